@@ -27,9 +27,9 @@ from pathlib import Path
 
 import numpy as np
 from scene_graph import acts, macro_f1, majority
-from sensed_worlds import KINDS, World, ids_in_view, mapped_boxes, sensed
+from sensed_worlds import KINDS, Mapped, World, ids_in_view, mapped, sensed
 
-from dataflow.messages import Activity, Boxes3D, Odometry, Pose, SceneGraph
+from dataflow.messages import Activity, Boxes3D, Classification, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from operators.recognition import ActivityRecognizer
 from operators.recognition.episodes import Episode
@@ -57,6 +57,7 @@ class Step:
     near: Callable[[SceneGraph], set[int]]
     """True agents of which a node of their class is within a metre."""
     objects: Boxes3D | None = None
+    postures: Classification | None = None
 
 
 @dataclass
@@ -107,18 +108,23 @@ def true_steps(episode: Episode, stride: int = 2) -> Iterator[Step]:
 
 
 def sensor_steps(world: World) -> Iterator[Step]:
-    yield from steps_of(world, *mapped_boxes(world))
+    yield from steps_of(world, mapped(world))
 
 
-def steps_of(world: World, nodes: list[SceneGraph], objects: Sequence[Boxes3D | None]) -> Iterator[Step]:
-    for frame, given, boxes in zip(world.frames, nodes, objects, strict=True):
+def steps_of(world: World, made: Sequence[Mapped | None]) -> Iterator[Step]:
+    """Yields the times of a world with what was mapped, or with the true nodes where nothing was."""
+    for frame, given in zip(world.frames, made, strict=True):
         view = ids_in_view(frame.objects, 0.3)
         said = zip(frame.activities.subjects.tolist(), frame.activities.goals, strict=True)
         goals = {i: int(g.rpartition(" ")[2]) if g.rpartition(" ")[2].isdigit() else -1 for i, g in said}
         truth = frame.scene
         match = partial(match_nodes, truth=truth)
         near = partial(agents_near, truth=truth)
-        yield Step(given, frame.base, view, acts(frame.activities), goals, match, near, boxes)
+        doing = acts(frame.activities)
+        if given is None:
+            yield Step(truth, frame.base, view, doing, goals, match, near)
+        else:
+            yield Step(given.nodes, frame.base, view, doing, goals, match, near, given.objects, given.postures)
 
 
 def agents_near(graph: SceneGraph, truth: SceneGraph) -> set[int]:
@@ -134,7 +140,7 @@ def figures_of(steps: list[Step]) -> Figures:
     said: dict[str, list[dict[int, str]]] = {"ours": [], "rules": [], "network": []}
     graphs, ofs = [], []
     for step in steps:
-        recognized = recognizer.process(step.nodes, step.robot, step.objects)
+        recognized = recognizer.process(step.nodes, step.robot, step.objects, step.postures)
         built = ours.process(step.nodes, step.robot, recognized=recognized)
         of = step.match(built["graph"])
         graphs.append(built["graph"])
@@ -324,7 +330,7 @@ def main() -> None:
 def report_shown(worlds: Iterable[World]) -> None:
     total: Counter[str] = Counter()
     for world in worlds:
-        counts = shown(list(steps_of(world, [frame.scene for frame in world.frames], [None] * len(world.frames))))
+        counts = shown(list(steps_of(world, [None] * len(world.frames))))
         print(world.name, dict(counts), flush=True)
         total.update(counts)
     print("all", dict(total))

@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 from scene_graph import acts
-from sensed_worlds import World, ids_in_view, mapped_boxes, sensed
+from sensed_worlds import World, ids_in_view, mapped, sensed
 
 from operators.recognition.sensed_people import SensedTrack, sensed_tracks, write_tracks
 from operators.sources.simulator.classes import ACTIVITIES
@@ -21,15 +21,15 @@ from operators.sources.simulator.classes import ACTIVITIES
 
 def tracks_of(world: World, every: int) -> list[SensedTrack]:
     frames = world.frames[::every]
-    nodes, objects = mapped_boxes(World(world.name, world.image_info, world.extrinsics, frames))
+    made = mapped(World(world.name, world.image_info, world.extrinsics, frames))
     return sensed_tracks(
-        nodes,
+        [each.nodes for each in made],
         [frame.base for frame in frames],
         [frame.scene for frame in frames],
         [acts(frame.activities) for frame in frames],
         [ids_in_view(frame.objects, 0.3) for frame in frames],
         ACTIVITIES,
-        objects,
+        [each.objects for each in made],
     )
 
 

@@ -19,6 +19,7 @@ from dataflow.messages import (
     Activity,
     Boxes3D,
     CameraInfo,
+    Classification,
     Detections2D,
     Odometry,
     PointCloud,
@@ -29,6 +30,7 @@ from dataflow.messages import (
 )
 from operators.cloud import CloudBuilder, PlaneSegmenter
 from operators.detection import CustomDetector
+from operators.recognition import PostureRecognizer
 from operators.scene import ObjectLifter, SemanticMap
 from operators.segmentation import Segmenter
 from operators.sources.simulated_robot import SimulatedRobot
@@ -111,11 +113,25 @@ class Mapper:
         return dict(found), dict(made)
 
 
-def mapped_boxes(world: World) -> tuple[list[SceneGraph], list[Boxes3D]]:
-    """Returns the map from sensors after each frame, as nodes and as boxes with velocities."""
-    mapper = Mapper()
-    made = [mapper.step(world, f, f.detections, f.segmentation)[1] for f in world.frames]
-    return [m["nodes"] for m in made], [m["objects"] for m in made]
+@dataclass(frozen=True)
+class Mapped:
+    """The map from sensors after a frame, as nodes and as boxes with velocities, and the postures of its people."""
+
+    nodes: SceneGraph
+    objects: Boxes3D
+    postures: Classification
+
+
+def mapped(world: World) -> list[Mapped]:
+    """Returns what is mapped after each frame."""
+    mapper, recognizer = Mapper(), PostureRecognizer()
+    recognizer.setup()
+    found = []
+    for frame in world.frames:
+        lifted, made = mapper.step(world, frame, frame.detections, frame.segmentation)
+        look = lifted["boxes"], lifted["clusters"], frame.cloud, frame.camera, world.extrinsics
+        found.append(Mapped(made["nodes"], made["objects"], recognizer.process(made["nodes"], *look)))
+    return found
 
 
 def sense(kind: str, seed: int, route: Route) -> World:

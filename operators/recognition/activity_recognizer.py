@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Activity, Boxes3D, Odometry, Pose, SceneGraph
+from dataflow.messages import Activity, Boxes3D, Classification, Odometry, Pose, SceneGraph
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.recognition.activity_model import ActivityModel
 from operators.recognition.activity_samples import STEP
 from operators.recognition.agent_features import AGENTS, DRINKS, AgentWindow, Surroundings
 from operators.recognition.in_hand import Hand, drinking
+from operators.recognition.looks import Looks
 from operators.recognition.possible import possible
 from operators.recognition.scene_agents import mattering, seen_times
 from operators.scene.agents import UNKNOWN
@@ -25,7 +26,8 @@ from operators.weights import shipped
 
 @dataclass
 class _Agent:
-    """State of one agent: its recent past, the network's state (2, L, W), what it does, since when (ns), its hand.
+    """State of one agent: its recent past, the network's state (2, L, W), what it does, since when (ns), its hand, and
+    the last looks at its posture.
 
     `stepped` is the time (ns) of the graph whose step is the last in the state, None where there is none.
     """
@@ -36,6 +38,7 @@ class _Agent:
     activity: str
     since: int
     hand: Hand
+    looks: Looks
 
 
 class ActivityRecognizer(Operator):
@@ -45,6 +48,9 @@ class ActivityRecognizer(Operator):
     graph into two LSTM layers. Their state is kept for as long as the agent is in the scene, and goes on by steps of
     0.15 s at least, however often graphs come; the network answers for a quarter of a second ago. `unknown` stands for
     what is too unsure, or too long out of sight.
+
+    Where the postures of people are given, too, what they look like counts beside what the network says: the product of
+    both, since they see different things.
 
     What motion and surroundings exclude is not said: nobody sits down or stands up away from every seat, and a robot
     that moves does not rest. Who has reached for a drink has it in hand for a while: one who then seems to stand
@@ -60,10 +66,14 @@ class ActivityRecognizer(Operator):
         required=False,
         doc="the nodes as boxes with velocities: how fast those are that are new; of the nodes' own stamp",
     )
+    postures: Sampled[Classification] = Sampled(
+        required=False, doc="what the posture of each person looks like, by PostureRecognizer; of the nodes' own stamp"
+    )
     activities: Out[Activity] = Out(doc="a row an agent: activity, probabilities, what it is done to, since when")
 
     weights: str | None = Param(None, doc="network file of `dataflow train activity`; none means the shipped one")
     least: float = Param(0.35, ge=0, lt=1, live=True, doc="probability below which an activity is unknown")
+    posture: float = Param(1.0, ge=0, live=True, doc="how much postures count beside the network; 0 for not at all")
     memory: float = Param(1.5, ge=0, doc="time out of sight after which an activity is unknown", unit="s")
 
     def setup(self) -> None:
@@ -83,6 +93,7 @@ class ActivityRecognizer(Operator):
         nodes: SceneGraph,
         robot: Pose | Odometry | None = None,
         objects: Boxes3D | None = None,
+        postures: Classification | None = None,
     ) -> Activity:
         """Raises ValueError where the robot is in another frame than the nodes."""
         if robot is not None and robot.frame != nodes.frame:
@@ -95,10 +106,12 @@ class ActivityRecognizer(Operator):
         agents = sorted((b for b in bodies if b.label in AGENTS), key=lambda b: b.id)
         self._agents = {b.id: self._agents.get(b.id) or self._fresh(nodes.stamp) for b in agents}
         here = None if robot is None else robot.matrix()[:2, 3]
+        looks = self._looks(postures) if postures is not None and postures.stamp == nodes.stamp else {}
         vectors = []
         for body in agents:
             window = self._agents[body.id].window
             window.add(time, body)
+            self._agents[body.id].looks.update(time, looks.get(body.id))
             vectors.append(window.vector(body, (nodes.stamp - seen[body.id]) * 1e-9, self._around, here))
         self._counts.update({"graphs": 1, "agents": len(agents), "unusable nodes": unusable})
         drinks = {b.id: (b, seen[b.id] * 1e-9) for b in bodies if b.label in DRINKS}
@@ -110,7 +123,7 @@ class ActivityRecognizer(Operator):
 
     def snapshot(self) -> Mapping[str, Any]:
         agents = [
-            [i, a.window.snapshot(), a.state, a.stepped, a.activity, a.since, a.hand.snapshot()]
+            [i, a.window.snapshot(), a.state, a.stepped, a.activity, a.since, a.hand.snapshot(), a.looks.snapshot()]
             for i, a in self._agents.items()
         ]
         return {"agents": agents, "around": self._around.snapshot(), "counts": dict(self._counts)}
@@ -118,12 +131,14 @@ class ActivityRecognizer(Operator):
     def restore(self, state: Mapping[str, Any]) -> None:
         self._begin()
         self._around.restore(state["around"])
-        for id, window, network, stepped, activity, since, hand in state["agents"]:
-            kept, held = AgentWindow(), Hand()
-            kept.restore(window)
-            held.restore(hand)
-            last = None if stepped is None else int(stepped)
-            self._agents[int(id)] = _Agent(kept, np.array(network, np.float32), last, str(activity), int(since), held)
+        for id, window, network, stepped, activity, since, hand, looks in state["agents"]:
+            agent = self._fresh(int(since))
+            agent.window.restore(window)
+            agent.hand.restore(hand)
+            agent.looks.restore(looks)
+            agent.state, agent.stepped = np.array(network, np.float32), None if stepped is None else int(stepped)
+            agent.activity = str(activity)
+            self._agents[int(id)] = agent
         self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
 
     def summary(self) -> Mapping[str, float | int]:
@@ -131,7 +146,20 @@ class ActivityRecognizer(Operator):
         return dict(self._counts)
 
     def _fresh(self, stamp: int) -> _Agent:
-        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, Hand())
+        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, Hand(), Looks())
+
+    def _looks(self, postures: Classification) -> dict[int, NDArray[np.float32]]:
+        """Returns what each posture speaks for, by ids: probabilities (C,) of our activities.
+
+        Nothing speaks against those that the postures do not know.
+        """
+        if postures.ids is None or postures.probabilities is None:
+            return {}
+        own = list(self._model.classes)
+        columns = [k for k, name in enumerate(postures.class_names) if name in own]
+        rows = np.repeat(postures.probabilities.max(axis=1, initial=0.0, keepdims=True), len(own), axis=1)
+        rows[:, [own.index(postures.class_names[k]) for k in columns]] = postures.probabilities[:, columns]
+        return dict(zip(postures.ids.tolist(), rows, strict=True))
 
     def _answer(
         self,
@@ -148,6 +176,10 @@ class ActivityRecognizer(Operator):
             features = np.stack(vectors)
             probabilities[:, :-1], states = self._model.step(features, states)
             probabilities[:, :-1] *= possible(features, self._classes[:-1])
+            for k, body in enumerate(agents):
+                evidence = self._agents[body.id].looks.evidence(self.posture)
+                if evidence is not None:
+                    probabilities[k, :-1] *= evidence
             probabilities /= np.maximum(probabilities.sum(axis=1, keepdims=True), 1e-6)
         chosen = []
         for k, body in enumerate(agents):

@@ -39,7 +39,7 @@ from operators.training.options import (
     Width,
     Workers,
 )
-from operators.training.people_commands import train_activity
+from operators.training.people_commands import train_activity, train_posture
 from operators.training.refining import BORDERS, REFINER, BorderEpochs, RefinerEpochs, command_of, train_second
 from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data, variation_of
 from operators.training.torchvision_command import train_torchvision
@@ -60,6 +60,7 @@ train = typer.Typer(
     rich_markup_mode="rich",
 )
 train.command("activity")(train_activity)
+train.command("posture")(train_posture)
 train.command("torchvision")(train_torchvision)
 train.command("trunk")(train_trunk)
 for each in (REFINER, BORDERS):

@@ -1,7 +1,8 @@
-"""`dataflow train activity`: what people do, learned from simulated worlds without images."""
+"""`dataflow train activity` and `train posture`: what people do, learned from simulated worlds."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,13 +10,16 @@ import typer
 from rich.progress import track
 
 from operators.training.console import Json, err_console, friendly
-from operators.training.options import Every, Overwrite, Rate, Resume, Seed
+from operators.training.options import Device, Every, Overwrite, Rate, Resume, Seed, Threads, Workers
 from operators.training.running import keep_earlier, report, run_task
 
 if TYPE_CHECKING:
     from operators.recognition.episodes import Episode
 
 Folder = Annotated[Path, typer.Argument(help="Folder of episodes; those that it lacks are made.", show_default=False)]
+Silhouettes = Annotated[
+    Path, typer.Argument(help="Folder of silhouettes; those that it lacks are made.", show_default=False)
+]
 Worlds = Annotated[int, typer.Option(min=1, help="Worlds to train on.")]
 Chosen = Annotated[int, typer.Option("--validation", min=1, help="Worlds by which the best epoch is chosen.")]
 Processes = Annotated[int, typer.Option(min=1, help="Worlds made at once.")]
@@ -83,6 +87,54 @@ def train_activity(
     report(outcome, "operators.recognition:ActivityRecognizer", json)
 
 
+def train_posture(
+    data: Silhouettes,
+    worlds: Worlds = 160,
+    validation: Chosen = 8,
+    processes: Processes = 1,
+    epochs: Epochs = 10,
+    out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("posture.onnx"),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    batch: Annotated[int, typer.Option(min=2, help="Silhouettes a step.")] = 128,
+    learning_rate: Rate = 3e-3,
+    seed: Seed = 0,
+    evaluate_every: Every = 1,
+    workers: Workers = 1,
+    threads: Threads = None,
+    device: Device = None,
+    json: Json = False,
+) -> None:
+    """Train the posture network on silhouettes of people in simulated worlds.
+
+    A silhouette is what a depth sensor sees of a person from somewhere around it, with the errors of a sensor and of a
+    segmenter. The score is the mean over activities of the share that is right, in other worlds.
+    `operators.recognition:PostureRecognizer` takes the file as `weights`.
+
+    Examples:
+
+      dataflow train posture out/silhouettes --processes 2
+      dataflow train posture out/silhouettes --worlds 20 --epochs 4 --out out/posture.onnx
+    """
+    with friendly():
+        keep_earlier(out, resume, overwrite)
+        from operators.recognition.posture_training import PostureTask
+        from operators.training.loop import Settings
+        from operators.training.simulated_postures import TRAINING, VALIDATION, read_postures, write_postures
+        from operators.training.simulated_postures import worlds as worlds_from
+
+        parts = worlds_from(TRAINING, worlds), worlds_from(VALIDATION, validation)
+        _followed(write_postures(data, [*parts[0], *parts[1]], processes), worlds + validation, json)
+        task = PostureTask(read_postures(data, parts[0]), read_postures(data, parts[1]), seed=seed)
+        _tell(f"{task.samples} silhouettes of {worlds} worlds to train on, {validation} worlds to choose by", json)
+        settings = Settings(
+            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
+            device=device,
+        )  # fmt: skip
+        outcome = run_task(task, settings, out, resume, json)
+    report(outcome, "operators.recognition:PostureRecognizer", json)
+
+
 def _episodes(
     folder: Path, training: int, validation: int, processes: int, quiet: bool
 ) -> tuple[list[Episode], list[Episode]]:
@@ -91,10 +143,14 @@ def _episodes(
 
     parts = worlds(TRAINING, training), worlds(VALIDATION, validation)
     made = write_episodes(folder, [*parts[0], *parts[1]], processes)
-    total = training + validation
+    _followed(made, training + validation, quiet)
+    return read_episodes(folder, parts[0]), read_episodes(folder, parts[1])
+
+
+def _followed(made: Iterator[int], total: int, quiet: bool) -> None:
+    """Makes worlds, with a progress bar unless output is for programs."""
     for _ in made if quiet else track(made, total=total, description="worlds", console=err_console):
         pass
-    return read_episodes(folder, parts[0]), read_episodes(folder, parts[1])
 
 
 def _tell(text: str, quiet: bool) -> None:

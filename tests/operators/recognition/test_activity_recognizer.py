@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dataflow.firing.failure import OperatorFailure
-from dataflow.messages import Activity, Boxes3D, Pose, SceneGraph
+from dataflow.messages import Activity, Boxes3D, Classification, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import play
 from operators.recognition import ActivityRecognizer
@@ -137,6 +137,50 @@ def test_who_is_out_of_sight_for_long_does_something_unknown() -> None:
     assert found[-1] == "unknown"
 
 
+POSTURES = ("standing", "walking", "sitting", "reaching", "drinking")
+
+
+def looks(graphs: list[SceneGraph], *likely: str) -> list[Classification]:
+    """What the posture of person 1 looks like in each graph: 0.8 for one thing, 0.05 for the others."""
+    rows = [np.array([[0.8 if name == p else 0.05 for p in POSTURES]], np.float32) for name in likely]
+    return [
+        Classification(
+            stamp=graph.stamp, class_names=POSTURES, class_ids=row.argmax(axis=1).astype(np.int32),
+            scores=row.max(axis=1), probabilities=row, ids=[1],
+        )
+        for graph, row in zip(graphs, rows, strict=True)
+    ]  # fmt: skip
+
+
+def test_what_a_posture_looks_like_counts_beside_motion_unless_it_is_switched_off() -> None:
+    mug: Box = 4, "mug", (0.45, 0.2, 0.75), (0.09, 0.09, 0.1)
+    table: Box = 6, "table", (0.7, 0.0, 0.0), (0.6, 1.2, 0.75)
+    graphs = course(4, lambda t: [person(0.0, 0.0), mug, table])
+    given = {"nodes": graphs, "postures": looks(graphs, *["drinking"] * len(graphs))}
+    alone, off, on, strong = (
+        play(ActivityRecognizer(posture=weight), streams)["activities"][-1]
+        for weight, streams in ((1.0, {"nodes": graphs}), (0.0, given), (1.0, given), (3.0, given))
+    )
+    assert off.digest() == alone.digest()
+    column = alone.class_names.index("drinking")
+    assert on.probabilities[0, column] > 5 * alone.probabilities[0, column]
+    assert [said(each) for each in (alone, strong)] == ["standing", "drinking"]
+
+
+def test_looks_of_another_time_and_of_nobody_change_nothing() -> None:
+    graphs = course(3, lambda t: [person(0.0, 0.0)])
+    late = [nodes(k / RATE + 0.1, []) for k in range(len(graphs))]
+    given = {"nodes": graphs, "postures": looks(late, *["drinking"] * len(graphs))}
+    assert play(ActivityRecognizer(), given).digests() == play(ActivityRecognizer(), {"nodes": graphs}).digests()
+
+
+def test_a_posture_that_speaks_against_motion_does_not_outweigh_it_at_once() -> None:
+    graphs = course(6, lambda t: [person(0.65 * t, 0.0, length=0.8)])
+    names = ["walking"] * (len(graphs) - 1) + ["standing"]
+    found = play(ActivityRecognizer(), {"nodes": graphs, "postures": looks(graphs, *names)})["activities"]
+    assert said(found[-1]) == "walking"
+
+
 def test_graphs_that_come_more_often_take_no_more_steps_of_the_network() -> None:
     recognizer = ActivityRecognizer()
     recognizer.setup()
@@ -158,10 +202,11 @@ def test_the_state_goes_on_after_a_snapshot_as_if_nothing_had_been() -> None:
     whole, first, second = ActivityRecognizer(), ActivityRecognizer(), ActivityRecognizer()
     for each in (whole, first, second):
         each.setup()
-    expected = [whole.process(g).digest() for g in graphs]
-    found = [first.process(g).digest() for g in graphs[:11]]
+    seen = looks(graphs, *(["walking", "standing"] * len(graphs))[: len(graphs)])
+    expected = [whole.process(g, postures=p).digest() for g, p in zip(graphs, seen, strict=True)]
+    found = [first.process(g, postures=p).digest() for g, p in zip(graphs[:11], seen, strict=False)]
     second.restore(first.snapshot())
-    found += [second.process(g).digest() for g in graphs[11:]]
+    found += [second.process(g, postures=p).digest() for g, p in zip(graphs[11:], seen[11:], strict=True)]
     assert found == expected
 
 

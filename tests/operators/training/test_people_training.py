@@ -13,13 +13,19 @@ from operators.recognition.activity_model import ActivityModel
 from operators.recognition.activity_score import macro_f1
 from operators.recognition.agent_features import COUNT
 from operators.recognition.episodes import Episode
+from operators.recognition.posture_data import BODY, POSTURES, Postures
+from operators.recognition.posture_model import PostureModel
 from operators.recognition.sensed_people import SensedTrack, write_tracks
+from operators.recognition.silhouette import MIDDLE, SIDE
 from operators.sources.simulator.classes import ACTIVITIES
+from operators.training import simulated_postures
 from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, worlds, write_episodes
 
 pytest.importorskip("torch", reason="training needs the extra [train]")
 
+from operators.recognition.posture_training import mirrored
 from operators.training.commands import train
+from operators.training.simulated_postures import worlds as posture_worlds
 
 
 def made(seed: int) -> Episode:
@@ -135,3 +141,65 @@ def test_unknown_is_a_miss_and_false_for_no_class() -> None:
 
 def test_a_class_that_is_said_and_never_true_counts_nought() -> None:
     assert macro_f1(["a", "a", "a"], ["a", "a", "b"]) == pytest.approx((4 / 5 + 0) / 2)
+
+
+def test_the_posture_network_is_trained_scored_and_written(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    folder, out = tmp_path / "silhouettes", tmp_path / "posture.onnx"
+    folder.mkdir()
+    for kind, seed, people in (
+        *posture_worlds(simulated_postures.TRAINING, 2),
+        *posture_worlds(simulated_postures.VALIDATION, 1),
+    ):
+        activities = np.arange(21) % len(POSTURES)
+        shapes = np.zeros((21, 3, SIDE, SIDE), np.int8)
+        for shape, activity in zip(shapes, activities, strict=True):
+            shape[:2, 4 + 8 * activity : 10 + 8 * activity, 20:44] = 127
+        Postures(shapes, rng.normal(0, 0.3, (21, BODY)).astype(np.float32), activities).write(
+            folder / f"{kind}_{seed}_{people}.npz"
+        )
+    words = [
+        "posture",
+        str(folder),
+        "--out",
+        str(out),
+        "--worlds",
+        "2",
+        "--validation",
+        "1",
+        "--epochs",
+        "2",
+        "--batch",
+        "8",
+    ]
+    done = CliRunner().invoke(train, [*words, "--json"])
+    assert done.exit_code == 0, done.output
+    assert 0 <= json.loads(done.stdout)["scores"]["score"] <= 1
+    model = PostureModel.open(out)
+    both = model.judge(shapes[:2].astype(np.float32) / 127)
+    np.testing.assert_allclose(both.sum(axis=1), 1, rtol=1e-5)
+    np.testing.assert_allclose(model.judge(shapes[1:2].astype(np.float32) / 127)[0], both[1], rtol=1e-4)
+
+
+def test_simulated_people_are_seen_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulated_postures, "_LOOKS", 2)
+    monkeypatch.setattr(simulated_postures, "_MORE", 0)
+    found, again = (simulated_postures.looked_at("table_top", 45_501, 2) for _ in range(2))
+    assert found.silhouettes.tobytes() == again.silhouettes.tobytes()
+    assert {"sitting", "walking"} <= {POSTURES[k] for k in found.activities}
+    pelvis = found.bodies[:, 14] + MIDDLE  # metres over the floor
+    seated, walking = (found.activities == POSTURES.index(name) for name in ("sitting", "walking"))
+    assert pelvis[seated].max() < 0.7 < pelvis[walking].min()
+    highest = np.array([(shape[0] != 0).any(axis=1).argmax() for shape in found.silhouettes])
+    assert np.median(highest[seated]) > np.median(highest[walking]) + 5  # rows count from above
+
+
+def test_a_mirrored_silhouette_has_a_mirrored_body() -> None:
+    rng = np.random.default_rng(1)
+    shape, body = rng.random((3, SIDE, SIDE)).astype(np.float32), rng.random(BODY).astype(np.float32)
+    once = mirrored(shape, body)
+    np.testing.assert_array_equal(once[0], shape[:, :, ::-1])
+    np.testing.assert_allclose(once[1][:3], body[3:6] * [-1, 1, 1])
+    twice = mirrored(*once)
+    np.testing.assert_array_equal(twice[0], shape)
+    np.testing.assert_allclose(twice[1], body)

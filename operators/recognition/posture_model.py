@@ -1,0 +1,46 @@
+"""The posture network in use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.inference import open_session
+from operators.recognition.silhouette import HALF, MIDDLE, SIDE
+from operators.weights import NetworkFileError, facts_of
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+F32 = NDArray[np.float32]
+KIND = "posture"
+_LACKING = "train one by `dataflow train posture`"
+
+
+@dataclass(frozen=True, eq=False)
+class PostureModel:
+    """An opened network. It runs on one CPU thread, so equal inputs give equal outputs."""
+
+    classes: tuple[str, ...]
+    session: onnxruntime.InferenceSession
+
+    @classmethod
+    def open(cls, file: Path) -> PostureModel:
+        """Raises FileNotFoundError, or NetworkFileError where the file is no posture network for our silhouettes."""
+        session = open_session(file)
+        facts = facts_of(file, session, ("kind", "classes"))
+        if facts["kind"] != KIND:
+            raise NetworkFileError(f"{file} is of kind {facts['kind']!r}; a {KIND} network is needed: {_LACKING}")
+        given, wanted = [facts.get(name) for name in ("side", "half", "middle")], [SIDE, HALF, MIDDLE]
+        if given != wanted:
+            raise NetworkFileError(f"{file} is for windows (side, half, middle) {given}, not {wanted}: {_LACKING}")
+        return cls(tuple(map(str, facts["classes"])), session)
+
+    def judge(self, silhouettes: F32) -> F32:
+        """Returns probabilities (N, C) for silhouettes (N, 3, SIDE, SIDE)."""
+        (found,) = self.session.run(None, {"silhouettes": silhouettes})
+        return np.asarray(found, np.float32)
