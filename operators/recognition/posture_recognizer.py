@@ -1,4 +1,4 @@
-"""What the postures of people look like, as an operator: one look at each, by depth alone."""
+"""Postures of the people of a scene as an operator: one look at each, by depth alone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class PostureRecognizer(Operator):
     The points of each person that is in view make a silhouette of 64x64 cells, with how much nearer or farther they
     are, and what stands before and behind; a small network says what somebody of that shape does: stands, walks, sits
     down, sits, stands up, reaches or drinks. It knows nothing of the past: `ActivityRecognizer` takes these answers
-    together with how people move and what is around them. Trained on simulated people (`dataflow train posture`).
+    together with how people move and what is around them. Trained on simulated depth alone (`dataflow train posture`),
+    as in Shotton et al., "Real-time human pose recognition in parts from single depth images", 2011.
     """
 
     nodes: In[SceneGraph] = In(doc="objects with persons among them; z points up in their frame")
