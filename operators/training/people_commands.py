@@ -92,7 +92,7 @@ def train_posture(
     worlds: Worlds = 160,
     validation: Chosen = 8,
     processes: Processes = 1,
-    epochs: Epochs = 10,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes through the silhouettes.")] = 10,
     out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("posture.onnx"),
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -119,11 +119,11 @@ def train_posture(
     with friendly():
         keep_earlier(out, resume, overwrite)
         from operators.recognition.posture_training import PostureTask
+        from operators.training import made_worlds
         from operators.training.loop import Settings
         from operators.training.simulated_postures import TRAINING, VALIDATION, read_postures, write_postures
-        from operators.training.simulated_postures import worlds as worlds_from
 
-        parts = worlds_from(TRAINING, worlds), worlds_from(VALIDATION, validation)
+        parts = made_worlds.worlds(TRAINING, worlds), made_worlds.worlds(VALIDATION, validation)
         _followed(write_postures(data, [*parts[0], *parts[1]], processes), worlds + validation, json)
         task = PostureTask(read_postures(data, parts[0]), read_postures(data, parts[1]), seed=seed)
         _tell(f"{task.samples} silhouettes of {worlds} worlds to train on, {validation} worlds to choose by", json)
@@ -139,7 +139,8 @@ def _episodes(
     folder: Path, training: int, validation: int, processes: int, quiet: bool
 ) -> tuple[list[Episode], list[Episode]]:
     """Makes the episodes that a folder lacks, and reads all."""
-    from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, worlds, write_episodes
+    from operators.training.made_worlds import worlds
+    from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, write_episodes
 
     parts = worlds(TRAINING, training), worlds(VALIDATION, validation)
     made = write_episodes(folder, [*parts[0], *parts[1]], processes)

@@ -6,10 +6,8 @@ Each world is drawn from a seed of its own and driven through; what a tracker wo
 
 from __future__ import annotations
 
-import multiprocessing
 import re
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +18,10 @@ from operators.sources.simulator.drive import Drive
 from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
 from operators.sources.simulator.scene import Thing
 from operators.sources.simulator.worlds import make_world
+from operators.training.made_worlds import Chosen, file_of, write_lacking
 
 TRAINING, VALIDATION, HELD_OUT = 40_000, 45_000, 50_000
 """First seeds of the worlds to train on, to choose by, and to report on."""
-KINDS = ("office", "table_top", "corridor", "yard")
 RATE, SECONDS = 8.0, 45.0
 _SPEED = 0.5  # m/s, of the robot; as SimulatedRobot drives
 _GOAL = re.compile(r"(?:sit down (?:at|on)|drink from) \w+ (\d+)$")
@@ -51,36 +49,14 @@ def watched(kind: str, seed: int, people: int, *, rate: float = RATE, seconds: f
     )
 
 
-def worlds(first: int, count: int) -> list[tuple[str, int, int]]:
-    """Returns `count` worlds (kind, seed, people), kinds and numbers of people in turn."""
-    return [(KINDS[k % len(KINDS)], first + k, (3, 3, 4, 2)[(k // len(KINDS)) % 4]) for k in range(count)]
-
-
-def write_episodes(folder: Path, chosen: Sequence[tuple[str, int, int]], processes: int) -> Iterator[int]:
+def write_episodes(folder: Path, chosen: Sequence[Chosen], processes: int) -> Iterator[int]:
     """Writes an episode of each world that the folder lacks; yields how many are made after each."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lacking = [world for world in chosen if not _file(folder, *world).is_file()]
-    if not lacking:
-        return
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        for k, _ in enumerate(pool.imap(partial(_write, folder), lacking)):
-            yield k + 1
+    return write_lacking(folder, chosen, processes, watched)
 
 
-def read_episodes(folder: Path, chosen: Sequence[tuple[str, int, int]]) -> list[Episode]:
+def read_episodes(folder: Path, chosen: Sequence[Chosen]) -> list[Episode]:
     """Returns the episodes of these worlds. Raises FileNotFoundError for one that is not there."""
-    return [Episode.read(_file(folder, *world)) for world in chosen]
-
-
-def _write(folder: Path, world: tuple[str, int, int]) -> None:
-    file = _file(folder, *world)
-    unfinished = file.with_suffix(".partial.npz")
-    watched(*world).write(unfinished)
-    unfinished.replace(file)
-
-
-def _file(folder: Path, kind: str, seed: int, people: int) -> Path:
-    return folder / f"{kind}_{seed}_{people}.npz"
+    return [Episode.read(file_of(folder, world)) for world in chosen]
 
 
 def _row(thing: Thing, t: float) -> NDArray[np.float64]:

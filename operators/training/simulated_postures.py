@@ -6,10 +6,8 @@ that is drawn at random, with a sensor's noise and with masks that are wrong at 
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -25,13 +23,13 @@ from operators.sources.simulator.persons import Person
 from operators.sources.simulator.renderer import Renderer
 from operators.sources.simulator.scene import Thing, World
 from operators.sources.simulator.worlds import make_world
+from operators.training.made_worlds import Chosen, file_of, write_lacking
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 TRAINING, VALIDATION = 41_000, 45_500
 """First seeds of the worlds to train on, and of those to choose by."""
-KINDS = ("office", "table_top", "corridor", "yard")
 _SECONDS, _STEP = 60.0, 0.1
 _LOOKS, _MORE = 24, 12  # at a person in each activity, and so many more at one who walks
 _TRIES = 6  # places to look from
@@ -72,36 +70,14 @@ def looked_at(kind: str, seed: int, people: int) -> Postures:
     )
 
 
-def worlds(first: int, count: int) -> list[tuple[str, int, int]]:
-    """Returns `count` worlds (kind, seed, people), kinds and numbers of people in turn."""
-    return [(KINDS[k % len(KINDS)], first + k, (3, 3, 4, 2)[(k // len(KINDS)) % 4]) for k in range(count)]
-
-
-def write_postures(folder: Path, chosen: Sequence[tuple[str, int, int]], processes: int) -> Iterator[int]:
+def write_postures(folder: Path, chosen: Sequence[Chosen], processes: int) -> Iterator[int]:
     """Writes the silhouettes of each world that the folder lacks; yields how many are made after each."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lacking = [world for world in chosen if not _file(folder, *world).is_file()]
-    if not lacking:
-        return
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        for k, _ in enumerate(pool.imap(partial(_write, folder), lacking)):
-            yield k + 1
+    return write_lacking(folder, chosen, processes, looked_at)
 
 
-def read_postures(folder: Path, chosen: Sequence[tuple[str, int, int]]) -> Postures:
+def read_postures(folder: Path, chosen: Sequence[Chosen]) -> Postures:
     """Returns the silhouettes of these worlds together. Raises FileNotFoundError for one that is not there."""
-    return Postures.joined([Postures.read(_file(folder, *world)) for world in chosen])
-
-
-def _write(folder: Path, world: tuple[str, int, int]) -> None:
-    file = _file(folder, *world)
-    unfinished = file.with_suffix(".partial.npz")
-    looked_at(*world).write(unfinished)
-    unfinished.replace(file)
-
-
-def _file(folder: Path, kind: str, seed: int, people: int) -> Path:
-    return folder / f"{kind}_{seed}_{people}.npz"
+    return Postures.joined([Postures.read(file_of(folder, world)) for world in chosen])
 
 
 def _moments(world: World, things: dict[int, Thing], rng: Rng) -> list[tuple[float, int, int]]:

@@ -19,13 +19,13 @@ from operators.recognition.sensed_people import SensedTrack, write_tracks
 from operators.recognition.silhouette import MIDDLE, SIDE
 from operators.sources.simulator.classes import ACTIVITIES
 from operators.training import simulated_postures
-from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, worlds, write_episodes
+from operators.training.made_worlds import worlds
+from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, write_episodes
 
 pytest.importorskip("torch", reason="training needs the extra [train]")
 
 from operators.recognition.posture_training import mirrored
 from operators.training.commands import train
-from operators.training.simulated_postures import worlds as posture_worlds
 
 
 def made(seed: int) -> Episode:
@@ -148,8 +148,8 @@ def test_the_posture_network_is_trained_scored_and_written(tmp_path: Path) -> No
     folder, out = tmp_path / "silhouettes", tmp_path / "posture.onnx"
     folder.mkdir()
     for kind, seed, people in (
-        *posture_worlds(simulated_postures.TRAINING, 2),
-        *posture_worlds(simulated_postures.VALIDATION, 1),
+        *worlds(simulated_postures.TRAINING, 2),
+        *worlds(simulated_postures.VALIDATION, 1),
     ):
         activities = np.arange(21) % len(POSTURES)
         shapes = np.zeros((21, 3, SIDE, SIDE), np.int8)
