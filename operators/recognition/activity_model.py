@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.inference import open_session
 from operators.recognition.agent_features import NAMES
-from operators.weights import NetworkFileError, facts_of
+from operators.weights import NetworkFileError, open_kind
 
 if TYPE_CHECKING:
     import onnxruntime
 
 F32 = NDArray[np.float32]
 KIND = "activity"
-_LACKING = "train one by `dataflow train activity`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +31,11 @@ class ActivityModel:
     @classmethod
     def open(cls, file: Path) -> ActivityModel:
         """Raises FileNotFoundError, or NetworkFileError where the file is no activity network for our features."""
-        session = open_session(file)
-        facts = facts_of(file, session, ("kind", "classes"))
-        if facts["kind"] != KIND:
-            raise NetworkFileError(f"{file} is a {facts['kind']}; an {KIND} network is needed: {_LACKING}")
+        session, facts = open_kind(file, KIND, ("classes", "layers", "width"))
         if tuple(facts.get("features", ())) != NAMES:
-            raise NetworkFileError(f"{file} was trained on other features than these {len(NAMES)}: {_LACKING}")
+            raise NetworkFileError(
+                f"{file} was trained on other features than these {len(NAMES)}: train one by `dataflow train {KIND}`"
+            )
         return cls(tuple(map(str, facts["classes"])), int(facts["layers"]), int(facts["width"]), session)
 
     def fresh(self) -> F32:

@@ -27,6 +27,7 @@ from operators.recognition.agent_features import NAMES
 from operators.recognition.episodes import Episode
 from operators.recognition.sensed_people import SensedTrack
 from operators.sources.simulator.classes import ACTIVITIES
+from operators.training.balance import class_weights
 from operators.training.export import export_steps
 
 KIND = "activity"
@@ -103,9 +104,7 @@ class ActivityTask:
         self.activities.mean.copy_(torch.from_numpy(every.mean(axis=0)))
         self.activities.scale.copy_(torch.from_numpy(np.maximum(every.std(axis=0), 0.05)))
         known = np.concatenate([labels[labels >= 0] for _, labels, _ in self._training])
-        counts = np.bincount(known, minlength=len(ACTIVITIES))
-        weights = (counts.sum() / np.maximum(counts, 1)) ** 0.5
-        self._weights = torch.from_numpy((weights / np.average(weights, weights=counts)).astype(np.float32))
+        self._weights = class_weights(known, len(ACTIVITIES))
 
     @property
     def network(self) -> nn.Module:

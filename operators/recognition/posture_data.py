@@ -29,8 +29,11 @@ class Postures:
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """Raises FileNotFoundError where there is no such file."""
+        """Raises FileNotFoundError where there is no such file, ValueError for one that holds no silhouettes."""
         with np.load(file) as kept:
+            lacking = {"silhouettes", "bodies", "activities"} - set(kept)
+            if lacking:
+                raise ValueError(f"{file} holds no {', '.join(sorted(lacking))}: delete it, and it is made anew")
             return cls(kept["silhouettes"], kept["bodies"], kept["activities"])
 
     @classmethod

@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.inference import open_session
 from operators.recognition.silhouette import HALF, MIDDLE, SIDE
-from operators.weights import NetworkFileError, facts_of
+from operators.weights import NetworkFileError, open_kind
 
 if TYPE_CHECKING:
     import onnxruntime
 
 F32 = NDArray[np.float32]
 KIND = "posture"
-_LACKING = "train one by `dataflow train posture`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +29,12 @@ class PostureModel:
     @classmethod
     def open(cls, file: Path) -> PostureModel:
         """Raises FileNotFoundError, or NetworkFileError where the file is no posture network for our silhouettes."""
-        session = open_session(file)
-        facts = facts_of(file, session, ("kind", "classes"))
-        if facts["kind"] != KIND:
-            raise NetworkFileError(f"{file} is of kind {facts['kind']!r}; a {KIND} network is needed: {_LACKING}")
+        session, facts = open_kind(file, KIND, ("classes",))
         given, wanted = [facts.get(name) for name in ("side", "half", "middle")], [SIDE, HALF, MIDDLE]
         if given != wanted:
-            raise NetworkFileError(f"{file} is for windows (side, half, middle) {given}, not {wanted}: {_LACKING}")
+            raise NetworkFileError(
+                f"{file} is for windows (side, half, middle) {given}, not {wanted}: `dataflow train {KIND}` makes one"
+            )
         return cls(tuple(map(str, facts["classes"])), session)
 
     def judge(self, silhouettes: F32) -> F32:

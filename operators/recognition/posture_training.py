@@ -16,6 +16,7 @@ from operators.recognition.posture_data import POSTURES, Postures
 from operators.recognition.posture_model import KIND
 from operators.recognition.posture_network import DeployedPosture, PostureNetwork
 from operators.recognition.silhouette import HALF, MIDDLE, SIDE
+from operators.training.balance import class_weights
 from operators.training.export import export_rows
 
 F32 = NDArray[np.float32]
@@ -33,9 +34,7 @@ class PostureTask:
         torch.manual_seed(seed)
         self._training, self._validation = training, validation
         self.postures = PostureNetwork(len(POSTURES))
-        counts = np.bincount(training.activities, minlength=len(POSTURES))
-        weights = (counts.sum() / np.maximum(counts, 1)) ** 0.5
-        self._weights = torch.from_numpy((weights / np.average(weights, weights=counts)).astype(np.float32))
+        self._weights = class_weights(training.activities, len(POSTURES))
 
     @property
     def network(self) -> nn.Module:

@@ -15,6 +15,7 @@ from torch.nn import functional
 from operators.recognition.dataset import ClassificationData, LabelledImage
 from operators.recognition.network import Architecture, ClassifierNetwork, DeployedClassifier
 from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
+from operators.training.balance import class_weights
 from operators.training.export import export_network
 
 KIND = "classifier"
@@ -42,9 +43,8 @@ class ClassifierTask:
         self.architecture: Architecture = architecture
         self.variation = Variation() if variation is None else variation
         self.classifier = ClassifierNetwork(len(data.classes), architecture)
-        counts = np.bincount([image.label for image in data.training], minlength=len(data.classes))
-        weights = (counts.sum() / np.maximum(counts, 1)) ** 0.5  # rare classes count more, but not by all they lack
-        self.class_weights = torch.from_numpy((weights / np.average(weights, weights=counts)).astype(np.float32))
+        labels = np.array([image.label for image in data.training], np.int64)
+        self.class_weights = class_weights(labels, len(data.classes))
 
     @property
     def network(self) -> nn.Module:

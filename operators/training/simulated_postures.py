@@ -22,6 +22,7 @@ from operators.sources.simulator.optics import Optics, View, camera_rays
 from operators.sources.simulator.persons import Person
 from operators.sources.simulator.renderer import Renderer
 from operators.sources.simulator.scene import Thing, World
+from operators.sources.simulator.settings import ColorCamera, DepthCamera
 from operators.sources.simulator.worlds import make_world
 from operators.training.made_worlds import Chosen, file_of, write_lacking
 
@@ -33,9 +34,10 @@ TRAINING, VALIDATION = 41_000, 45_500
 _SECONDS, _STEP = 60.0, 0.1
 _LOOKS, _MORE = 24, 12  # at a person in each activity, and so many more at one who walks
 _TRIES = 6  # places to look from
-_WIDTH, _HEIGHT, _FOCAL, _STRIDE = 640, 480, 544.0, 3  # of the sensor: pixels, and every which one gives a point
-_RANGE = 6.0  # metres
-_GRAZING, _SPECKS, _NOISE = 0.12, 0.01, 0.0015
+_SENSOR = DepthCamera()
+_WIDTH, _HEIGHT, _FOCAL = 640, 480, 640 * ColorCamera().focal  # pixels
+_STRIDE = 3  # every which pixel of the sensor gives a point
+_SPECKS = 0.01  # share of the points that are lost
 _LEAST_POINTS, _LEAST_SHARE = 15, 0.4  # of a person's image, in the sensor's view
 
 
@@ -121,7 +123,7 @@ def _seen(
 
 def _look(renderer: Renderer, id: int, foot: Array, height: float, rng: Rng) -> _Look | None:
     """Looks at a person from somewhere around it; None where too little of it is in view."""
-    away = float(np.exp(rng.uniform(np.log(1.0), np.log(_RANGE))))
+    away = float(np.exp(rng.uniform(np.log(1.0), np.log(_SENSOR.max_range))))
     around = rng.uniform(-np.pi, np.pi)
     eye = foot + np.array([away * np.cos(around), away * np.sin(around), 0])
     eye[2] = np.clip(height + rng.uniform(-0.25, 0.25), 0.3, 2.0)
@@ -137,7 +139,7 @@ def _look(renderer: Renderer, id: int, foot: Array, height: float, rng: Rng) -> 
     view = renderer.view(T, optics, color=False)
     own = view.instances == id
     inside = np.zeros((side, side), bool)
-    rows, columns = ((_within(c, half, extent, k, side)) for c, extent in ((v, _HEIGHT), (u, _WIDTH)))
+    rows, columns = (_within(c, half, extent, k, side) for c, extent in ((v, _HEIGHT), (u, _WIDTH)))
     inside[rows, columns] = True
     whole, shown = int(own.sum()), int((own & inside).sum())
     if whole < 20 or shown < max(_LEAST_POINTS, 0.02 * side * side) or shown < _LEAST_SHARE * whole:
@@ -156,8 +158,8 @@ def _measured(look: _Look, rng: Rng) -> tuple[Array, NDArray[np.bool_]]:
     shape, side = look.own.shape, look.own.shape[0]
     grain = rng.normal(0, 1, (side // 2 + 1, side // 2 + 1))
     depth = look.view.depth.astype(np.float64)
-    depth = depth + cv2.resize(grain, (side, side)) * _NOISE * np.minimum(depth, 9) ** 2
-    there = look.inside & np.isfinite(depth) & (depth < _RANGE) & (look.view.cosine > _GRAZING)
+    depth = depth + cv2.resize(grain, (side, side)) * _SENSOR.noise * np.minimum(depth, 9) ** 2
+    there = look.inside & np.isfinite(depth) & (depth < _SENSOR.max_range) & (look.view.cosine > _SENSOR.grazing)
     there &= rng.random(shape) > _SPECKS
     mask = look.own.copy()
     if rng.random() < 0.6:

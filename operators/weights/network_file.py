@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 KEY, SECOND, TRUNK = "dataflow.network", "dataflow.second", "trunk"
+_IMAGES = ("kind", "classes", "width", "height")
 _FOLDER = Path(__file__).parent
 
 
@@ -71,17 +72,32 @@ class Network:
         return _divided(self, names)
 
 
+def open_kind(
+    file: Path, kind: str, needed: Sequence[str] = _IMAGES
+) -> tuple[onnxruntime.InferenceSession, dict[str, Any]]:
+    """Opens a network of a kind, whatever its inputs are; returns it with its metadata.
+
+    Raises FileNotFoundError, or NetworkFileError for one of another kind or without the metadata that are needed.
+    """
+    session = open_session(file)
+    found = facts_of(file, session, ("kind",))["kind"]
+    if found != kind:
+        raise NetworkFileError(f"{file} is {_called(found)}; {_called(kind)} is needed: `dataflow train {kind} DATA`")
+    return session, facts_of(file, session, needed)
+
+
+def _called(kind: str) -> str:
+    """A kind with its article: a detector, an activity network."""
+    name = kind if kind.endswith(("er", "or")) else f"{kind} network"
+    return f"{'an' if name[:1] in 'aeiou' else 'a'} {name}"
+
+
 def open_network(file: Path, kind: str) -> Network:
     """Opens a network for one CPU thread, so that equal images give equal outputs on any load and core count.
 
     Raises NetworkFileError where the file is no network of this `kind` (`detector`, `segmenter`, `classifier`).
     """
-    session = open_session(file)
-    found = facts_of(file, session, ("kind",))["kind"]
-    if found != kind:
-        other = "an activity network" if found == "activity" else f"a {found}"
-        raise NetworkFileError(f"{file} is {other}; a {kind} is needed: `dataflow train {kind} DATA`")
-    facts = facts_of(file, session)
+    session, facts = open_kind(file, kind)
     inputs = session.get_inputs()
     size = (int(facts["width"]), int(facts["height"]))
     if len(inputs) != 1 or inputs[0].type != "tensor(float)" or list(inputs[0].shape) != [1, 3, size[1], size[0]]:
@@ -163,9 +179,6 @@ def training_seed(file: Path) -> int:
     Raises FileNotFoundError or NetworkFileError.
     """
     return int(read_facts(file).get("seed", 0))
-
-
-_IMAGES = ("kind", "classes", "width", "height")
 
 
 def facts_of(file: Path, session: onnxruntime.InferenceSession, needed: Sequence[str] = _IMAGES) -> dict[str, Any]:

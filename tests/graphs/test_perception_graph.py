@@ -60,6 +60,12 @@ def test_where_boxes_and_masks_are_given_no_network_runs() -> None:
     assert nodes["perception/objects"].inputs["boxes"] == ("robot1/perception/lifter/boxes",)
 
 
+def test_postures_reach_the_activities_wherever_there_is_depth() -> None:
+    nodes = load_graph(REPOSITORY / "graphs" / "perception.yaml").nodes
+    assert nodes["perception/postures"].inputs["clusters"] == ("robot1/perception/lifter/clusters",)
+    assert nodes["perception/people"].inputs["postures"] == ("robot1/perception/postures/postures",)
+
+
 @pytest.mark.parametrize(
     ("name", "folder", "cut", "left_out", "must"),
     [

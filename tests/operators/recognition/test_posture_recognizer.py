@@ -161,7 +161,9 @@ def test_equal_looks_give_equal_answers() -> None:
 
 def test_other_networks_and_other_frames_are_refused() -> None:
     given = {name: [message] for name, message in look(STANDING).items()}
-    with pytest.raises(OperatorFailure, match="is of kind 'activity'; a posture network is needed: train one by"):
+    with pytest.raises(
+        OperatorFailure, match="is an activity network; a posture network is needed: `dataflow train posture"
+    ):
         play(PostureRecognizer(weights=str(shipped("activity.onnx"))), given)
     elsewhere = Pose.from_matrix(np.eye(4), stamp=0, frame="odom", child_frame="lens")
     with pytest.raises(OperatorFailure, match="the pose is in 'odom', the nodes in 'map'"):

@@ -21,10 +21,12 @@ from operators.sources.simulator.classes import ACTIVITIES
 from operators.training import simulated_postures
 from operators.training.made_worlds import worlds
 from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, write_episodes
+from operators.weights import NetworkFileError
 
 pytest.importorskip("torch", reason="training needs the extra [train]")
 
-from operators.recognition.posture_training import mirrored
+from operators.recognition.posture_training import PostureTask, mirrored
+from operators.training.balance import class_weights
 from operators.training.commands import train
 
 
@@ -203,3 +205,24 @@ def test_a_mirrored_silhouette_has_a_mirrored_body() -> None:
     twice = mirrored(*once)
     np.testing.assert_array_equal(twice[0], shape)
     np.testing.assert_allclose(twice[1], body)
+
+
+def test_networks_of_other_windows_and_files_without_silhouettes_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "other.onnx"
+    shapes, bodies = np.zeros((7, 3, SIDE, SIDE), np.int8), np.zeros((7, BODY), np.float32)
+    made = Postures(shapes, bodies, np.arange(7))
+    task = PostureTask(made, made)
+    task.export(task.network.eval(), {"side": 32}, file)
+    with pytest.raises(NetworkFileError, match=r"is for windows \(side, half, middle\) \[32, "):
+        PostureModel.open(file)
+    np.savez(tmp_path / "foreign.npz", silhouettes=shapes)
+    with pytest.raises(ValueError, match=r"foreign.npz holds no activities, bodies: delete it"):
+        Postures.read(tmp_path / "foreign.npz")
+
+
+def test_rare_classes_count_more_but_not_by_all_that_they_lack() -> None:
+    labels = np.repeat([0, 1, 2], [90, 10, 1])
+    weights = class_weights(labels, 4).numpy()
+    np.testing.assert_allclose(weights[labels].mean(), 1, rtol=1e-5)
+    np.testing.assert_allclose(weights[1] / weights[0], 3, rtol=1e-5)
+    assert np.isfinite(weights).all()
