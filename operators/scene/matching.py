@@ -34,7 +34,7 @@ class MapSettings:
     margin: float = 0.1
     overlap: float = 0.25
     image_overlap: float = 0.3
-    confirm: float = 1.0
+    confirm: float = 1.25
     views: int = 3
     vacated: float = 1.0
     missed: float = 0.12

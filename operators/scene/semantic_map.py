@@ -88,7 +88,7 @@ class SemanticMap(Operator):
     image_overlap: float = Param(
         0.3, gt=0, le=1, doc="IoU in the image of an object's box and that of a view that is of it"
     )
-    confirm: float = Param(1.0, gt=0, doc="evidence from which an object is given, in log odds")
+    confirm: float = Param(1.25, gt=0, doc="evidence from which an object is given, in log odds")
     views: int = Param(3, ge=1, doc="and views from which it was seen; those less than 0.1 s after another count less")
     missed: float = Param(0.12, ge=0, doc="evidence that a view in which it is plain but not detected takes")
     plain: float = Param(0.03, gt=0, doc="angle of view from which an object should be detected", unit="rad")

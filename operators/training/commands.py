@@ -44,6 +44,7 @@ from operators.training.refining import BORDERS, REFINER, BorderEpochs, RefinerE
 from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data, variation_of
 from operators.training.torchvision_command import train_torchvision
 from operators.training.trunk_command import train_trunk
+from operators.training.views_commands import train_focus, train_reclassifier
 
 __all__ = ["evaluate", "train"]
 
@@ -60,7 +61,9 @@ train = typer.Typer(
     rich_markup_mode="rich",
 )
 train.command("activity")(train_activity)
+train.command("focus")(train_focus)
 train.command("posture")(train_posture)
+train.command("reclassifier")(train_reclassifier)
 train.command("torchvision")(train_torchvision)
 train.command("trunk")(train_trunk)
 for each in (REFINER, BORDERS):

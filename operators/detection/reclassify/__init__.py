@@ -1,0 +1,1 @@
+"""What small things are, by close-ups in the image's own resolution."""
