@@ -1,4 +1,4 @@
-"""Small things by the shipped detector alone, and with FocusDetector behind it, on worlds that neither has seen.
+"""Small things by the shipped detector alone, with FocusDetector and with Reclassifier behind it, on unseen worlds.
 
 python benchmarks/focus.py [--worlds 12] [--frames 16] [--size 640x480] [--focal 0.85] [--json]
 
@@ -20,7 +20,7 @@ from rich.progress import track
 from rich.table import Table
 
 from dataflow.messages import Detections2D
-from operators.detection import CustomDetector, FocusDetector
+from operators.detection import CustomDetector, FocusDetector, Reclassifier
 from operators.detection.custom.evaluation import DetectionScore, ScoredImage, score_detections
 from operators.detection.decode import Candidates
 from operators.detection.focus.model import FocusModel
@@ -61,25 +61,25 @@ def scored(taken: WorldImage, found: Detections2D) -> ScoredImage:
 
 def measured(count: int, frames: int, size: tuple[int, int], focal: float) -> dict[str, Kept]:
     """Detects in images of held-out worlds, alone and with a second look."""
-    detector, focus = CustomDetector(score_threshold=0.1), FocusDetector()
-    detector.setup()
-    focus.setup()
-    alone, both = Kept(), Kept()
+    detector, focus, names = CustomDetector(score_threshold=0.1), FocusDetector(), Reclassifier()
+    for operator in (detector, focus, names):
+        operator.setup()
+    kept = {"detector": Kept(), "FocusDetector behind it": Kept(), "Reclassifier behind that": Kept()}
     chosen = worlds(HELD_OUT, count)
     for world, seed in track(chosen, description="worlds", console=Console(stderr=True)):
-        alone.worlds.append([])
-        both.worlds.append([])
+        for each in kept.values():
+            each.worlds.append([])
         for taken in render(world, seed, frames, size, varied=False, focal=focal):
-            began = time.process_time()
-            first = detector.process(taken.image)
-            between = time.process_time()
-            second = focus.process(taken.image, first)
-            ended = time.process_time()
-            alone.worlds[-1].append(scored(taken, first))
-            both.worlds[-1].append(scored(taken, second))
-            alone.ms.append(1000 * (between - began))
-            both.ms.append(1000 * (ended - between))
-    return {"detector": alone, "with focus": both}
+            times = [time.process_time()]
+            found = [detector.process(taken.image)]
+            times.append(time.process_time())
+            for operator in (focus, names):
+                found.append(operator.process(taken.image, found[-1]))
+                times.append(time.process_time())
+            for each, made, spent in zip(kept.values(), found, np.diff(times).tolist(), strict=True):
+                each.worlds[-1].append(scored(taken, made))
+                each.ms.append(1000 * spent)
+    return kept
 
 
 def told(found: dict[str, Kept]) -> dict[str, Any]:
