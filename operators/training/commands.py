@@ -10,14 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from operators.training.console import (
-    Data,
-    Json,
-    SplitSeed,
-    friendly,
-    out_console,
-    score_words,
-)
+from operators.training.console import Data, Json, SplitSeed, friendly, out_console, score_words
 from operators.training.evaluation import evaluate
 from operators.training.options import (
     Backbone,
@@ -60,12 +53,11 @@ train = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
-train.command("activity")(train_activity)
-train.command("focus")(train_focus)
-train.command("posture")(train_posture)
-train.command("reclassifier")(train_reclassifier)
-train.command("torchvision")(train_torchvision)
-train.command("trunk")(train_trunk)
+for name, command in (
+    ("activity", train_activity), ("focus", train_focus), ("posture", train_posture),
+    ("reclassifier", train_reclassifier), ("torchvision", train_torchvision), ("trunk", train_trunk),
+):  # fmt: skip
+    train.command(name)(command)
 for each in (REFINER, BORDERS):
     train.command(each.kind)(command_of(each))
 

@@ -1,4 +1,4 @@
-"""What the focus network should say of a view, cell by cell."""
+"""Truth of a view, cell by cell, as the focus network should tell it."""
 
 from __future__ import annotations
 

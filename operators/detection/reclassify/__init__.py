@@ -1,1 +1,1 @@
-"""What small things are, by close-ups in the image's own resolution."""
+"""Classes of small things, by close-ups in the image's own resolution."""

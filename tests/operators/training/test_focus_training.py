@@ -66,10 +66,10 @@ def test_it_is_trained_scored_and_written_and_tells_neighbours_apart(tmp_path: P
     folder, out = tmp_path / "views", tmp_path / "focus.onnx"
     folder.mkdir()
     for k, world in enumerate(worlds(simulated_views.TRAINING, 2, INDOOR)):
-        shelves(range(80 * k, 80 * k + 80)).write(file_of(folder, world))
+        shelves(range(64 * k, 64 * k + 64)).write(file_of(folder, world))
     shelves(range(1000, 1008)).write(file_of(folder, worlds(simulated_views.VALIDATION, 1, INDOOR)[0]))
-    words = ["focus", str(folder), "--out", str(out), "--worlds", "2", "--validation", "1", "--epochs", "8",
-             "--batch", "8", "--evaluate-every", "8"]  # fmt: skip
+    words = ["focus", str(folder), "--out", str(out), "--worlds", "2", "--validation", "1", "--epochs", "7",
+             "--batch", "8", "--evaluate-every", "7"]  # fmt: skip
     done = CliRunner().invoke(train, [*words, "--json"])
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["scores"]["ap50_book"] > 0.5
