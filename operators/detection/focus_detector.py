@@ -17,7 +17,7 @@ from operators.detection.decode import Candidates
 from operators.detection.focus.model import FocusModel
 from operators.detection.focus.regions import Region, pixels_of, regions
 from operators.detection.nms import intersection_over_union
-from operators.detection.small import by_score, indices, of_classes, require_same_image, small_ones
+from operators.detection.some import by_score, indices, of_classes, require_same_image, small_ones
 from operators.network_input import three_channels
 from operators.weights import shipped
 

@@ -13,11 +13,13 @@ from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.nms import intersection_over_union
 from operators.detection.reclassify.model import ReclassifierModel
-from operators.detection.small import by_score, indices, require_same_image, small_ones
+from operators.detection.some import indices, require_same_image, rows_of, small_ones
 from operators.network_input import three_channels
 from operators.weights import shipped
 
 F32 = NDArray[np.float32]
+
+_LEAST = 1e-12  # probability: a detector may know none of the classes that the close-up is like
 
 
 class Reclassifier(Operator):
@@ -56,14 +58,15 @@ class Reclassifier(Operator):
         ids = indices(detections.class_names, self._model.classes)
         before = detections.class_ids[rows]
         belief = np.where(ids == before[:, None], 1.0, self.doubt) * (ids >= 0)
-        likely = self._model.judge(pixels, detections.boxes[rows]) * belief
+        likely = np.maximum(self._model.judge(pixels, detections.boxes[rows]), _LEAST) * belief
         likely /= likely.sum(axis=1, keepdims=True)
         classes, scores = detections.class_ids.copy(), detections.scores.copy()
         classes[rows] = ids[likely.argmax(axis=1)]
         scores[rows] *= likely.max(axis=1).astype(np.float32)
         self._counts["renamed"] += int((classes[rows] != before).sum())
         kept = _without_renamed_doubles(detections, classes, scores, rows, self.nms_iou)
-        return by_score(detections, detections.boxes[kept], scores[kept], classes[kept])
+        order = np.argsort(-scores, kind="stable")
+        return rows_of(detections.replace(class_ids=classes, scores=scores), order[kept[order]])
 
     def snapshot(self) -> Mapping[str, Any]:
         return dict(self._counts)

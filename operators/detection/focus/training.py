@@ -98,7 +98,8 @@ class FocusTask:
         }
 
     def evaluate(self, network: nn.Module) -> dict[str, float]:
-        deployed = DeployedFocus(network).eval()  # type: ignore[arg-type]
+        assert isinstance(network, FocusNetwork)
+        deployed = DeployedFocus(network).eval()
         device = next(network.parameters()).device
 
         def answer(pixels: U8) -> tuple[F32, F32]:

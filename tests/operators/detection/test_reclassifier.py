@@ -85,6 +85,25 @@ def test_a_renamed_box_joins_a_surer_one_of_its_new_class(monkeypatch: pytest.Mo
     assert both.labels() == ("ball", "ball")  # the detector kept them apart
 
 
+def test_all_that_is_told_of_a_detection_stays_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ReclassifierModel, "judge", sure_of("ball"))
+    given = detections(("mug", 0.8, (60, 60, 80, 80)), ("ball", 0.7, (110, 50, 125, 65))).replace(
+        ids=np.array([7, 9]), visible=np.array([0.5, 1.0], np.float32)
+    )
+    made = opened(doubt=0.01).process(BLANK, given)
+    assert made.ids is not None
+    assert dict(zip(made.ids.tolist(), made.labels(), strict=True)) == {7: "mug", 9: "ball"}
+    assert made.ids.tolist() == [9, 7]
+
+
+def test_a_detector_of_one_class_keeps_it_where_the_closeup_is_like_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ReclassifierModel, "judge", lambda _, __, boxes: np.eye(6, dtype=np.float32)[[1] * len(boxes)])
+    given = detections(("mug", 0.8, (60, 60, 80, 80))).replace(class_names=("mug",))
+    made = opened().process(BLANK, given)
+    assert made.labels() == ("mug",)
+    assert made.scores.tolist() == given.scores.tolist()
+
+
 def test_fewer_small_things_of_the_recording_have_a_wrong_name(drive: Drive) -> None:
     operator = opened()
     made = [operator.process(*each) for each in zip(drive.images, drive.detections, strict=True)]

@@ -1,4 +1,4 @@
-"""The small ones among detections, which operators look at once more."""
+"""Some of the detections of a message, such as the small ones, which operators look at once more."""
 
 from __future__ import annotations
 
@@ -34,6 +34,13 @@ def small_ones(detections: Detections2D, names: Sequence[str], largest: float) -
 def indices(known: Sequence[str], names: Sequence[str]) -> NDArray[np.int32]:
     """Returns where each name (N,) is among those known; -1 where it is not."""
     return np.array([known.index(name) if name in known else -1 for name in names], np.int32)
+
+
+def rows_of(detections: Detections2D, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Detections2D:
+    """Returns some detections, in that order, with all that is told of them."""
+    return detections.replace(
+        **{name: value[rows] for name, value in detections.items() if isinstance(value, np.ndarray)}
+    )
 
 
 def by_score(
