@@ -9,18 +9,16 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.scene.box_images import CORNERS, ELLIPSE, images, lies_across, spines
 from operators.scene.class_sizes import Usual
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Box = tuple[Array, Array, float]
 """Centre (3,), full size (3,) and heading about the vertical of an upright box."""
 
-_SIGNS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_AROUND = np.radians(22.5 + 45 * np.arange(8))
-_ELLIPSE = np.array([[0.52 * np.cos(a), 0.52 * np.sin(a), z] for a in _AROUND for z in (-0.5, 0.5)])
 _STEPS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.02])  # of centre, m; of log sizes; of heading, rad
 _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
-_NEAREST = 0.1  # metres before the camera from which a corner has a place in the image
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TAIL = 0.8  # standard deviations of noise by which the outermost of accumulated points are beyond a side
@@ -28,6 +26,7 @@ _TAIL_FLAT, _TAIL_ROUND = 2.3, 1.4  # and those of single views, on flat sides a
 _ASKEW = 8.0  # cost of lying otherwise than most things around
 _TURN, _TURN_ALONG = 0.1, 0.03  # radians by which the heading that points show strays, and that of a room
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
+_SIDES = np.array([True, False, True, False])  # of an image box, that neighbours hide
 _SIZES = 4  # residuals, the last ones, that compare heading and sizes with what is known
 _ALIKE = 6  # views that tell as much as more do, since their errors are alike
 _ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
@@ -58,6 +57,7 @@ def fit_cuboid(
     noise: float = 0.0,
     *,
     raw: bool = False,
+    front: float | None = None,
 ) -> tuple[int, Box, Array]:
     """Returns the upright box that agrees best with image boxes, with points (N, 3) of its surface, and with its class.
 
@@ -69,11 +69,17 @@ def fit_cuboid(
     only that one is tried. Last comes by how many standard deviations each view's edges stray from that box (V,).
 
     `noise` is that of ranges at one metre, m; it grows by the square. Points are `raw` that are of single views.
+    `front` is the heading of the front of the case that the thing stands in, either way along it, if it does: then its
+    spine is there, and its image ends anywhere between the sides of its spine and its own, since others hide the rest.
     After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
-    logs, spreads, along = _priors(tuple(usual))
+    logs, spreads, along, spine = _priors(tuple(usual))
+    spine = spine & (front is not None)
     ways = len(logs)
     eyes = np.stack([v.eye for v in views])
+    if before is not None and front is not None and spine[before[0] % ways]:
+        center, size, yaw = before[1]
+        before = None if _shows_cover(np.array([[*center, *size, yaw]]), front)[0] else before
     if before is None:
         x, forms = _starts(start, eyes, logs), np.arange(ways)
         if heading is not None:
@@ -81,17 +87,21 @@ def fit_cuboid(
             x = np.concatenate([x, _starts(_along(points, turned), eyes, logs)])
             forms = np.concatenate([forms[~along], forms + ways])
             x = x[forms]
+        if front is not None:
+            usually = np.concatenate([x[:, :3], logs[forms % ways], x[:, 6:]], axis=1)
+            shown = ~(spine[forms % ways] & _shows_cover(usually, front))
+            x, forms = x[shown], forms[shown]
         headings = x[:, 6].copy()
     else:
         form, box = before
         form += ways if heading is not None and form < ways and along[form] else 0  # it settled before that was known
         forms, x = np.array([form]), np.array([[*box[0], *np.log(box[1]), box[2]]])
         headings = np.array([_nearest_turn(box[2], heading if heading is not None and form >= ways else start[2])])
-    logs, spreads = logs[forms % ways], spreads[forms % ways]
+    logs, spreads, spine = logs[forms % ways], spreads[forms % ways], spine[forms % ways]
     turns = np.where(along[forms % ways] & (forms >= ways), _TURN_ALONG, _TURN)
-    outline = _ELLIPSE if usual and usual[0].round else _SIGNS
+    outline = ELLIPSE if usual and usual[0].round else CORNERS
     inset = usual[0].inset if usual else 0.0
-    noise *= (_TAIL_ROUND if outline is _ELLIPSE else _TAIL_FLAT) if raw else _TAIL
+    noise *= (_TAIL_ROUND if outline is ELLIPSE else _TAIL_FLAT) if raw else _TAIL
     P = np.stack([v.P for v in views], axis=1)
     places = np.concatenate([points, eyes]).T.copy()
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
@@ -101,7 +111,11 @@ def fit_cuboid(
     def residuals(rows: Array) -> Array:
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
         flat = rows.reshape(-1, 7)
-        image = ((_images(flat, P, outline) - boxes) * weights).reshape(len(flat), -1)
+        image = images(flat, P, outline) - boxes
+        if front is not None and spine.any():
+            own = np.repeat(spine, rows.shape[1])[:, None, None] & _SIDES
+            image = np.where(own, _nearer(image, spines(flat, P, eyes, front) - boxes), image)
+        image = (image * weights).reshape(len(flat), -1)
         image[np.isnan(image)] = 0.0
         turn = ((rows[..., 6] - headings[:, None]) / turns[:, None]).reshape(-1, 1)
         size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
@@ -115,7 +129,7 @@ def fit_cuboid(
         if turn == _CHOICE and len(x) > 1:
             kept = np.argsort(_cost(r) + askew, kind="stable")[:2]
             x, r, J, headings, logs, spreads = (a[kept] for a in (x, r, J, headings, logs, spreads))
-            forms, askew, turns = forms[kept], askew[kept], turns[kept]
+            forms, askew, turns, spine = forms[kept], askew[kept], turns[kept], spine[kept]
         weighted = J * _influence(r)[:, None]
         A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
         step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
@@ -143,6 +157,16 @@ def _influence(r: Array) -> Array:
     return np.asarray(weights)
 
 
+def _shows_cover(rows: Array, front: float) -> Mask:
+    """Tells of boxes (K, 7) whether the longer of their sides on the ground lies across the heading of a front."""
+    return np.asarray(lies_across(rows, front) == (rows[:, 3] > rows[:, 4]))
+
+
+def _nearer(own: Array, other: Array) -> Array:
+    """Returns how far places are from the nearer of two, given how far from each; 0 between them."""
+    return np.where(own * other < 0, 0.0, np.where(np.abs(other) < np.abs(own), other, own))
+
+
 def _nearest_turn(yaw: float, towards: float) -> float:
     """Returns the heading nearest to `yaw` that is `towards` or turned from it by quarters."""
     return float(yaw + np.remainder(towards - yaw + np.pi / 4, np.pi / 2) - np.pi / 4)
@@ -158,19 +182,21 @@ def _along(points: Array, yaw: float) -> Box:
 
 
 @lru_cache(maxsize=64)  # as many classes
-def _priors(usual: tuple[Usual, ...]) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _priors(usual: tuple[Usual, ...]) -> tuple[Array, Array, Mask, Mask]:
     """Returns the usual log sizes (A, 3), their spreads, with the sides on the ground either way round, and which of
-    them (A,) always lie along the room.
+    them (A,) always lie along the room and which show their spines.
     """
     rows = []
     for each in usual:
         a, b, c = each.size
-        rows.append(((a, b, c), each.spread, each.along))
+        rows.append(((a, b, c), each.spread, each.along, each.spine))
         if b > 1.3 * a:
-            rows.append(((b, a, c), (each.spread[1], each.spread[0], each.spread[2]), each.along))
+            turned = (each.spread[1], each.spread[0], each.spread[2])
+            rows.append(((b, a, c), turned, each.along, each.spine))
     if not rows:
-        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0), False))
-    return np.log([row[0] for row in rows]), np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
+        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0), False, False))
+    sizes, spreads, along, spine = (np.array(each) for each in zip(*rows, strict=True))
+    return np.log(sizes), spreads, along, spine
 
 
 def _starts(start: Box, eyes: Array, logs: Array) -> Array:
@@ -186,42 +212,6 @@ def _starts(start: Box, eyes: Array, logs: Array) -> Array:
     rows[:, :3], rows[:, 3:6], rows[:, 6] = center, np.log(sizes), yaw
     rows[:, :2] += axes[deep] * np.sign(along[deep]) * lack[:, None] / 2
     return rows
-
-
-def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
-    """Returns the image boxes (K, 4) of upright boxes (K, 7), centre, sizes and heading, NaN where partly behind.
-
-    `rounded` (K,) says which hold something of round outline.
-    """
-    rows = boxes.copy()
-    rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
-    image = _images(rows, P[:, None], _SIGNS)[:, 0]
-    if rounded.any():
-        image[rounded] = _images(rows[rounded], P[:, None], _ELLIPSE)[:, 0]
-    return image
-
-
-def _images(rows: Array, P: Array, outline: Array) -> Array:
-    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (3, V, 4), NaN where partly behind the camera.
-
-    `outline` (C, 3) are the places in a box of side 1 that are looked at: the first axis of what is worked with, along
-    which extremes are found many times as fast.
-    """
-    c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
-    x, y, z = outline.T[..., None] * np.exp(rows.T[3:6, None])
-    places = np.empty((3, len(outline), len(rows)))
-    np.subtract(c * x, s * y, out=places[0])
-    np.add(s * x, c * y, out=places[1])
-    places[2] = z
-    places += rows.T[:3, None]
-    seen = places.reshape(3, -1).T @ P[..., :3].reshape(-1, 3).T
-    seen += P[..., 3].ravel()
-    seen = seen.reshape(len(outline), len(rows), 3, -1)
-    depth = np.maximum(seen[:, :, 2], 1e-6)
-    uv = seen[:, :, :2] / depth[:, :, None]
-    image = np.concatenate([np.minimum.reduce(uv, axis=0), np.maximum.reduce(uv, axis=0)], axis=1).transpose(0, 2, 1)
-    image[np.minimum.reduce(depth, axis=0) < _NEAREST] = np.nan
-    return image
 
 
 def _surface(rows: Array, places: Array, count: int, noise: float, inset: float) -> Array:

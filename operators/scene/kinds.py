@@ -69,6 +69,14 @@ class Kinds:
         """Tells whether things of a class often stand side by side."""
         return any(u.rows for u in self.usual.get(class_id, ()))
 
+    def is_case(self, object: MapObject) -> bool:
+        """Tells whether things stand in an object side by side."""
+        return any(u.case for u in self.usual.get(object.class_id, ()))
+
+    def shows_spine(self, object: MapObject) -> bool:
+        """Tells whether things of an object's class show their spines where they stand in a case."""
+        return any(u.spine for u in self.usual.get(object.class_id, ()))
+
     def foot(self, object: MapObject) -> float:
         """Returns how much of an object's foot may be hidden, metres; 0 where its class does not stand on the floor."""
         return max((u.foot for u in self.usual.get(object.class_id, ())), default=0.0)

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.scene.box_images import image_boxes, spine_boxes
 from operators.scene.cells import Cells, standing_box
-from operators.scene.cuboid import ImageView, image_boxes
+from operators.scene.cuboid import ImageView
 from operators.scene.map_object import MapObject
 from operators.tracking.assignment import overlap
 
@@ -130,18 +131,30 @@ class InImages:
         return InImage(float(self.iou[observation, object]), float(self.within[observation, object]))
 
 
-def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> InImages | None:
-    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without any."""
+def in_image(
+    seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_], fronts: Array | None = None
+) -> InImages | None:
+    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without any.
+
+    What stands in a case with a front, a heading in `fronts` (M,), else NaN, may show its spine alone.
+    """
     if not len(rows) or any(each.image is None for each in seen):
         return None
     images = [each.image for each in seen if each.image is not None]
     boxes = np.stack([image.box for image in images])
     known = image_boxes(rows, images[0].P, rounded)
+    in_case = np.flatnonzero(np.isfinite(fronts)) if fronts is not None else np.zeros(0, np.intp)
+    spines = known[in_case]
+    if fronts is not None and len(in_case):
+        spines[:, ::2] = spine_boxes(rows[in_case], images[0].P, images[0].eye, fronts[in_case])[:, ::2]
     beyond = ~np.stack([image.edges for image in images])
     for k, edge in np.argwhere(beyond).tolist():  # what reaches beyond the image is cut off there
         cut = np.maximum if edge < 2 else np.minimum
-        known[:, edge % 2 :: 2] = cut(known[:, edge % 2 :: 2], boxes[k, edge])
+        for each in (known, spines):
+            each[:, edge % 2 :: 2] = cut(each[:, edge % 2 :: 2], boxes[k, edge])
     iou = np.nan_to_num(overlap(boxes, known))
+    if len(in_case):
+        iou[:, in_case] = np.maximum(iou[:, in_case], np.nan_to_num(overlap(boxes, spines)))
     low = np.maximum(boxes[:, None, :2], known[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], known[None, :, 2:])
     areas = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6).prod(axis=1)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.carrying import carried
+from operators.scene.cases import fronts, stands
 from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
@@ -113,8 +114,7 @@ class ObjectMap:
 
     def confirmed(self) -> list[MapObject]:
         """Returns the objects that are surely there, by rising id."""
-        s = self._settings
-        sure = [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.sightings >= s.views]
+        s, sure = self._settings, [o for _, o in sorted(self.objects.items()) if self._is_sure(o)]
         called = (o for o in sure if o.label >= s.label or not self._kinds.may_leave(o))
         return [o for o in called if self._kinds.may_be_so_large(o)]
 
@@ -148,7 +148,9 @@ class ObjectMap:
         here = ~moves & (near <= s.reach) & (still | ~movers[:, None])
         compared = np.flatnonzero(here.any(axis=0)).tolist()
         boxes = np.column_stack([centers, sizes, [o.yaw for o in known]])[compared]
-        images = in_image(seen, boxes, np.array([self._kinds.is_round(known[j]) for j in compared], bool))
+        near_by = [known[j] for j in compared]
+        in_case = np.where([stands(o) for o in near_by], self._fronts(near_by), np.nan)
+        images = in_image(seen, boxes, np.array([self._kinds.is_round(o) for o in near_by], bool), in_case)
         for k, n in np.argwhere(here[:, compared]).tolist():
             j, image = compared[n], None if images is None else images.of(k, n)
             value[k, j] = alike(seen[k], cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
@@ -202,9 +204,16 @@ class ObjectMap:
 
     def _fit(self, object: MapObject) -> None:
         s, others = self._settings, smaller_in_place(object, self.objects.values(), self._kinds, self._settings)
-        object.fit(self._kinds.usual, self._heading, s.range_noise, self.floor, others)
+        front = None if math.isnan(found := float(self._fronts([object])[0])) else found
+        object.fit(self._kinds.usual, self._heading, s.range_noise, self.floor, others, front)
         if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
             object.stand_on(self.floor, foot)
+
+    def _fronts(self, objects: Sequence[MapObject]) -> Array:
+        return fronts(objects, (o for o in self.objects.values() if self._is_sure(o)), self._kinds)
+
+    def _is_sure(self, object: MapObject) -> bool:
+        return object.evidence >= self._settings.confirm and object.sightings >= self._settings.views
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)

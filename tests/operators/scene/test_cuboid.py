@@ -8,10 +8,11 @@ from made_scene import FOCAL, camera
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from operators.scene.box_images import image_boxes, images
 from operators.scene.box_overlap import shared_volume, upright_iou
 from operators.scene.cells import standing_box
 from operators.scene.class_sizes import CLASS_SIZES
-from operators.scene.cuboid import Box, ImageView, _images, _surface, fit_cuboid, image_boxes
+from operators.scene.cuboid import Box, ImageView, _surface, fit_cuboid
 
 K = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
 ALL = np.ones(4, np.bool_)
@@ -130,7 +131,7 @@ def boxes_and_views(count: int, views: int) -> tuple[NDArray[np.float64], NDArra
 def test_images_of_boxes_hold_the_corners_as_each_view_projects_them(count: int, views: int) -> None:
     rows, P = boxes_and_views(count, views)
     outline = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    found = _images(rows, P, outline)
+    found = images(rows, P, outline)
     for k, row in enumerate(rows):
         c, s = np.cos(row[6]), np.sin(row[6])
         corners = (outline * np.exp(row[3:6])) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]) + row[:3]

@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from operators.scene.box_images import image_boxes
 from operators.scene.class_sizes import Usual
-from operators.scene.cuboid import ImageView, image_boxes
+from operators.scene.cuboid import ImageView
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings, Observation
 from operators.scene.object_map import ObjectMap
