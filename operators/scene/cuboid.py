@@ -22,7 +22,11 @@ _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TAIL = 0.8  # standard deviations of noise by which the outermost of accumulated points are beyond a side
-_TAIL_FLAT, _TAIL_ROUND = 2.3, 1.4  # and those of single views, on flat sides and on round ones, which recede
+_TAIL_FLAT, _TAIL_ROUND = 1.4, 0.8  # and those of single views, on flat sides and on round ones, which recede
+_STRAYING, _STRAYING_RAW = (
+    1 / 40,
+    1 / 10,
+)  # share of points on each side that may be others', and of those of single views
 _ASKEW = 8.0  # cost of lying otherwise than most things around
 _TURN, _TURN_ALONG = 0.1, 0.03  # radians by which the heading that points show strays, and that of a room
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
@@ -102,6 +106,7 @@ def fit_cuboid(
     outline = ELLIPSE if usual and usual[0].round else CORNERS
     inset = usual[0].inset if usual else 0.0
     noise *= (_TAIL_ROUND if outline is ELLIPSE else _TAIL_FLAT) if raw else _TAIL
+    cut = int(len(points) * (_STRAYING_RAW if raw else _STRAYING))
     P = np.stack([v.P for v in views], axis=1)
     places = np.concatenate([points, eyes]).T.copy()
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
@@ -119,7 +124,7 @@ def fit_cuboid(
         image[np.isnan(image)] = 0.0
         turn = ((rows[..., 6] - headings[:, None]) / turns[:, None]).reshape(-1, 1)
         size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
-        parts = [image, _surface(flat, places, len(points), noise, inset), turn, size]
+        parts = [image, _surface(flat, places, len(points), cut, noise, inset), turn, size]
         return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
 
     askew = np.where((forms < ways) & (heading is not None), _ASKEW, 0.0)
@@ -214,10 +219,11 @@ def _starts(start: Box, eyes: Array, logs: Array) -> Array:
     return rows
 
 
-def _surface(rows: Array, places: Array, count: int, noise: float, inset: float) -> Array:
+def _surface(rows: Array, places: Array, count: int, cut: int, noise: float, inset: float) -> Array:
     """Returns by how much the points' extents differ from the sides of boxes (K, 7): (K, 6), in standard deviations.
 
-    `places` (3, N) are `count` points, then the eyes. Sides that no view sees may be farther out than the points.
+    `places` (3, N) are `count` points, then the eyes; `cut` points on each side are left out. Sides that no view sees
+    may be farther out than the points.
     """
     c, s = np.cos(rows[:, 6, None]), np.sin(rows[:, 6, None])
     half = np.exp(rows[:, 3:6]) / 2
@@ -226,7 +232,6 @@ def _surface(rows: Array, places: Array, count: int, noise: float, inset: float)
     np.add(c * x, s * y, out=local[:, 0])
     np.subtract(c * y, s * x, out=local[:, 1])
     np.subtract(places[2], rows[:, 2:3], out=local[:, 2])
-    cut = count // 40
     low, high = _extents(local[..., :count], cut)
     residual = np.concatenate([low + half, half - high], axis=1)
     eye = local[..., count:]
