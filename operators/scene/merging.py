@@ -13,8 +13,8 @@ from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, MapObject
 from operators.scene.matching import MapSettings, closeness, tolerance
 
-_COVERED = 0.25  # share of the smaller of two boxes that both have, from which they are one
-_APART_COVERED = 0.5  # that share where both are seen beside each other
+_COVERED = 0.15  # share of the smaller of two boxes that both have, from which they are one
+_APART_COVERED = 0.3  # that share where both are seen beside each other
 _PART = 0.4  # that share where the classes differ
 _LIKE = 6.0  # times smaller, and what is in the other is no part of it
 _NEAR, _NEAR_MOVERS = 0.1, 0.3  # metres that the bounds of two entries of one thing are apart at most
