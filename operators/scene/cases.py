@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,16 @@ _AROUND = 0.1  # metres by which the box of a case may be too small
 _STANDS = 1.5  # times as high as thin is what stands
 
 
-def fronts(objects: Sequence[MapObject], cases: Iterable[MapObject], kinds: Kinds) -> Array:
+def fronts(objects: Sequence[MapObject], cases: Sequence[MapObject], kinds: Kinds) -> Array:
     """Returns for each object (N,) the heading along which the case lies deep that it is in, rad; NaN where in none."""
     found = np.full(len(objects), np.nan)
     rows = [k for k, o in enumerate(objects) if kinds.shows_spine(o)]
-    known = [o for o in cases if kinds.is_case(o)]
-    if not rows or not known:
+    if not rows or not cases:
         return found
     middles = np.array([objects[k].cells.middle for k in rows])
-    yaws = np.array([o.yaw for o in known])
-    sizes = np.array([o.size for o in known])
-    way = middles[:, None] - np.array([o.center for o in known])
+    yaws = np.array([o.yaw for o in cases])
+    sizes = np.array([o.size for o in cases])
+    way = middles[:, None] - np.array([o.center for o in cases])
     c, s = np.cos(yaws), np.sin(yaws)
     local = np.stack([c * way[..., 0] + s * way[..., 1], c * way[..., 1] - s * way[..., 0], way[..., 2]], axis=-1)
     away = np.linalg.norm(np.maximum(np.abs(local) - sizes / 2, 0), axis=2)

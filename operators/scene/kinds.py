@@ -31,6 +31,8 @@ class Kinds:
         """`telling` says how much a label counts, where that is not 1; `carriers` may hold what is `portable`."""
         self.carriers, self.portable = frozenset(carriers), frozenset(portable)
         self.movers, self.usual, self._telling = frozenset(movers), dict(usual), dict(telling or {})
+        self._cases = frozenset(i for i, usual in self.usual.items() if any(u.case for u in usual))
+        self._spines = frozenset(i for i, usual in self.usual.items() if any(u.spine for u in usual))
         self._largest = {i: max((max(u.size) for u in self.usual.get(i, ())), default=0.0) for i in self.movers}
         self._most = {
             i: [[size * math.exp(_ODD * spread) for size, spread in zip(u.size, u.spread, strict=True)] for u in usual]
@@ -71,11 +73,11 @@ class Kinds:
 
     def is_case(self, object: MapObject) -> bool:
         """Tells whether things stand in an object side by side."""
-        return any(u.case for u in self.usual.get(object.class_id, ()))
+        return object.class_id in self._cases
 
     def shows_spine(self, object: MapObject) -> bool:
         """Tells whether things of an object's class show their spines where they stand in a case."""
-        return any(u.spine for u in self.usual.get(object.class_id, ()))
+        return object.class_id in self._spines
 
     def foot(self, object: MapObject) -> float:
         """Returns how much of an object's foot may be hidden, metres; 0 where its class does not stand on the floor."""

@@ -77,6 +77,7 @@ class ObjectMap:
         self._stamp: int | None = None
         self._room, self._updates = RoomHeading(), 0
         self._heading: float | None = None
+        self._cases: list[MapObject] = []
         self.floor: float | None = None
         """Height of the floor, where it is known: what stands on it reaches down to it."""
 
@@ -89,6 +90,7 @@ class ObjectMap:
             self._room.add(view.points)
         self._updates += 1
         self._heading = self._room.angle
+        self._cases = [o for o in self.objects.values() if self._kinds.is_case(o) and self._is_sure(o)]
         seen = [self._alone(each, view) for each in seen]
         cells = Cells.of_each([each.points for each in seen], s.voxel)
         joined = self._joined(seen, cells, stamp, view)
@@ -149,7 +151,7 @@ class ObjectMap:
         compared = np.flatnonzero(here.any(axis=0)).tolist()
         boxes = np.column_stack([centers, sizes, [o.yaw for o in known]])[compared]
         near_by = [known[j] for j in compared]
-        in_case = np.where([stands(o) for o in near_by], self._fronts(near_by), np.nan)
+        in_case = np.where([stands(o) for o in near_by], fronts(near_by, self._cases, self._kinds), np.nan)
         images = in_image(seen, boxes, np.array([self._kinds.is_round(o) for o in near_by], bool), in_case)
         for k, n in np.argwhere(here[:, compared]).tolist():
             j, image = compared[n], None if images is None else images.of(k, n)
@@ -204,13 +206,10 @@ class ObjectMap:
 
     def _fit(self, object: MapObject) -> None:
         s, others = self._settings, smaller_in_place(object, self.objects.values(), self._kinds, self._settings)
-        front = None if math.isnan(found := float(self._fronts([object])[0])) else found
+        front = None if math.isnan(found := float(fronts([object], self._cases, self._kinds)[0])) else found
         object.fit(self._kinds.usual, self._heading, s.range_noise, self.floor, others, front)
         if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
             object.stand_on(self.floor, foot)
-
-    def _fronts(self, objects: Sequence[MapObject]) -> Array:
-        return fronts(objects, (o for o in self.objects.values() if self._is_sure(o)), self._kinds)
 
     def _is_sure(self, object: MapObject) -> bool:
         return object.evidence >= self._settings.confirm and object.sightings >= self._settings.views
