@@ -27,6 +27,7 @@ from operators.recognition import activity_score
 from operators.scene import SceneGraphBuilder
 from operators.scene.scoring import PREDICATES, RelationScore, score_nodes
 
+SCOPES = ("mapped", "all")
 ARRIVALS = ("sitting_down", "sitting", "reaching")
 
 
@@ -123,8 +124,9 @@ def run(world: World, every: int, *, true: bool) -> dict[str, Any]:
             of_drive.add(out["graph"], frame.scene, of, set(of) if true else whole, () if true else ignored)
     return figures | {
         "relations": relations.counts,
-        "f1 mapped": relations.f1("mapped"),
-        "f1 all": relations.f1("all"),
+        **{f"f1 {scope}": relations.f1(scope) for scope in SCOPES},
+        **{f"edge precision {scope}": relations.precision(scope) for scope in SCOPES},
+        **{f"edge recall {scope}": relations.recall(scope) for scope in SCOPES},
         "f1 whole drive": of_drive.f1("all"),
         "acts": compare_acts(world, frames, made),
         "goals": goals(frames, graphs) if true else {},
@@ -152,7 +154,8 @@ def main() -> None:
     for fed, worlds in rows.items():
         if not worlds:
             continue
-        for key in ("recall", "precision", "f1 mapped", "f1 all", "f1 whole drive"):
+        edges = [f"{what} {scope}" for what in ("f1", "edge precision", "edge recall") for scope in SCOPES]
+        for key in ("recall", "precision", *edges, "f1 whole drive"):
             values = [r[key] for r in worlds if key in r]
             if values:
                 print(f"{fed} {key}: mean {np.mean(values):.3f}, worst {min(values):.3f}")

@@ -69,6 +69,18 @@ def test_relations_with_a_node_of_nothing_are_false() -> None:
     assert f1(mine, {11, 12}) == pytest.approx(0.8)
 
 
+def test_precision_and_recall_of_relations_count_what_is_false_and_what_is_missed() -> None:
+    nodes = {21: ("mug", 1.0), 22: ("table", 2.0), 24: ("mug", 9.0)}
+    mine = graph(nodes, [(22, "on", FLOOR), (24, "near", 22), (24, "left_of", 22)])  # one right, two false, one missed
+    score, relations = score_nodes(mine, TRUTH, {11, 12}), RelationScore()
+    relations.add(mine, TRUTH, score.match, {11, 12}, score.ignored)
+    assert relations.precision("all") == pytest.approx(1 / 3)
+    assert relations.recall("all") == pytest.approx(1 / 2)
+    assert relations.precision("mapped") == 1.0
+    assert relations.recall("mapped", " near") == 0.0
+    assert np.isnan(relations.precision("mapped", " near"))
+
+
 def test_what_is_mapped_scores_by_itself() -> None:
     mine = graph({21: ("mug", 1.0), 23: ("ball", 3.0)}, [(21, "near", 23)])
     relations = RelationScore()
