@@ -14,6 +14,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,17 +74,22 @@ class Network:
 
 
 def open_kind(
-    file: Path, kind: str, needed: Sequence[str] = _IMAGES
+    file: Path, kind: str, needed: Sequence[str] = _IMAGES, made_for: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[onnxruntime.InferenceSession, dict[str, Any]]:
     """Opens a network of a kind, whatever its inputs are; returns it with its metadata.
 
-    Raises FileNotFoundError, or NetworkFileError for one of another kind or without the metadata that are needed.
+    Raises FileNotFoundError, or NetworkFileError for one of another kind, without the metadata that are needed, or with
+    others than it must be `made_for`.
     """
     session = open_session(file)
     found = facts_of(file, session, ("kind",))["kind"]
     if found != kind:
         raise NetworkFileError(f"{file} is {_called(found)}; {_called(kind)} is needed: `dataflow train {kind} DATA`")
-    return session, facts_of(file, session, needed)
+    facts = facts_of(file, session, needed)
+    if any(facts.get(name) != value for name, value in made_for.items()):
+        given, wanted = (", ".join(f"{name} {values.get(name)}" for name in made_for) for values in (facts, made_for))
+        raise NetworkFileError(f"{file} is made for {given}, not {wanted}: `dataflow train {kind}` makes one")
+    return session, facts
 
 
 def _called(kind: str) -> str:

@@ -15,7 +15,7 @@ from operators.detection.decode import Candidates
 from operators.detection.focus.cells import MULTIPLE, STRIDE
 from operators.detection.focus.regions import Region
 from operators.detection.nms import merging_nms
-from operators.weights import NetworkFileError, open_kind
+from operators.weights import open_kind
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -40,13 +40,7 @@ class FocusModel:
     @classmethod
     def open(cls, file: Path) -> FocusModel:
         """Raises FileNotFoundError, or NetworkFileError where the file is no focus network of our cells."""
-        session, facts = open_kind(file, KIND, ("classes",))
-        given, wanted = [facts.get(name) for name in ("stride", "multiple")], [STRIDE, MULTIPLE]
-        if given != wanted:
-            raise NetworkFileError(
-                f"{file} has cells and a multiple (stride, multiple) of {given} pixels, not {wanted}: "
-                f"`dataflow train {KIND}` makes one"
-            )
+        session, facts = open_kind(file, KIND, ("classes",), {"stride": STRIDE, "multiple": MULTIPLE})
         return cls(tuple(map(str, facts["classes"])), session)
 
     def found(self, pixels: U8, regions: Sequence[Region], least: float, nms_iou: float, most: int) -> Candidates:

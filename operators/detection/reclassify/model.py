@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.reclassify.closeups import AROUND, SIDE, closeups
-from operators.weights import NetworkFileError, open_kind
+from operators.weights import open_kind
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -29,12 +29,7 @@ class ReclassifierModel:
     @classmethod
     def open(cls, file: Path) -> ReclassifierModel:
         """Raises FileNotFoundError, or NetworkFileError where the file is no network for our close-ups."""
-        session, facts = open_kind(file, KIND, ("classes",))
-        given, wanted = [facts.get(name) for name in ("side", "around")], [SIDE, AROUND]
-        if given != wanted:
-            raise NetworkFileError(
-                f"{file} is for close-ups (side, around) {given}, not {wanted}: `dataflow train {KIND}` makes one"
-            )
+        session, facts = open_kind(file, KIND, ("classes",), {"side": SIDE, "around": AROUND})
         return cls(tuple(map(str, facts["classes"])), session)
 
     def judge(self, pixels: NDArray[np.uint8], boxes: F32) -> F32:

@@ -213,7 +213,7 @@ def test_networks_of_other_windows_and_files_without_silhouettes_are_refused(tmp
     made = Postures(shapes, bodies, np.arange(7))
     task = PostureTask(made, made)
     task.export(task.network.eval(), {"side": 32}, file)
-    with pytest.raises(NetworkFileError, match=r"is for windows \(side, half, middle\) \[32, "):
+    with pytest.raises(NetworkFileError, match=r"is made for side 32, half "):
         PostureModel.open(file)
     np.savez(tmp_path / "foreign.npz", silhouettes=shapes)
     with pytest.raises(ValueError, match=r"foreign.npz holds no activities, bodies: delete it"):
