@@ -46,11 +46,11 @@ class SemanticMap(Operator):
     """Accumulates objects and surfaces in the world, each with class, box, existence and when it was last seen.
 
     What a view shows is joined to the map by place, class and colour; two entries that come to share their place and
-    are not seen beside each other are one. Each view also says where nothing is: an object whose place is empty goes,
-    and one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move
-    by themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is
-    out of sight. Surfaces are joined by their planes and by where they lie; there is one floor, and people stand
-    on it.
+    are not seen beside each other are one. Books in a shelf show their spines, and others hide the rest of them. Each
+    view also says where nothing is: an object whose place is empty goes, and one of its class, size and colour that
+    appears elsewhere takes its id, moved and not doubled. Classes that move by themselves are followed instead, and
+    forgotten after a while out of sight. Everything else is kept while it is out of sight. Surfaces are joined by their
+    planes and by where they lie; there is one floor, and people stand on it.
 
     With `save` the map is written at the end, and with it the classes that were learned for it; `map_file` begins with
     such a map, in whose frame the pose must be. What moves by itself is not taken over.
