@@ -45,9 +45,9 @@ class ObjectMap:
     and to which its points are near; of a large one whose voxels it shares; of another class only where both cover each
     other. Colour decides near ties. Two objects that come to share their place, of one class or not, are one, unless
     they are seen beside each other. Things in a case may show their spines alone. What a view shows of things that
-    stand in rows ends where it looks between two of them. Places that a view looks through lose voxels; an object whose place is empty, or that is in plain view and not
-    detected, loses evidence and at last goes. If one of its class and size appears elsewhere, that is the same object,
-    moved.
+    stand in rows ends where it looks between two of them. Places that a view looks through lose voxels; an object whose
+    place is empty, or that is in plain view and not detected, loses evidence and at last goes. If one of its class and
+    size appears elsewhere, that is the same object, moved.
     `movers` are classes whose place is that of their last view; they are joined by predicted place. Small ones (a ball)
     are as other things are until a view looks through their place and one of their class is near.
 
