@@ -19,8 +19,7 @@ def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
 
     `rounded` (K,) says which hold something of round outline.
     """
-    rows = boxes.copy()
-    rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
+    rows = _with_log_sizes(boxes)
     image = images(rows, P[:, None], CORNERS)[:, 0]
     if rounded.any():
         image[rounded] = images(rows[rounded], P[:, None], ELLIPSE)[:, 0]
@@ -29,13 +28,20 @@ def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
 
 def spine_boxes(boxes: Array, P: Array, eye: Array, fronts: Array) -> Array:
     """Returns the same of the spines alone of things that stand in cases with `fronts` (K,), seen from `eye` (3,)."""
+    return spines(_with_log_sizes(boxes), P[:, None], eye[None], fronts)[:, 0]
+
+
+def _with_log_sizes(boxes: Array) -> Array:
     rows = boxes.copy()
     rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
-    return spines(rows, P[:, None], eye[None], fronts)[:, 0]
+    return rows
 
 
 def spines(rows: Array, P: Array, eyes: Array, front: Array | float) -> Array:
-    """Returns the image boxes (K, V, 4) of those sides of boxes (K, 7) along `front` that `eyes` (V, 3) see."""
+    """Returns the image boxes (K, V, 4) of those sides of boxes (K, 7) along `front` that `eyes` (V, 3) see.
+
+    Boxes are as in `images`; `front` is a heading, rad, or one for each box (K,).
+    """
     across = lies_across(rows, front)
     deep = rows.copy()  # turned by a quarter where that lets its second axis lie along the front
     deep[~across, 3], deep[~across, 4] = rows[~across, 4], rows[~across, 3]
@@ -54,8 +60,8 @@ def lies_across(rows: Array, front: Array | float) -> Mask:
 def images(rows: Array, P: Array, outline: Array) -> Array:
     """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (3, V, 4), NaN where partly behind the camera.
 
-    `outline` (C, 3) are the places in a box of side 1 that are looked at: the first axis of what is worked with, along
-    which extremes are found many times as fast.
+    Boxes are centre, log sizes and heading. `outline` (C, 3) are the places in a box of side 1 that are looked at: the
+    first axis of what is worked with, along which extremes are found many times as fast.
     """
     c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
     x, y, z = outline.T[..., None] * np.exp(rows.T[3:6, None])

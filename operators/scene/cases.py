@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -32,6 +33,12 @@ def fronts(objects: Sequence[MapObject], cases: Sequence[MapObject], kinds: Kind
     deep = np.where(sizes[:, 0] < sizes[:, 1], yaws, yaws + np.pi / 2)
     found[rows] = np.where(away.min(axis=1) <= _AROUND, deep[nearest], np.nan)
     return found
+
+
+def front_of(object: MapObject, cases: Sequence[MapObject], kinds: Kinds) -> float | None:
+    """Returns the same of one object; None where it is in no case."""
+    front = float(fronts([object], cases, kinds)[0])
+    return None if math.isnan(front) else front
 
 
 def stands(object: MapObject) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.carrying import carried
-from operators.scene.cases import fronts, stands
+from operators.scene.cases import front_of, fronts, stands
 from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
@@ -206,7 +206,7 @@ class ObjectMap:
 
     def _fit(self, object: MapObject) -> None:
         s, others = self._settings, smaller_in_place(object, self.objects.values(), self._kinds, self._settings)
-        front = None if math.isnan(found := float(fronts([object], self._cases, self._kinds)[0])) else found
+        front = front_of(object, self._cases, self._kinds)
         object.fit(self._kinds.usual, self._heading, s.range_noise, self.floor, others, front)
         if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
             object.stand_on(self.floor, foot)

@@ -188,17 +188,17 @@ class RelationScore:
         hit, false, miss = self._counted(scope, predicate)
         return 2 * hit / (2 * hit + false + miss) if hit + false + miss else float("nan")
 
-    def precision(self, scope: str, predicate: str = "") -> float:
+    def precision(self, scope: str) -> float:
         """Returns the share of the relations said that are true; NaN without any."""
-        hit, false, _ = self._counted(scope, predicate)
+        hit, false, _ = self._counted(scope)
         return hit / (hit + false) if hit + false else float("nan")
 
-    def recall(self, scope: str, predicate: str = "") -> float:
+    def recall(self, scope: str) -> float:
         """Returns the share of the true relations that are said; NaN without any."""
-        hit, _, miss = self._counted(scope, predicate)
+        hit, _, miss = self._counted(scope)
         return hit / (hit + miss) if hit + miss else float("nan")
 
-    def _counted(self, scope: str, predicate: str) -> tuple[int, int, int]:
+    def _counted(self, scope: str, predicate: str = "") -> tuple[int, int, int]:
         """Returns how many are right, false and missed."""
         hit, false, miss = (
             sum(n for k, n in self.counts.items() if k.startswith(f"{scope} {kind}") and k.endswith(predicate))

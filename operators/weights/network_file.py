@@ -14,7 +14,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -74,7 +73,7 @@ class Network:
 
 
 def open_kind(
-    file: Path, kind: str, needed: Sequence[str] = _IMAGES, made_for: Mapping[str, Any] = MappingProxyType({})
+    file: Path, kind: str, needed: Sequence[str] = _IMAGES, made_for: Mapping[str, Any] | None = None
 ) -> tuple[onnxruntime.InferenceSession, dict[str, Any]]:
     """Opens a network of a kind, whatever its inputs are; returns it with its metadata.
 
@@ -86,7 +85,7 @@ def open_kind(
     if found != kind:
         raise NetworkFileError(f"{file} is {_called(found)}; {_called(kind)} is needed: `dataflow train {kind} DATA`")
     facts = facts_of(file, session, needed)
-    if any(facts.get(name) != value for name, value in made_for.items()):
+    if made_for and any(facts.get(name) != value for name, value in made_for.items()):
         given, wanted = (", ".join(f"{name} {values.get(name)}" for name in made_for) for values in (facts, made_for))
         raise NetworkFileError(f"{file} is made for {given}, not {wanted}: `dataflow train {kind}` makes one")
     return session, facts

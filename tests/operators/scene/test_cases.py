@@ -16,7 +16,9 @@ from operators.scene.class_sizes import CLASS_SIZES
 from operators.scene.cuboid import Box, ImageView, fit_cuboid
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MapObject
-from operators.scene.matching import Observation, in_image
+from operators.scene.matching import MapSettings, Observation, in_image
+from operators.scene.object_map import ObjectMap
+from operators.scene.range_view import RangeView
 
 Array = NDArray[np.float64]
 K = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
@@ -114,6 +116,32 @@ def test_what_an_image_shows_of_a_book_in_a_row_agrees_with_that_book(hidden: bo
     assert compared.iou[0, [0, 2]].max() < 0.7
     if hidden:  # whole boxes hold those of several spines, so that they agree as much with any
         assert alone.iou[0].max() < 0.4
+
+
+SHELF: Box = (np.array([2.58, 0.0, 0.8]), np.array([0.32, 1.0, 1.4]), 0.0)
+
+
+def mapped(*, shelf: bool) -> list[MapObject]:
+    """The books of a map after views of a row of them that stands in a shelf, or in none."""
+    known = ObjectMap(len(NAMES), (), MapSettings(), {k: CLASS_SIZES[name] for k, name in enumerate(NAMES)})
+    for k in range(24):
+        x, y = OBLIQUE[k % len(OBLIQUE)]
+        y += 0.05 * (k // len(OBLIQUE))
+        seen = [Observation(spine_points(b), 0, 0.9, image=view_of(b, x, y, hidden=True)) for b in ROW]
+        if shelf:
+            seen.append(Observation(spine_points(SHELF), 1, 0.9, image=view_of(SHELF, x, y, hidden=False)))
+        T = camera(1, (x, y, 1.0), yaw=float(np.arctan2(-y, 2.5 - x)), pitch=0.0).matrix()
+        points = np.concatenate([each.points for each in seen])
+        known.update((k + 1) * 250_000_000, seen, RangeView((points - T[:3, 3]) @ T[:3, :3], T, 0.012))
+    return [each for each in known.confirmed() if each.class_id == 0]
+
+
+def test_a_row_of_books_seen_at_an_angle_is_mapped_book_by_book_once_its_shelf_is() -> None:
+    inside, alone = (mapped(shelf=shelf) for shelf in (True, False))
+    assert len(inside) == len(ROW)
+    for book in ROW:
+        assert max(upright_iou(each.box, book) for each in inside) > 0.5
+    assert min(max(upright_iou(each.box, book) for each in alone) for book in ROW) < 0.3
 
 
 def test_spines_are_the_sides_that_are_seen_whichever_way_a_box_is_written() -> None:

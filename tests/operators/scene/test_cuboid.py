@@ -94,6 +94,22 @@ def test_points_that_stray_by_the_noise_of_their_ranges_do_not_draw_a_box_toward
     assert abs(single[0] - 4.7) < 0.015 < 4.7 - accumulated[0]
 
 
+def test_a_few_points_of_something_before_a_thing_do_not_draw_its_box_towards_the_viewer() -> None:
+    """Raw points of a far bottle, of which one in fifteen is of what hides a brink of it."""
+    bottle: Box = (np.array([4.5, 0.0, 1.0]), np.array([0.07, 0.07, 0.25]), 0.0)
+    rng = np.random.default_rng(5)
+    around, z = rng.uniform(np.pi / 2, 3 * np.pi / 2, 45), rng.uniform(0.88, 1.12, 45)
+    points = np.column_stack([4.5 + 0.035 * np.cos(around), 0.035 * np.sin(around), z])
+    points[::15, 0] -= 0.15
+    views = [view_of(bottle, y) for y in SIDEWAYS]
+    usual = CLASS_SIZES["bottle"]
+    raw, all_but_outermost = (
+        fit_cuboid(standing_box(points), views, points, usual, raw=raw)[1][0] for raw in (True, False)
+    )
+    assert abs(raw[0] - 4.5) < 0.015
+    assert 4.5 - all_but_outermost[0] > 0.03
+
+
 def test_a_fit_tells_which_view_is_of_another_thing() -> None:
     beside: Box = (BOOK[0] + [0, 0.06, 0], BOOK[1], BOOK[2])
     views = [view_of(beside if k == 2 else BOOK, y, 0.5) for k, y in enumerate(SIDEWAYS)]

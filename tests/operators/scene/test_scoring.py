@@ -77,8 +77,9 @@ def test_precision_and_recall_of_relations_count_what_is_false_and_what_is_misse
     assert relations.precision("all") == pytest.approx(1 / 3)
     assert relations.recall("all") == pytest.approx(1 / 2)
     assert relations.precision("mapped") == 1.0
-    assert relations.recall("mapped", " near") == 0.0
-    assert np.isnan(relations.precision("mapped", " near"))
+    assert relations.recall("mapped") == pytest.approx(1 / 2)
+    assert np.isnan(RelationScore().precision("all"))
+    assert np.isnan(RelationScore().recall("all"))
 
 
 def test_what_is_mapped_scores_by_itself() -> None:
