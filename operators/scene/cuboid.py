@@ -23,10 +23,7 @@ _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by su
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TAIL = 0.8  # standard deviations of noise by which the outermost of accumulated points are beyond a side
 _TAIL_FLAT, _TAIL_ROUND = 1.4, 0.8  # and those of single views, on flat sides and on round ones, which recede
-_STRAYING, _STRAYING_RAW = (
-    1 / 40,
-    1 / 10,
-)  # share of points on each side that may be others', and of those of single views
+_STRAYING, _STRAYING_RAW = 1 / 40, 1 / 10  # of points on each side are others' at most, and of those of single views
 _ASKEW = 8.0  # cost of lying otherwise than most things around
 _TURN, _TURN_ALONG = 0.1, 0.03  # radians by which the heading that points show strays, and that of a room
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more

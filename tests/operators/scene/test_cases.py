@@ -122,12 +122,13 @@ SHELF: Box = (np.array([2.58, 0.0, 0.8]), np.array([0.32, 1.0, 1.4]), 0.0)
 
 
 def mapped(*, shelf: bool) -> list[MapObject]:
-    """The books of a map after views of a row of them that stands in a shelf, or in none."""
+    """The books of a map after views of a row of them that stands in a shelf, or in none; each view misses one book."""
     known = ObjectMap(len(NAMES), (), MapSettings(), {k: CLASS_SIZES[name] for k, name in enumerate(NAMES)})
-    for k in range(24):
+    for k in range(36):
         x, y = OBLIQUE[k % len(OBLIQUE)]
-        y += 0.05 * (k // len(OBLIQUE))
-        seen = [Observation(spine_points(b), 0, 0.9, image=view_of(b, x, y, hidden=True)) for b in ROW]
+        y += 0.02 * (k % 7)
+        shown = [book for j, book in enumerate(ROW) if j != k % 3]
+        seen = [Observation(spine_points(book), 0, 0.9, image=view_of(book, x, y, hidden=True)) for book in shown]
         if shelf:
             seen.append(Observation(spine_points(SHELF), 1, 0.9, image=view_of(SHELF, x, y, hidden=False)))
         T = camera(1, (x, y, 1.0), yaw=float(np.arctan2(-y, 2.5 - x)), pitch=0.0).matrix()
