@@ -20,7 +20,6 @@ from dataflow.graph import Graph as ResolvedGraph
 from dataflow.graph.problems import did_you_mean
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign
-from dataflow.interop.playing import play
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.recording.layout import BAG, RUN
@@ -148,6 +147,8 @@ def replay(
     facts: dict[str, dict[str, str]] = {}
     played: set[str] | None = None
     if graph is not None and is_foreign(path):
+        from dataflow.interop.playing import play  # bags need libraries that no recording does
+
         built = resolved(graph, settings)
         words = [f"{topic}={stream}" for topic, stream in (maps or {}).items()]
         with play(path, built, words, clock) as bag:

@@ -15,6 +15,7 @@ from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, interrupted_by_user, wants_traceback
 from dataflow.cli.plugins import CommandGroup, renamed
 from dataflow.cli.standard_output import OutputFailed
+from dataflow.extras import missing_extra
 
 app = typer.Typer(
     name="dataflow",
@@ -87,6 +88,8 @@ def call() -> None:
         if wants_traceback():
             err.print(escape(traceback.format_exc().rstrip()), soft_wrap=True)
             fail(f"internal error: {type(error).__name__}: {error}")
+        elif hint := missing_extra(error):
+            fail(f"{error}; {hint}")
         else:
             fail(f"internal error: {type(error).__name__}: {error} (where: run it again with {TRACEBACK}=1)")
         sys.exit(COULD_NOT_RUN)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from dataflow.extras import missing_extra
 from dataflow.foxglove.drawing import Drawn, data_of, drawing_of, schema_of
 from dataflow.foxglove.topics import Topics
 from dataflow.messages import Message
@@ -158,5 +159,5 @@ def _sdk() -> Any:
         import foxglove
         import foxglove.websocket
     except ImportError as error:
-        raise FoxgloveError('foxglove-sdk is not installed; it comes with: pip install -e ".[foxglove]"') from error
+        raise FoxgloveError(f"foxglove-sdk is not installed; {missing_extra(error)}") from error
     return foxglove

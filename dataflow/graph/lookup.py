@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
 
+from dataflow.extras import missing_extra
 from dataflow.graph.problems import did_you_mean, nearest
 from dataflow.graph.search import looked_in
 from dataflow.operator import Operator, Source
@@ -38,7 +39,7 @@ def find_operator(use: str) -> type[Operator] | NotFound:
     try:
         found = getattr(module, name, None)
     except (Exception, SystemExit) as error:  # a package may import what it offers only now
-        return NotFound(f"{use!r} fails to import: {type(error).__name__}: {error}", _where(error, module_name))
+        return NotFound(f"{use!r} fails to import: {type(error).__name__}: {error}", _mend(error, module_name))
     if found is None:
         return NotFound(
             f"module {module_name!r} has no operator {name!r}",
@@ -71,7 +72,7 @@ def import_module(name: str) -> ModuleType | NotFound:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         if error.name != name:
-            return NotFound(f"module {name!r} needs {error.name!r}, which is not installed", _where(error, name))
+            return NotFound(f"module {name!r} needs {error.name!r}, which is not installed", _mend(error, name))
         if parent and not hasattr(sys.modules[parent], "__path__"):
             return NotFound(f"no module {name!r}: {parent!r} is a single module", "")
         looked = "" if parent else f"{looked_in()}; --path DIR names another folder"
@@ -99,13 +100,13 @@ def offered(module: ModuleType, named: str | None = None) -> Iterator[tuple[str,
                 yield name, value
 
 
-def lost_exports(module: ModuleType) -> Iterator[tuple[str, str]]:
-    """Yields what a module exports (`module:name`) and fails to import, and why."""
+def lost_exports(module: ModuleType) -> Iterator[tuple[str, str, str]]:
+    """Yields what a module exports (`module:name`) and fails to import, why, and how to install what is missing."""
     for name in getattr(module, "__all__", ()):
         try:
             getattr(module, name)
         except (Exception, SystemExit) as error:
-            yield f"{module.__name__}:{name}", f"{type(error).__name__}: {error}"
+            yield f"{module.__name__}:{name}", f"{type(error).__name__}: {error}", missing_extra(error)
 
 
 def is_concrete(cls: type[Operator]) -> bool:
@@ -121,6 +122,11 @@ def _nearest_module(name: str, parent: str) -> str:
         return did_you_mean(name, candidates, f"modules in {parent!r}").replace("mean '", f"mean '{parent}.")
     near = nearest(name, candidates)
     return "" if near is None else f"did you mean {near!r}?"
+
+
+def _mend(error: BaseException, module: str) -> str:
+    """Returns the extra that installs what is missing, else where the error was raised."""
+    return missing_extra(error) or _where(error, module)
 
 
 def _where(error: BaseException, module: str) -> str:

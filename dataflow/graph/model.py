@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from dataflow.extras import missing_extra
 from dataflow.graph.sections import (
     Network,
     Record,
@@ -58,11 +59,19 @@ def import_operator(use: str) -> type[Operator]:
     try:
         module = sys.modules.get(module_name) or importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
-        raise OperatorImportError(f"cannot import {module_name!r}: {type(error).__name__}: {error}") from error
-    found = getattr(module, name, None)
+        raise _failed(module_name, error) from error
+    try:
+        found = getattr(module, name, None)
+    except (Exception, SystemExit) as error:  # a package may import what it offers only now
+        raise _failed(use, error) from error
     if not (isinstance(found, type) and issubclass(found, Operator)):
         raise OperatorImportError(f"module {module_name!r} has no operator {name!r}")
     return found
+
+
+def _failed(what: str, error: BaseException) -> OperatorImportError:
+    reason = f"cannot import {what!r}: {type(error).__name__}: {error}"
+    return OperatorImportError("; ".join(filter(None, (reason, missing_extra(error)))))
 
 
 @dataclass(frozen=True, slots=True)

@@ -250,7 +250,7 @@ name = "$distribution"
 version = "0.1.0"
 description = "Operators and graphs of $name"
 requires-python = ">=3.11"
-dependencies = ["robot-dataflow"]
+dependencies = ["robot-dataflow[all]"]
 
 [project.optional-dependencies]
 dev = ["pytest>=8"]
@@ -304,7 +304,7 @@ README = Template("""\
 # $name
 
     python3 -m venv .venv && . .venv/bin/activate
-    pip install -e PATH/TO/robot-dataflow  # where it was cloned to
+    pip install -e "PATH/TO/robot-dataflow[all]"  # where it was cloned to
     pip install -e ".[dev]"
     pytest
     dataflow run graphs/$package.yaml --record out/run.mcap --view out/run.rrd

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.extras import missing_extra
 from dataflow.interop.conversions import convert
 from dataflow.interop.export.frames import IMAGES
 from dataflow.interop.export.lerobot_layouts import Dataset, Layout, Layout21
@@ -86,8 +87,8 @@ def export_lerobot(
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ImportError:
-        raise RecordingError("a dataset of LeRobot needs pyarrow: pip install pyarrow") from None
+    except ImportError as error:
+        raise RecordingError(f"a dataset of LeRobot needs pyarrow; {missing_extra(error)}") from None
     layout = layout or Layout21()
     plan = _planned(material, action, done)
     stamps: list[int] = []

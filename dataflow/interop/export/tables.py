@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.extras import missing_extra
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Message
@@ -76,8 +77,8 @@ def export_parquet(material: Material, folder: Path, done: Exported) -> None:
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ImportError:
-        raise RecordingError("--to parquet needs pyarrow: pip install pyarrow") from None
+    except ImportError as error:
+        raise RecordingError(f"--to parquet needs pyarrow; {missing_extra(error)}") from None
     for name, columns in _tables(material, done):
         path = _file(folder, material.names[name], ".parquet")
         kind = material.streams[name].message_type
