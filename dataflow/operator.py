@@ -195,6 +195,14 @@ class Operator:
         """Figures to show at the end of a run (metrics sinks); read after `finish()`."""
         return {}
 
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        """Returns whether the network that it uses with these parameters was trained on simulated data alone.
+
+        A run warns where such an operator takes what follows from a source that is not `simulated`.
+        """
+        return False
+
     def use_file(self, path: str | Path) -> Path:
         """Notes the content hash of a file that the operator reads, for the firing record of `setup()`.
 
@@ -216,6 +224,8 @@ class Source(Operator, abstract=True):
     """
 
     live: ClassVar[bool] = False
+    simulated: ClassVar[bool] = False
+    """Its messages are computed, not measured by a sensor."""
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         """Yields what is emitted at one stamp: a mapping from port to message. Stamps strictly increase."""

@@ -28,6 +28,7 @@ from dataflow.supervision import plan
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import RunReport
+from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.verification.report import VerifyReport
 
 NOTEBOOK = "__main__:"
@@ -113,6 +114,7 @@ def run(
     `GraphError`, and `RunFailed` with the operator that failed.
     """
     built = resolved(graph, settings)
+    warn_of_gap(built)
     file = None if record is None else Path(record)
     report = LocalRun(built, paranoid=paranoid).execute(
         record=file, metadata=metadata_of(built, "run"), overwrite=overwrite, watch=watch
@@ -153,11 +155,13 @@ def replay(
         words = [f"{topic}={stream}" for topic, stream in (maps or {}).items()]
         with play(path, built, words, clock) as bag:
             log = plan_replay(bag, built, start=start, end=end)
+            warn_of_gap(built, bag)
             facts, played = {BAG: bag.facts()}, {p.topic for p in bag.played.values()}
     else:
         with Recording(path) as opened:
             built = recorded_graph(opened) if graph is None else resolved(graph, settings)
             log = plan_replay(opened, built, start=start, end=end)
+            warn_of_gap(built, opened)
     file = None if record is None else Path(record)
     report = LocalRun(built, log=log, paranoid=paranoid).execute(
         record=file, metadata=facts | metadata_of(built, "replay"), overwrite=overwrite, watch=watch

@@ -18,6 +18,7 @@ from dataflow.firing.threads import limited_threads
 from dataflow.messages.base import Message
 from dataflow.process.runners import Runners
 from dataflow.supervision.report import RunFailed
+from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.sync import Entry
 
 Made = dict[str, tuple[Message, ...]]
@@ -53,6 +54,7 @@ class Session:
         set up.
         """
         self.graph = resolved(graph, settings)
+        warn_of_gap(self.graph)
         self._names = self._chosen(outputs)
         self._made: dict[str, list[Message]] = {}
         self._runners = Runners()

@@ -60,7 +60,7 @@ def graph_as_recorded(recording: PlayableStreams) -> Graph:
     return load_bundle(bundle)
 
 
-def resolved_graph(recording: Recording) -> Graph | None:
+def resolved_graph(recording: PlayableStreams) -> Graph | None:
     """Returns the graph that made a recording as it was resolved then, for tools that look: imports no operator.
 
     None where the recording holds none, or none that is sound (another version's, or another program's).

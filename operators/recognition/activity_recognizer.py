@@ -21,7 +21,7 @@ from operators.recognition.possible import possible
 from operators.recognition.scene_agents import mattering, seen_times
 from operators.scene.agents import UNKNOWN
 from operators.scene.bodies import Body
-from operators.weights import shipped
+from operators.weights import shipped, trained_in_simulation
 
 
 @dataclass
@@ -75,6 +75,10 @@ class ActivityRecognizer(Operator):
     least: float = Param(0.35, ge=0, lt=1, live=True, doc="probability below which an activity is unknown")
     posture: float = Param(1.0, ge=0, live=True, doc="how much postures count beside the network; 0 for not at all")
     memory: float = Param(1.5, ge=0, doc="time out of sight after which an activity is unknown", unit="s")
+
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        return trained_in_simulation(params["weights"] or shipped("activity.onnx"))
 
     def setup(self) -> None:
         """Opens the network. Raises FileNotFoundError or NetworkFileError."""

@@ -29,6 +29,7 @@ from operators.recognition.sensed_people import SensedTrack
 from operators.sources.simulator.classes import ACTIVITIES
 from operators.training.balance import class_weights
 from operators.training.export import export_steps
+from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 KIND = "activity"
 TOLERANCE = 0.5
@@ -159,6 +160,7 @@ class ActivityTask:
             "lag": LAG,
             "training_episodes": self._episodes,
             "sensed_tracks": self._sensed,
+            TRAINED_ON: SIMULATOR,
             **facts,
         }
         step = ActivityStep(copy.deepcopy(network).cpu())

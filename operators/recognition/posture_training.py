@@ -18,6 +18,7 @@ from operators.recognition.posture_network import DeployedPosture, PostureNetwor
 from operators.recognition.silhouette import HALF, MIDDLE, SIDE
 from operators.training.balance import class_weights
 from operators.training.export import export_rows
+from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 F32 = NDArray[np.float32]
 
@@ -79,6 +80,7 @@ class PostureTask:
             "half": HALF,
             "middle": MIDDLE,
             "training_silhouettes": self.samples,
+            TRAINED_ON: SIMULATOR,
             **facts,
         }
         example = {"silhouettes": torch.zeros(2, 3, SIDE, SIDE)}

@@ -20,6 +20,7 @@ from operators.training.augmentation import NONE, Variation, fitted, recolored, 
 from operators.training.backbone import BACKBONES, Backbone, load_backbone
 from operators.training.export import export_network
 from operators.training.network_weights import begin_with, fitting_facts, sample_images
+from operators.weights.network_file import TRAINED_ON
 
 KIND = "segmenter"
 MULTIPLE = 16
@@ -124,6 +125,7 @@ class SegmenterTask:
             "width": self.size[0],
             "height": self.size[1],
             "training_images": self.samples,
+            **({TRAINED_ON: self.data.origin} if self.data.origin else {}),
             **facts,
         }
         if len(self.data.classes) <= MOST_CLASSES:

@@ -74,6 +74,8 @@ class SimulatedRobot(Source):
     what was so long before the stamp; truth that belongs to an image describes what the image shows.
     """
 
+    simulated = True
+
     image: Out[Image] = Out(doc="colour")
     image_jpeg: Out[CompressedImage] = Out(doc="the same as JPEG")
     image_info: Out[CameraInfo] = Out(static=True, doc="calibration of the colour camera")

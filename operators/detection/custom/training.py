@@ -22,6 +22,7 @@ from operators.training.augmentation import Variation, fitted, tensor_of, warp
 from operators.training.backbone import BACKBONES, Backbone, load_backbone
 from operators.training.export import export_network
 from operators.training.network_weights import begin_with, fitting_facts, sample_images
+from operators.weights.network_file import TRAINED_ON
 
 KIND = "detector"
 STEP = 16
@@ -147,6 +148,7 @@ class DetectorTask:
             "strides": list(self.strides),
             "anchors": np.round(self.anchors.astype(float), 4).tolist(),
             "training_images": self.samples,
+            **({TRAINED_ON: self.data.origin} if self.data.origin else {}),
             **facts,
         }
         export_network(network, self.size, [f"stride{s}" for s in self.strides], described, file)

@@ -19,13 +19,12 @@ from operators.segmentation.network import ClassDecoder  # noqa: E402
 from operators.segmentation.training import SegmenterTask  # noqa: E402
 from operators.sources.simulator.classes import CLASSES, THINGS  # noqa: E402
 from operators.training.augmentation import fitted, tensor_of, warp  # noqa: E402
-from operators.training.averaging import average  # noqa: E402
 from operators.training.backbone import SmallResNet  # noqa: E402
 from operators.training.files import TrainingFileError  # noqa: E402
 from operators.training.loop import Settings, train  # noqa: E402
 from operators.training.network_weights import begin_with, sample_images  # noqa: E402
 from operators.training.pair import PairTask  # noqa: E402
-from operators.weights import open_network, read_facts, shipped  # noqa: E402
+from operators.weights import open_network, read_facts, shipped, trained_in_simulation  # noqa: E402
 
 SIZE = (160, 128)
 
@@ -58,6 +57,10 @@ def test_a_training_begins_with_what_the_file_answers(trained: Path, worlds: Pat
         assert np.abs(mine.numpy() - theirs).max() < 0.02  # weights are stored in half precision
     anchors = read_facts(trained / "detector.onnx")["anchors"]
     assert np.allclose(task.boxes.anchors, anchors, atol=1e-3)
+
+
+def test_networks_of_rendered_worlds_are_marked_as_trained_in_simulation(trained: Path) -> None:
+    assert all(trained_in_simulation(trained / name) for name in ("detector.onnx", "segmenter.onnx"))
 
 
 def test_normalisation_while_training_agrees_with_what_was_measured(trained: Path, worlds: Path) -> None:
@@ -121,22 +124,3 @@ def test_a_file_that_does_not_fit_is_refused_with_what_differs(trained: Path, wo
     fewer = DetectorTask(read_detection_data(worlds).only(["chair"]), SIZE, width=0.25, architecture="smallresnet")
     with pytest.raises(TrainingFileError, match=r"its classes is|its strides is"):
         fewer.begin_with(trained / "detector.onnx")
-
-
-def test_the_mean_of_two_trainings_lies_between_them(trained: Path, worlds: Path, tmp_path: Path) -> None:
-    other = pair(worlds, seed=2)
-    other.begin_with(trained / "detector.onnx")
-    train(other, Settings(epochs=1, batch=4, threads=1), tmp_path / "pair.onnx")
-
-    task = pair(worlds)
-    average(task, trained / "detector.onnx", tmp_path / "detector.onnx")
-
-    ends = []
-    for file in (trained / "detector.onnx", tmp_path / "detector.onnx"):
-        end = pair(worlds)
-        end.begin_with(file)
-        ends.append(end.network.state_dict()["grid.lateral.0.weight"])
-    assert torch.allclose(task.network.state_dict()["grid.lateral.0.weight"], (ends[0] + ends[1]) / 2, atol=1e-6)
-    norms = [m for m in task.network.modules() if isinstance(m, nn.BatchNorm2d)]
-    assert all(not m.training and m.momentum == 0.1 for m in norms)
-    assert all(bool(torch.isfinite(m.running_var).all()) for m in norms)
