@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +13,11 @@ from rich.markup import escape
 
 from dataflow.cli.arguments import output_file
 from dataflow.cli.output import INTERRUPTED, about_a_file, err, fail, out, print_json, say, size
+from dataflow.cli.storage import named, recording_file
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
+    from dataflow.recording.parts import Storage
     from dataflow.supervision.report import RunFailed, RunReport, Watch
 
 
@@ -28,9 +30,12 @@ class Outputs:
     live_view: str | None
     open_file: bool
     overwrite: bool
+    storage: Storage
 
 
-def checked_outputs(record: Path | None, view: str | None, open_view: bool, overwrite: bool) -> Outputs:
+def checked_outputs(
+    record: Path | None, view: str | None, open_view: bool, overwrite: bool, storage: Storage
+) -> Outputs:
     """Checks the options that name outputs; ends the command where they contradict each other or a file is there."""
     saves = view is not None and view.endswith(".rrd")
     if view is not None and view not in ("spawn", "serve") and not saves:
@@ -42,11 +47,11 @@ def checked_outputs(record: Path | None, view: str | None, open_view: bool, over
 
         require_display()
     if record is not None:
-        output_file(record, ".mcap", overwrite=overwrite, option="--record")
+        record = recording_file(named(record), storage.splitting, overwrite=overwrite, option="--record")
     view_file = Path(view) if view is not None and saves else None
     if view_file is not None:
         output_file(view_file, ".rrd", overwrite=overwrite, option="--view")
-    return Outputs(record, view_file, None if saves else view, open_view, overwrite)
+    return Outputs(record, view_file, None if saves else view, open_view, overwrite, storage)
 
 
 def plan_options(
@@ -64,6 +69,7 @@ def plan_options(
         "placement": _placement(graph, one_process, process_each, place),
         "record": outputs.record,
         "overwrite": outputs.overwrite,
+        "storage": replace(outputs.storage, on_failure=outputs.storage.on_failure or graph.record.on_failure),
         "view_file": outputs.view_file,
         "rate": rate,
         "paranoid": paranoid,

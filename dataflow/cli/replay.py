@@ -46,6 +46,7 @@ from dataflow.cli.run_options import (
     Timeout,
     View,
 )
+from dataflow.cli.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -78,6 +79,11 @@ def replay(
     place: Place = None,
     record: Record = None,
     compression: Compression = None,
+    split_every: SplitEvery = None,
+    split_size: SplitSize = None,
+    keep_disk: KeepDisk = None,
+    record_failure: OnFailure = None,
+    readable: Readable = "owner",
     view: View = None,
     open_view: Open = False,
     complete: Annotated[
@@ -145,6 +151,7 @@ def replay(
             raise fail("--set changes a graph file: name it with --graph")
         if compression is not None and record is None:
             raise fail("--compression is of a recording: name one with --record")
+        storage = storage_of(record, split_every, split_size, keep_disk, record_failure, readable)
         packing = {} if compression is None else {"compression": compression}
         find_modules_in(path)
         early = None if complete is not None else stack.enter_context(early_nursery())
@@ -165,7 +172,7 @@ def replay(
             if complete is not None:
                 raise fail("--complete needs the firing records of a run, which bags do not hold")
             loaded = load_graph(graph_file(graph), settings=settings or ())
-            outputs = checked_outputs(record, view, open_view, overwrite)
+            outputs = checked_outputs(record, view, open_view, overwrite, storage)
             options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
             options |= {"early": early, "paused": step, "controls": keys(quiet or json), **packing}
             if loop != 1:
@@ -200,7 +207,7 @@ def replay(
             begin = part.start if begin is None and part is not None else begin
             if begin is not None:
                 _say_what_begins_fresh(opened, loaded, begin)
-        outputs = checked_outputs(record, view, open_view, overwrite)
+        outputs = checked_outputs(record, view, open_view, overwrite, storage)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         shown = None
         if whole is not None:
