@@ -44,6 +44,7 @@ from dataflow.cli.run_options import (
     Replace,
     Step,
     Timeout,
+    Verbose,
     View,
 )
 from dataflow.cli.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
@@ -96,6 +97,7 @@ def replay(
         ),
     ] = None,
     overwrite: Replace = False,
+    verbose: Verbose = False,
     json: Json = False,
 ) -> None:
     """Replay a recording through the graph that made it, or another one.
@@ -175,10 +177,23 @@ def replay(
             outputs = checked_outputs(record, view, open_view, overwrite, storage)
             options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
             options |= {"early": early, "paused": step, "controls": keys(quiet or json), **packing}
+            if storage.splitting.splits:
+                raise fail("of a bag no split recording is made; split it afterwards: dataflow split FILE.mcap")
             if loop != 1:
                 raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
             replay_bag(
-                recording, loaded, maps or (), clock, start, end, outputs, options, began=began, json=json, quiet=quiet
+                recording,
+                loaded,
+                maps or (),
+                clock,
+                start,
+                end,
+                outputs,
+                options,
+                began=began,
+                json=json,
+                quiet=quiet,
+                verbose=verbose,
             )
             return
         with Recording(recording) as opened:
@@ -225,6 +240,7 @@ def replay(
                 began=began,
                 json=json,
                 quiet=quiet,
+                verbose=verbose,
             )
             return dict(report.streams)
 

@@ -36,6 +36,7 @@ from dataflow.cli.run_options import (
     Replace,
     Step,
     Timeout,
+    Verbose,
     View,
 )
 from dataflow.cli.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
@@ -74,6 +75,7 @@ def run(
     view: View = None,
     open_view: Open = False,
     overwrite: Replace = False,
+    verbose: Verbose = False,
     json: Json = False,
 ) -> None:
     """Run a graph.
@@ -146,4 +148,5 @@ def run(
             began=began,
             json=json,
             quiet=quiet,
+            verbose=verbose,
         )

@@ -85,13 +85,14 @@ def _taken(path: Path) -> bool:
     return path.exists() or bool(parts_of(path))
 
 
-def recording_file(path: Path, splitting: Splitting, *, overwrite: bool, option: str) -> Path:
+def recording_file(path: Path, splitting: Splitting | None, *, overwrite: bool, option: str) -> Path:
     """`path`, checked as a recording to write, which may be split: none of its parts may be there unasked."""
     from dataflow.recording.parts import parts_of
 
-    if splitting.splits and not overwrite and (there := parts_of(path)):
+    splits = splitting is not None and splitting.splits
+    if splits and not overwrite and (there := parts_of(path)):
         raise fail(f"{there[0]} exists; name another file, or replace its parts with --overwrite")
-    return output_file(path, ".mcap", overwrite=overwrite or splitting.splits, option=option)
+    return output_file(path, ".mcap", overwrite=overwrite or splits, option=option)
 
 
 def splitting_of(every: str | None, size: str | None, keep: str | None = None) -> Splitting:

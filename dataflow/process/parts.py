@@ -100,7 +100,7 @@ class PartsSink:
         k = 0 if start is None else next((k for k, r in enumerate(records) if r.stamp >= start), len(records))
         if self._full is None and not self._after_gap:
             k = 0
-        early, rest = records[:k], records[k:]
+        early, rest = list(records[:k]), list(records[k:])
         if early:
             self._store_records(self._full, operator, early, encode_batch(early))
         if rest:
@@ -152,14 +152,14 @@ class PartsSink:
         facts = {
             "path": str(self._closed[0].path if self._closed else self._path),
             "messages": sum(part.messages for part in self._closed),
-            "bytes": self.bytes,
+            "bytes": self.size,
             "parts": [str(part.path) for part in self._closed],
             "deleted": self._deleted,
         }
         return {**facts, "lost": self.lost.as_json()} if self.lost.any else facts
 
     @property
-    def bytes(self) -> int:
+    def size(self) -> int:
         """Bytes of all parts that there are."""
         return sum(part.bytes for part in self._closed) + sum(p.sink.writer.saved_bytes for p in self._open_parts())
 
@@ -273,7 +273,7 @@ class PartsSink:
 
     def _keep_to_limit(self) -> None:
         """Deletes the oldest parts while all together take more of the disk than they may."""
-        while self._storage.keep is not None and self._closed and self.bytes > self._storage.keep:
+        while self._storage.keep is not None and self._closed and self.size > self._storage.keep:
             self._closed.pop(0).path.unlink(missing_ok=True)
             self._deleted += 1
 
@@ -287,9 +287,8 @@ class PartsSink:
         else:
             if part is self._current and operator not in self._introduced:
                 self._introduced.add(operator)
-                for each in consecutive(self._folded.get(operator, ())):
-                    before = encode_batch(each)
-                    self._store(part, lambda before=before: part.sink.firings(operator, part.start or 0, before))
+                before = [encode_batch(each) for each in consecutive(self._folded.get(operator, ()))]
+                self._store(part, lambda: [part.sink.firings(operator, part.start or 0, each) for each in before])
             self._store(part, lambda: part.sink.firings(operator, records[-1].stamp, payload, calls=calls))
         self._folded[operator] = folded([*self._folded.get(operator, ()), *records])
 

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from process_doubles import Disk
 
@@ -202,7 +203,7 @@ def test_one_message_that_is_refused_costs_that_message_alone(
     given = Given(recorded, graph, tmp_path / "run.mcap", GO_ON)
     with Recording(recorded) as recording:
         found = next(iter(recording.messages(["test/left/fast"])))
-    before = FeatureVector(stamp=-5, vectors=found.message.vectors, model="test")
+    before = FeatureVector(stamp=-5, vectors=np.zeros((1, 1), np.float32), model="test")
     given.sink.message(found.stream, before, 0, 0)
 
     facts = given.all()
