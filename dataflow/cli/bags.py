@@ -44,6 +44,7 @@ def replay_bag(
     began: float,
     json: bool,
     quiet: bool,
+    verbose: bool,
 ) -> None:
     """Replays a bag through a graph, and says what of it is played, by which clock, and what was repaired."""
     from dataflow.editing.untouched import keep_untouched
@@ -69,6 +70,7 @@ def replay_bag(
             began=began,
             json=json,
             quiet=quiet,
+            verbose=verbose,
         )
         if outputs.record is not None:
             kept = keep_untouched(outputs.record, path, {p.topic for p in opened.played.values()}, begin, finish)

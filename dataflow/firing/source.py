@@ -48,6 +48,7 @@ class SourceRunner:
         self.ended = False
         self.work = Work()
         """The time of reading `stream()`."""
+        self.first: int | None = None
         self.last = NEVER
         self._read = NEVER  # the stamp that was read last, on whichever thread
         self._steps: Iterator[Mapping[str, Message]] = iter(())
@@ -144,6 +145,7 @@ class SourceRunner:
             error = OutputError(f"{self.node.name} yielded stamp {stamp} after {self.last}: stamps strictly increase")
             raise OperatorFailure(self.node.name, "stream()", error)
         self.last = stamp
+        self.first = stamp if self.first is None else self.first
         try:
             emissions = self.ports.prepare(step, stamp)
         except OutputError as error:

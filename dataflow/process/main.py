@@ -67,22 +67,27 @@ def _make(
 
 def _recorder(config: SinkConfig, graph: Graph) -> StreamSink:
     """The sink that writes an MCAP recording; options: `path` (or `flight`: a folder), `metadata`,
-    `compression`, `overwrite`."""
+    `compression`, `overwrite`, `storage`."""
     from dataflow.process.freed_memory import keep_freed_memory
+    from dataflow.recording.parts import Storage
 
     keep_freed_memory()
-    if "flight" in config.options:
+    options = {**config.options, "storage": Storage.from_json(config.options["storage"])}
+    if "flight" in options:
         from dataflow.process.flight import FlightSink
 
-        return FlightSink(Path(config.options["flight"]), graph, config.streams, config.options)
-    from dataflow.process.recorder import RecorderSink
+        return FlightSink(Path(options["flight"]), graph, config.streams, options)
+    from dataflow.process.parts import PartsSink
 
-    return RecorderSink(Path(config.options["path"]), graph, config.streams, config.options)
+    return PartsSink(Path(options["path"]), graph, config.streams, options, life=config.life)
 
 
 def _viewer_file(config: SinkConfig, graph: Graph) -> StreamSink:
-    """The sink that writes a viewer file; options: `path`."""
+    """The sink that writes a viewer file; options: `path`, `storage`."""
     from dataflow.process.viewer_file import ViewerFileSink
+    from dataflow.recording.parts import Storage
+
+    os.umask(0o666 & ~Storage.from_json(config.options["storage"]).mode)  # the viewer's library opens the file
 
     return ViewerFileSink(config.options["path"], graph, config.streams)
 

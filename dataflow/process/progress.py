@@ -87,7 +87,12 @@ class Progress:
         waits = {name: found for name, found in self._waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
         self.behind = self._live.behind()
-        self._channel.send("progress", done=done, counts=counts, drops=drops, waits=waits, behind=self.behind)
+        news = {"done": done, "counts": counts, "drops": drops, "waits": waits, "behind": self.behind}
+        self._channel.send("progress", **news, first=self._first())
+
+    def _first(self) -> int | None:
+        """The first stamp that a source has given."""
+        return min((s.first for s in self._runners.sources if s.first is not None), default=None)
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""
@@ -141,6 +146,7 @@ class Progress:
             streams |= {name: [count, digest] for name, count, digest in log.counts()}
         return {
             "streams": streams,
+            "first": self._first(),
             "counts": self._counts_of(self._runners.operators),
             "drops": self._drops_of(self._runners.operators),
             "waits": self._waits_of(self._runners.operators),

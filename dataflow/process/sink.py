@@ -24,7 +24,7 @@ from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
 from dataflow.process.losses import losses_of
 from dataflow.recording import LogLine
-from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
+from dataflow.records.firing import Batch, FiringRecord, FiringRecordError, consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Envelope, Kind
 from dataflow.transport.envelope import MAGIC
@@ -56,7 +56,8 @@ class StreamSink(Protocol):
 
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None: ...
 
-    def firings(self, operator: str, stamp: int, payload: bytes) -> None: ...
+    def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
+        """Takes a batch of firing records, as it came and decoded."""
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None: ...
 
@@ -217,10 +218,10 @@ class SinkProcess:
         lacking.difference_update(places)
         self._recorded[batch.operator] = max(following, (places[-1][0], places[-1][1] + 1))
         if len(fresh) == len(batch.records):
-            self.sink.firings(batch.operator, last.stamp, batch.data)
+            self.sink.firings(batch.operator, batch.records, batch.data)
             return batch.last
         for part in consecutive(fresh):
-            self.sink.firings(batch.operator, part[-1].stamp, encode_batch(part, last=batch.last and part[-1] is last))
+            self.sink.firings(batch.operator, part, encode_batch(part, last=batch.last and part[-1] is last))
         return batch.last
 
     def _note_taken(self, operator: str, stamp: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from dataflow.messages.base import Message
 from dataflow.names import logs_key
 from dataflow.process.sink import SinkFailure
 from dataflow.recording import LogLine
+from dataflow.records.firing import FiringRecord
 from dataflow.view import Save, ViewerSink, as_alarm
 
 PATIENCE = 30.0
@@ -33,7 +34,7 @@ class ViewerFileSink:
         if self.viewer.statistics().dropped > dropped:
             raise SinkFailure(f"{self.path} took nothing for {PATIENCE:g} s")
 
-    def firings(self, operator: str, stamp: int, payload: bytes) -> None:
+    def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Firing records are not shown."""
 
     def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:

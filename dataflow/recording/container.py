@@ -37,6 +37,7 @@ from mcap.records import (
 from dataflow.recording.attachments import Attachment, Place
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.packing import MAX_CHUNK_BYTES, Buffer, Compression, Gathered, Packer, message_size
+from dataflow.recording.parts import OWNER_ONLY, created
 from dataflow.recording.seals import sealed
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -89,6 +90,7 @@ class ContainerWriter:
         chunk_bytes: int = CHUNK_BYTES,
         chunk_seconds: float = CHUNK_SECONDS,
         overwrite: bool = False,
+        mode: int = OWNER_ONLY,
     ) -> None:
         self.path = path
         self._packer = Packer(compression)
@@ -105,30 +107,25 @@ class ContainerWriter:
         self.last_time = 0
         self._failure: str | None = None
         self._position = 0
-        self._fd = self._open(overwrite)
+        self._fd = created(path, overwrite, mode)
         try:
             self._append(MAGIC, sealed(record_bytes(Header(profile=profile, library=library))))
         except RecordingError:
             os.close(self._fd)
             raise
 
-    def _open(self, overwrite: bool) -> int:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_TRUNC if overwrite else os.O_EXCL)
-        try:
-            return os.open(self.path, flags, 0o666)
-        except FileExistsError:
-            raise RecordingError(f"{self.path} exists already; choose another name or ask to overwrite it") from None
-        except OSError as error:
-            raise RecordingError(f"cannot create the recording {self.path}: {error.strerror}") from error
-
     @property
     def closed(self) -> bool:
         return self._fd < 0
 
+    def saved(self, topic: str) -> int:
+        """Messages of a topic that are in the file now."""
+        return sum(self._counts[channel.id] for channel in self._channels if channel.topic == topic)
+
     @property
-    def messages(self) -> int:
-        """Messages added so far, those of the unfinished chunk included."""
-        return sum(self._counts.values()) + self._unsaved()
+    def failed(self) -> bool:
+        """Tells whether a write has failed, so that nothing more can be added."""
+        return self._failure is not None
 
     @property
     def saved_bytes(self) -> int:

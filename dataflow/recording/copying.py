@@ -24,6 +24,7 @@ from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.layout import RECORDING, Kind, firings_topic, frames_topic
 from dataflow.recording.ordering import in_file_order
 from dataflow.recording.packing import Compression
+from dataflow.recording.parts import OWNER_ONLY
 from dataflow.recording.reader import Recording
 
 Mask = npt.NDArray[np.bool_]
@@ -123,6 +124,7 @@ class Copy:
         *,
         overwrite: bool = False,
         compression: Compression = "zstd",
+        mode: int = OWNER_ONLY,
     ) -> None:
         if path.exists() and not overwrite:
             raise RecordingError(f"{path} exists already; choose another name or ask to overwrite it")
@@ -136,6 +138,7 @@ class Copy:
             compression=compression,
             chunk_seconds=float("inf"),
             overwrite=True,
+            mode=mode,
         )
         self._channels: dict[tuple[int, int], int] = {}
         self._alike: dict[tuple[object, ...], list[tuple[int, int]]] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from enum import StrEnum
+from importlib.metadata import PackageNotFoundError, version
 from typing import Final
 
 FORMAT: Final = "1"
@@ -60,6 +61,14 @@ EVENT_SCHEMA: Final = json.dumps(
     },
     indent=1,
 ).encode()
+
+
+def library() -> str:
+    """Returns the name of this program in the header of its files."""
+    try:
+        return f"robot-dataflow/{version('robot-dataflow')}"
+    except PackageNotFoundError:
+        return "robot-dataflow/unknown"
 
 
 def firings_topic(namespace: str, operator: str) -> str:

@@ -24,7 +24,7 @@ from dataflow.supervision.boxes import Boxes
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.early import EarlyNursery
-from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
+from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed, adopting
 from dataflow.supervision.plan import RunPlan, process_plans
 from dataflow.supervision.report import RunFailed, RunReport, Status
 from dataflow.supervision.rings import Rings, pairs_of
@@ -106,6 +106,7 @@ class Supervisor:
             stack.callback(self._close_pipe)
             stack.callback(self._reserved.close)
             stack.enter_context(self._announced)
+            stack.enter_context(adopting())
             self._rings = self._make_rings()
             stack.callback(self._rings.close)
             self._log_file = stack.enter_context(contextlib.closing(LogFile()))
@@ -263,7 +264,7 @@ class Supervisor:
                 waiting, overflowed = child.channel.waiting, child.channel.overflowed
                 self._feed(events.NotReading(label, stuck, waiting, overflowed))
             if deserted and child.dead:
-                self._ended(label, None)
+                self._ended(label, child.bury())
         self._feed(events.Tick())
 
     @property

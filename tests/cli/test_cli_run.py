@@ -24,7 +24,7 @@ ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def test_a_run_reports_operators_and_figures_on_stdout_and_progress_on_stderr(dataflow, small: Path) -> None:
-    told = dataflow("run", small, "--one-process", "--set", "count=10")
+    told = dataflow("run", small, "--one-process", "--set", "count=10", "-v")
 
     assert "small  complete" in told.stdout
     assert any(line.split()[:3] == ["left", "10", "13"] for line in told.stdout.splitlines())  # firings, out
