@@ -19,6 +19,7 @@ from rich.text import Text
 
 from dataflow.extras import missing_extra
 from dataflow.graph.lookup import NotFound, find_operator, is_concrete, lost_exports, offered
+from dataflow.graph.model import current_path
 from dataflow.graph.problems import did_you_mean
 from dataflow.operator import InputPort, Operator, OutputPort, is_live, is_source
 from dataflow.sync.stamps import format_duration, parse_duration
@@ -173,7 +174,7 @@ def find(catalogue: Catalogue, name: str) -> Described:
     if ":" in name:
         found = find_operator(name)
         if not isinstance(found, NotFound):
-            return Described(name, found)
+            return Described(current_path(name), found)
         raise LookupError(f"{found.message}; {found.hint}" if found.hint else found.message)
     names = [path.partition(":")[2] for path in operators]
     hint = did_you_mean(name, names, "operators")

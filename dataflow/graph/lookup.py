@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 from dataflow.extras import missing_extra
+from dataflow.graph.model import current_path
 from dataflow.graph.problems import did_you_mean, nearest
 from dataflow.graph.search import looked_in
 from dataflow.operator import Operator, Source
@@ -27,12 +28,17 @@ class NotFound:
 
 
 def find_operator(use: str) -> type[Operator] | NotFound:
-    """The class that `use` (`"operators.cloud:CloudBuilder"`) names, or what is wrong with the path."""
+    """The class that `use` (`"operators.cloud:CloudBuilder"`) names, also by a former path, or what is wrong."""
     module_name, colon, name = use.partition(":")
     if not (colon and name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
         return NotFound(
             f"{use!r} names no operator", "write 'package.module:Class', or the path of a graph file (*.yaml)"
         )
+    package = import_module(module_name.partition(".")[0])
+    if isinstance(package, NotFound):
+        return package
+    use = current_path(use)
+    module_name, _, name = use.partition(":")
     module = import_module(module_name)
     if isinstance(module, NotFound):
         return module

@@ -51,12 +51,28 @@ class OperatorImportError(ImportError):
     """An operator that cannot be had from its import path: says which part of the path fails and why."""
 
 
+MOVED = "MOVED_OPERATORS"
+"""The mapping in which a top package keeps the former import paths of its operators: former path → present path."""
+
+
+def current_path(use: str) -> str:
+    """Returns the present import path of the operator that `use` (`"package.module:Class"`) names.
+
+    It differs from `use` where the top package lists that in its `MOVED_OPERATORS`. Imports the top package, and
+    raises what that raises.
+    """
+    package = use.partition(":")[0].partition(".")[0]
+    moved = getattr(sys.modules.get(package) or importlib.import_module(package), MOVED, None)
+    return moved.get(use, use) if isinstance(moved, Mapping) else use
+
+
 def import_operator(use: str) -> type[Operator]:
-    """The class behind `"operators.cloud:CloudBuilder"`; raises `OperatorImportError`."""
+    """The class behind `"operators.cloud:CloudBuilder"`, also by a former path; raises `OperatorImportError`."""
     from dataflow.operator import Operator
 
     module_name, _, name = use.partition(":")
     try:
+        module_name, _, name = current_path(use).partition(":")
         module = sys.modules.get(module_name) or importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
         raise _failed(module_name, error) from error

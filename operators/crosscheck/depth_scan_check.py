@@ -15,7 +15,7 @@ from operators.crosscheck.depth_scan import DepthScanAgreement, Misfit
 from operators.geometry import se3
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
-from operators.odometry.lidar_scan import deskewed
+from operators.odometry.lidar.scan import deskewed
 from operators.status import counted_status
 
 _SURE = 4.0  # standard deviations by which a misfit must stand out

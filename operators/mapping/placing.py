@@ -11,7 +11,7 @@ from dataflow.messages import Odometry, PointCloud, Pose, Transforms
 from dataflow.messages.geometry import transform_points
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix
-from operators.odometry.lidar_scan import deskewed
+from operators.odometry.lidar.scan import deskewed
 
 Array = NDArray[np.float64]
 
