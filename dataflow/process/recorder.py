@@ -13,6 +13,8 @@ from dataflow.messages.base import Message
 from dataflow.names import diagnostics_key
 from dataflow.recording import LogLine, RecordingWriter
 from dataflow.recording.layout import ENDS, OUTCOME
+from dataflow.recording.limits import MAX_STATE_BYTES
+from dataflow.records.firing import decode_batch, encode_batch
 
 
 class RecorderSink:
@@ -59,14 +61,24 @@ class RecorderSink:
         """`setup()` has no stamp; its record is stored at the stamp of the first message, so that viewers of the file
         show no long nothing before it."""
         if stamp > 0 or self._clock > 0:
-            self.writer.write_firings(operator, stamp if stamp > 0 else self._clock, payload)
+            self._write_firings(operator, stamp if stamp > 0 else self._clock, payload)
         else:
             self._early.append((operator, payload))
+
+    def _write_firings(self, operator: str, stamp: int, payload: bytes) -> None:
+        """Writes a batch; one whose states make it too large is written record by record."""
+        if len(payload) <= MAX_STATE_BYTES:
+            self.writer.write_firings(operator, stamp, payload)
+            return
+        batch = decode_batch(payload)
+        for record in batch.records:
+            data = encode_batch([record], last=batch.last and record is batch.records[-1])
+            self.writer.write_firings(operator, stamp, data)
 
     def _write_early(self) -> None:
         early, self._early = self._early, []
         for operator, payload in early:
-            self.writer.write_firings(operator, max(self._clock, 0), payload)
+            self._write_firings(operator, max(self._clock, 0), payload)
         logs, self._early_logs = self._early_logs, []
         for line in logs:
             self.writer.write_log(self._clock, line)
