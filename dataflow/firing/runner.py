@@ -19,6 +19,7 @@ from dataflow.firing.ports import Emitter
 from dataflow.firing.protocol import Runner
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
+from dataflow.recording.limits import MAX_STATE_BYTES
 from dataflow.records.firing import Emission, Kind
 from dataflow.sync import FOREVER, NEVER, Drop, Entry, Firing, format_duration, format_stamp
 from dataflow.sync.single import make_aligner
@@ -56,6 +57,7 @@ class OperatorRunner(Runner):
         super().__init__(node, node.make() if operator is None else operator, emitter, lossy=lossy)
         self.paranoid, self.snapshots = paranoid, snapshots
         self._next_snapshot: int | None = None
+        self._left_out = 0
         self._warm: int | None = None
         self.idle = NEVER
         """The output frontier after the last step, where that left nothing to decide; else NEVER."""
@@ -78,7 +80,8 @@ class OperatorRunner(Runner):
         if self._warm is not None:
             started = time.time_ns()
             state = self.calls.snapshot((self.records.incarnation, self._warm))
-            self.records.add("restore", self._warm, started, detail={"state": state, "before": self._warm})
+            kept = state if state is None or len(state) <= MAX_STATE_BYTES else None
+            self.records.add("restore", self._warm, started, detail={"state": kept, "before": self._warm})
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:
@@ -198,8 +201,19 @@ class OperatorRunner(Runner):
         self._next_snapshot = stamp + self.snapshots
         started = time.time_ns()
         state = self.calls.snapshot((self.records.incarnation, stamp))
-        if state is not None:
+        if state is None:
+            return
+        if len(state) <= MAX_STATE_BYTES:
             self.records.add("snapshot", stamp, started, detail={"state": state})
+            return
+        self._left_out += 1
+        self.records.add("snapshot", stamp, started, detail={"left_out": len(state)})
+        self.operator.log.warning(
+            "a snapshot of %d bytes is left out, at most %d are recorded; %d so far",
+            len(state),
+            MAX_STATE_BYTES,
+            self._left_out,
+        )
 
     def _record(
         self,

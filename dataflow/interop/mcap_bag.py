@@ -53,15 +53,14 @@ class McapBag:
 
     def _topic(self, file: McapFile, channel: Channel, size: int) -> Topic:
         schema = file.schemas.get(channel.schema_id)
-        entries = file.entries.get(channel.id)
-        times = None if entries is None or not len(entries) else entries.times
+        first, last = file.index.span(channel.id) or (None, None)
         return Topic(
             channel.topic,
             channel.message_encoding,
             SchemaText("", "", b"") if schema is None else SchemaText(schema.name, schema.encoding, schema.data),
-            0 if times is None else len(times),
-            None if times is None else int(times.min()),
-            None if times is None else int(times.max()),
+            file.index.count(channel.id),
+            first,
+            last,
             size,
             is_latched(channel.topic, channel.metadata.get("offered_qos_profiles", "")),
             channel.metadata,
@@ -100,7 +99,7 @@ class McapBag:
         names = {
             c.id: c.topic for c in file.channels.values() if c.topic in topics and c.metadata.get("kind") not in _OWN
         }
-        places = list(in_file_order([(c, file.entries[c]) for c in names if c in file.entries]))
+        places = list(in_file_order([(c, file.index.entries(c)) for c in names]))
         places.sort(key=lambda place: place[3])
         for place in places:
             yield place[3], names[place[0]], file.read(*place).data

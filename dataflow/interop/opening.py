@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dataflow.interop.bag import Bag, BagError
 from dataflow.interop.mcap_bag import McapBag
-from dataflow.recording.container import MAGIC
+from dataflow.recording.ending import MAGIC
 from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RECORDING
 
