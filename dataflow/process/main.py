@@ -7,7 +7,6 @@ import os
 import queue
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from dataflow.firing.failure import MOST_OF_A_TRACEBACK, cut
 from dataflow.messages.memory import make_large_arrays_in
+from dataflow.process.awake import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.handed import Handed, take_handed
 from dataflow.process.inbox import Inbox
@@ -38,7 +38,7 @@ def _listen(channel: Channel, inbox: Inbox) -> None:
             inbox.put(("control", kind, fields))
     except ChannelClosed:
         inbox.put(("control", "lost", {}))
-        time.sleep(LEAVE_WITHIN)
+        AwakeClock().sleep(LEAVE_WITHIN)
         os._exit(SUPERVISOR_GONE)
 
 
@@ -121,10 +121,11 @@ def _report(channel: Channel, error: BaseException, phase: str) -> None:
 
 def await_leave(inbox: Inbox) -> str:
     """After a failure: waits (bounded) until the supervisor has dealt with it; returns the outcome it names."""
-    deadline = time.monotonic() + LEAVE_WITHIN
-    while (left := deadline - time.monotonic()) > 0:
+    clock = AwakeClock()
+    deadline = clock() + LEAVE_WITHIN
+    while (left := deadline - clock()) > 0:
         try:
-            item = inbox.get(timeout=left)
+            item = inbox.get(timeout=min(left, LOOK_EVERY))
         except queue.Empty:
             continue  # something else has woken it, or the time is up
         if item[0] == "control" and item[1] in ("leave", "lost"):

@@ -22,6 +22,7 @@ from dataflow.supervision.events import (
     LeftBehind,
     Moment,
     NotReading,
+    Paused,
     PlaybackAsked,
     Printed,
     Remained,
@@ -76,6 +77,10 @@ class Core:
                 self._barrier.begin()
             case Tick():
                 self._tick()
+            case Paused(seconds):
+                self.run.event(
+                    "paused", f"the supervisor did not run for {seconds:.1f} s, which count against no process"
+                )
             case StopAsked():
                 self._stop()
             case PlaybackAsked(action, steps, speed):
