@@ -32,7 +32,7 @@ from dataflow.cli.output import (
     print_json,
     say,
 )
-from dataflow.cli.run_options import Quiet
+from dataflow.cli.run_options import Paranoid, Quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,6 +110,7 @@ def verify(
             help="Worker processes. Default: one for each core, fewer where little is to do.",
         ),
     ] = None,
+    paranoid: Paranoid = False,
     quiet: Quiet = False,
     one_process: Annotated[
         bool, typer.Option("--one-process", metavar=FLAG, help="Deprecated: means --jobs 1.")
@@ -194,6 +195,7 @@ def verify(
                 "tolerance": tolerance,
                 "start": start,
                 "jobs": 1 if one_process else jobs,
+                "paranoid": paranoid,
             }
             single = len(recordings) == 1 and not recordings[0].is_dir()
             checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)

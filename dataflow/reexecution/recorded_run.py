@@ -16,6 +16,8 @@ from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import ENDS, GRAPH, RUN
 
+_PROCESS = "process of "
+
 
 class ReplayError(ValueError):
     """A recording that cannot drive a graph: says which stream is missing and what would help."""
@@ -128,6 +130,12 @@ def final_stamps(recording: PlayableStreams, streams: Iterable[str]) -> dict[str
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise RecordingError(f"{recording.path}: how stream {stream!r} ended cannot be read: {error!r}") from error
     return finals
+
+
+def processes_of(recording: Recording) -> dict[str, str]:
+    """Returns the process in which each operator ran, by operator, where the recording says so."""
+    facts = recording.metadata.get(RUN, {})
+    return {fact.removeprefix(_PROCESS): label for fact, label in facts.items() if fact.startswith(_PROCESS)}
 
 
 def seeding_of(recording: Recording) -> int:
