@@ -30,6 +30,7 @@ STYLES = {
     "could not run": "bold red",
     "downstream": "yellow",
     "unverifiable": "yellow",
+    "not here": "bold red",
     "not wholly verified": "yellow",
 }
 FIELDS_SHOWN = 6
@@ -144,6 +145,9 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
     report = checked.report
     assert report is not None
     yield from _changed(s for s in report.stored if s.maker == judged.operator)
+    if judged.verdict == "not here":
+        yield f"{judged.operator}: it is not here ({report.absent[judged.operator]}): what it made is taken as recorded"
+        return
     v = next((v for v in report.operators if v.operator == judged.operator), None)
     if v is None:
         yield from _stand_in(next(s for s in report.stand_ins if s.operator == judged.operator))

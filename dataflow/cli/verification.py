@@ -132,7 +132,7 @@ def verify(
 
       0    identical, or within --tolerance, or as --baseline accepts
       1    different, not wholly verifiable, or nothing verified
-      2    could not run (of several recordings: at least one)
+      2    could not run (of several recordings: at least one), or an operator is not here any more
       130  interrupted with Ctrl-C
 
     Examples:
@@ -280,7 +280,7 @@ def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, who
 
 
 def _exit_code(checked: list[Checked], accepted: Baseline | None) -> int:
-    if any(c.report is None for c in checked):
+    if any(c.report is None or c.report.absent for c in checked):
         return COULD_NOT_RUN
     if accepted is None or any(c.report is not None and (c.report.empty or c.report.changed) for c in checked):
         return 0 if all(c.passed for c in checked) else DIFFERENT

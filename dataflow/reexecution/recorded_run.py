@@ -39,6 +39,33 @@ def recorded_graph(recording: PlayableStreams) -> Graph:
     return isolated(graph_as_recorded(recording))
 
 
+def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
+    """Returns the graph that made a recording, and why operators of it are not here, by operator: their modules or
+    classes are gone. These are external in it, so that what they made is taken from the recording.
+
+    Raises as `recorded_graph`.
+    """
+    from dataflow.graph import GraphError
+    from dataflow.graph.lookup import NotFound, find_operator
+
+    try:
+        return recorded_graph(recording), {}
+    except GraphError:
+        graph = resolved_graph(recording)
+        found = {} if graph is None else {name: find_operator(node.use) for name, node in graph.nodes.items()}
+        absent = {name: cls.message for name, cls in found.items() if isinstance(cls, NotFound) and cls.deleted}
+        if graph is None or not absent:
+            raise
+    nodes = {
+        name: replace(node, external=True)
+        if name in absent
+        else replace(node, use=node.use if isinstance(cls, NotFound) else f"{cls.__module__}:{cls.__qualname__}")
+        for name, node in graph.nodes.items()
+        for cls in (found[name],)
+    }
+    return isolated(replace(graph, nodes=nodes)), absent
+
+
 def isolated(graph: Graph) -> Graph:
     """Returns a graph whose processes can only be reached from this machine, whatever its `network:` section says."""
     return replace(graph, network=Network(shared_memory=graph.network.shared_memory))

@@ -22,7 +22,15 @@ from dataflow.verification.report import StandIn, VerifyReport
 FORMAT = 1
 
 OperatorVerdict = Literal[
-    "identical", "within tolerance", "accepted", "culprit", "downstream", "not as accepted", "changed", "unverifiable"
+    "identical",
+    "within tolerance",
+    "accepted",
+    "culprit",
+    "downstream",
+    "not as accepted",
+    "changed",
+    "unverifiable",
+    "not here",
 ]
 RecordingVerdict = Literal[
     "identical",
@@ -91,7 +99,7 @@ class Checked:
             return "different"
         if self.report.empty:
             return "nothing verified"
-        if "unverifiable" in found:
+        if found & {"unverifiable", "not here"}:
             return "not wholly verified"
         if "accepted" in found:
             return "accepted"
@@ -290,7 +298,8 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
             verdict = "unverifiable"
         steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
         judged.append(Judged(v.operator, verdict, outcome, v.whole and steady and not v.wrote))
-    return (*judged, *_judged_stand_ins(report, report.stand_ins))
+    absent = (Judged(name, "not here", firm=False) for name in report.absent)
+    return (*judged, *absent, *_judged_stand_ins(report, report.stand_ins))
 
 
 def _judged_stand_ins(report: VerifyReport, stand_ins: Iterable[StandIn]) -> Iterable[Judged]:

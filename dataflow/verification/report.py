@@ -60,6 +60,7 @@ class VerifyReport:
     `start`: seconds into the recording, where it began there. `torn`: the recording has no proper end, so what is
     verified is what had been stored. `part`: the recording is a part of another, cut out of it. `work` tells how long
     each operator worked, `reading` the CPU seconds for which that worker read the recording that read most of it.
+    `absent` are operators whose code is not here, and why: what they made is taken from the recording.
     `shared` are operators that make what was recorded, but not always in one process with those named; `mates` are, by
     operator, those that ran in its process.
     """
@@ -86,6 +87,7 @@ class VerifyReport:
     part: Cut | None = None
     work: Mapping[str, OperatorCounts] = field(default_factory=dict)
     reading: float = 0.0
+    absent: Mapping[str, str] = field(default_factory=dict)
     shared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     mates: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -95,6 +97,7 @@ class VerifyReport:
         stored message is the one that the firing records tell of."""
         return (
             not self.cut
+            and not self.absent
             and all(self.verdict(v) == "identical" for v in self.operators)
             and not self.changed
             and all(s.whole for s in self.stand_ins)
@@ -171,6 +174,7 @@ class VerifyReport:
             "sources": [asdict(s) | {"whole": s.whole} for s in self.stand_ins],
             "stored": [s.to_wire() for s in self.stored if not s.as_recorded or s.missing],
             "unchecked": list(self.unchecked),
+            "absent": dict(self.absent),
             "shared": {name: list(beside) for name, beside in self.shared.items()},
             "differing_facts": [{"fact": f, "recorded": a, "here": b} for f, a, b in self.facts],
         }

@@ -18,7 +18,7 @@ from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog, beginning, whole
 from dataflow.reexecution.engine import plan_feeding
-from dataflow.reexecution.recorded_run import ReplayError, processes_of, recorded_graph
+from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, processes_of
 from dataflow.supervision.report import OperatorCounts, Watch
 from dataflow.verification import part, partition, slices
 from dataflow.verification.choice import (
@@ -69,6 +69,7 @@ class _Task:
     unfed: Mapping[str, str]
     torn: bool
     placed: Mapping[str, str]
+    absent: Mapping[str, str]
 
 
 def verify(
@@ -163,7 +164,9 @@ def _prepare(
     early: EarlyWorkers | None,
 ) -> _Task:
     with Recording(path) as recording:
-        played = graph or recorded_graph(recording)
+        played, absent = (graph, dict[str, str]()) if graph is not None else graph_that_is_here(recording)
+        if gone := [name for name in [first, *(only or ())] if name in absent]:
+            raise ReplayError(f"{gone[0]!r} cannot be verified: it is not here: {absent[gone[0]]}")
         if early is not None:
             wanted = with_makers(recording.streams.keys(), played, chosen_operators(played, first, only))
             early.foresee({played.nodes[name].use.partition(":")[0] for name in wanted})
@@ -207,6 +210,7 @@ def _prepare(
             unfed=unfed,
             torn=recording.torn or RECOVERED in recording.metadata,
             placed=processes_of(recording),
+            absent=absent,
         )
 
 
@@ -279,6 +283,7 @@ def _report(
         torn=task.torn,
         part=task.ledger.part,
         work={name: OperatorCounts(*answer["work"][name]) for name, answer in of.items()},
+        absent=task.absent,
         repeated=retrial.repeated,
         shared=retrial.shared,
         mates={name: tuple(sorted(mates - {name})) for name, mates in mates_of(task.placed, task.operators).items()},
