@@ -221,7 +221,8 @@ def diff(
             raise fail(f"--tolerance {tolerance:g}: expected a number, 0 or more")
         spaces = {opened.metadata.get(RECORDING, {}).get("namespace", "") for opened in (first, second)}
         namespace = spaces.pop() if len(spaces) == 1 else ""
-        names = chosen_streams(streams, sorted({*first.streams, *second.streams}), namespace)
+        known = sorted({*first.streams, *second.streams})
+        names = chosen_streams(streams, known, namespace) if streams else None
         report = compare(first, second, streams=names, tolerance=tolerance)
     if json:
         print_json(report.as_json())

@@ -26,6 +26,9 @@ class OperatorFailure(RuntimeError):
 class InputMutated(RuntimeError):
     """An operator changed the memory of a message it was given."""
 
+    def __init__(self, operator: str, what: str) -> None:
+        super().__init__(f"{operator} changed the memory of {what}; messages are immutable: copy before writing")
+
 
 class TooManyTicks(RuntimeError):
     """The stamps of an operator's inputs jump so far ahead that its timer would fire for hours, or for ever."""

@@ -25,6 +25,8 @@ class NotFound:
 
     message: str
     hint: str = ""
+    deleted: bool = False
+    """True where a module or a class is not there, false where it is there and cannot be used."""
 
 
 def find_operator(use: str) -> type[Operator] | NotFound:
@@ -50,6 +52,7 @@ def find_operator(use: str) -> type[Operator] | NotFound:
         return NotFound(
             f"module {module_name!r} has no operator {name!r}",
             did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
+            deleted=True,
         )
     if not (isinstance(found, type) and issubclass(found, Operator)):
         what = f"the class {name}" if isinstance(found, type) else f"a {type(found).__name__}"
@@ -80,9 +83,10 @@ def import_module(name: str) -> ModuleType | NotFound:
         if error.name != name:
             return NotFound(f"module {name!r} needs {error.name!r}, which is not installed", _mend(error, name))
         if parent and not hasattr(sys.modules[parent], "__path__"):
-            return NotFound(f"no module {name!r}: {parent!r} is a single module", "")
+            return NotFound(f"no module {name!r}: {parent!r} is a single module", deleted=True)
         looked = "" if parent else f"{looked_in()}; --path DIR names another folder"
-        return NotFound(f"no module {name!r}", "\n".join(filter(None, (_nearest_module(last, parent), looked))))
+        hint = "\n".join(filter(None, (_nearest_module(last, parent), looked)))
+        return NotFound(f"no module {name!r}", hint, deleted=True)
     except (Exception, SystemExit) as error:  # the module's own code may fail in any way
         return NotFound(f"module {name!r} fails to import: {type(error).__name__}: {error}", _where(error, name))
 
