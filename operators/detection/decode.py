@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.fit import FitMode
+from operators.image.letterbox import FitMode
 
 Size = tuple[int, int]
 """(width, height) in pixels."""

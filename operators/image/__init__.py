@@ -1,8 +1,23 @@
 """Operators that prepare images: without distortion, rectified, cropped, scaled, evenly bright, adapted, none twice."""
 
-from operators.image.image_adapter import ImageAdapter
-from operators.image.image_preprocess import ImagePreprocess
-from operators.image.stereo_preprocess import StereoPreprocess
-from operators.image.watch import DepthWatch, ImageWatch
+from typing import TYPE_CHECKING
+
+from dataflow.lazy import lazily
+
+if TYPE_CHECKING:
+    from operators.image.image_adapter import ImageAdapter
+    from operators.image.image_preprocess import ImagePreprocess
+    from operators.image.stereo_preprocess import StereoPreprocess
+    from operators.image.watch import DepthWatch, ImageWatch
+else:
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "image_adapter": ("ImageAdapter",),
+            "image_preprocess": ("ImagePreprocess",),
+            "stereo_preprocess": ("StereoPreprocess",),
+            "watch": ("DepthWatch", "ImageWatch"),
+        },
+    )
 
 __all__ = ["DepthWatch", "ImageAdapter", "ImagePreprocess", "ImageWatch", "StereoPreprocess"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.network_input import three_channels
 from operators.segmentation.borders import Borders, scored
 from operators.segmentation.labelled import VOID, enlarged, labelled, least_of

@@ -103,7 +103,7 @@ def train_detector(
         keep_earlier(out, resume, overwrite)
         from operators.detection.custom.folder import read_detection_data
         from operators.detection.custom.training import DetectorTask
-        from operators.training.loop import Settings
+        from operators.learning.loop import Settings
 
         read = read_detection_data(data, seed)
         read = read if classes is None else read.only([name.strip() for name in classes.split(",") if name.strip()])
@@ -161,9 +161,9 @@ def train_segmenter(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
+        from operators.learning.loop import Settings
         from operators.segmentation.dataset import read_segmentation_data
         from operators.segmentation.training import SegmenterTask
-        from operators.training.loop import Settings
 
         read = read_segmentation_data(data, seed)
         task = SegmenterTask(
@@ -219,10 +219,10 @@ def train_classifier(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
+        from operators.learning.backbone import start_from
+        from operators.learning.loop import Settings
         from operators.recognition.dataset import read_classification_data
         from operators.recognition.training import ClassifierTask
-        from operators.training.backbone import start_from
-        from operators.training.loop import Settings
 
         read = read_classification_data(data, seed)
         task = ClassifierTask(
@@ -281,8 +281,8 @@ def train_pair(
         file = out / "pair.onnx"
         keep_earlier(file, resume, overwrite)
         from operators.detection.custom.folder import read_detection_data
+        from operators.learning.loop import Settings
         from operators.segmentation.dataset import read_segmentation_data
-        from operators.training.loop import Settings
         from operators.training.pair import DETECTOR, SEGMENTER, PairTask
 
         boxes, masks = read_detection_data(data, seed), read_segmentation_data(data, seed)

@@ -68,9 +68,9 @@ def train_activity(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
+        from operators.learning.loop import Settings
         from operators.recognition.activity_training import ActivityTask
         from operators.recognition.sensed_people import read_tracks
-        from operators.training.loop import Settings
 
         training, choosing = _episodes(data, worlds, validation, processes, json)
         parts = [read_tracks(folder) if folder else [] for folder in (sensed, sensed_validation)]
@@ -118,9 +118,9 @@ def train_posture(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
+        from operators.learning.loop import Settings
         from operators.recognition.posture_training import PostureTask
         from operators.training import made_worlds
-        from operators.training.loop import Settings
         from operators.training.simulated_postures import TRAINING, VALIDATION, read_postures, write_postures
 
         parts = made_worlds.worlds(TRAINING, worlds), made_worlds.worlds(VALIDATION, validation)

@@ -43,8 +43,8 @@ def shipped(name: str) -> Path:
 
 
 def trained_in_simulation(file: str | Path) -> bool:
-    """Returns whether a network was trained in simulation alone: it comes with the project, or its metadata say so by
-    `trained_on`. Opens no network; False for a file that is not there or is none of ours."""
+    """Returns whether a network knows simulated worlds alone: one that comes with the project, or whose file says so
+    by `trained_on` in its metadata. Opens no network; False for a file that is not there or is none of ours."""
     file = Path(file).expanduser()
     if file.resolve().parent == _FOLDER.resolve():
         return True

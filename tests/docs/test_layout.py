@@ -124,6 +124,20 @@ def test_no_modules_import_each_other(repository: Path) -> None:
     assert not circle, f"these import each other, or what does: {circle}"
 
 
+def test_folders_of_operators_do_not_import_each_other_in_a_circle(repository: Path) -> None:
+    left: dict[str, set[str]] = {}
+    for file in (repository / "operators").rglob("*.py"):
+        own = module_of(file, repository).split(".")[1:2]
+        others = {name.split(".")[1] for name in names_imported(file) if inside(name, "operators") and "." in name}
+        for room in own:
+            left.setdefault(room, set()).update(others - {room})
+    while free := [room for room, others in left.items() if not others & left.keys()]:
+        for room in free:
+            del left[room]
+    circle = {room: sorted(others & left.keys()) for room, others in left.items()}
+    assert not circle, f"these import each other, or what does: {circle}"
+
+
 def lines_of_functions(tree: ast.AST, name: str) -> Iterator[tuple[str, int]]:
     """Every function below a node, nested ones and methods included, with its lines without decorators."""
     for node in ast.iter_child_nodes(tree):

@@ -24,7 +24,7 @@ from operators.detection.custom.folder import read_detection_data
 from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
-from operators.training.augmentation import NONE, Variation, fitted, tensor_of, warp
+from operators.learning.augmentation import NONE, Variation, fitted, tensor_of, warp
 from operators.weights import NetworkFileError, open_network, open_second, shipped
 
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
@@ -547,7 +547,7 @@ def test_boxes_follow_the_pixels_through_every_variation(tmp_path: Path, seed: i
 
 
 def test_without_variation_training_sees_what_the_operator_sees(tmp_path: Path) -> None:
-    from operators.detection.fit import Fit
+    from operators.image.letterbox import Fit
 
     for size, target in (((640, 480), (320, 240)), ((200, 120), (160, 128)), ((100, 160), (160, 128))):
         pixels = cv2.resize(np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8), size)
@@ -614,7 +614,7 @@ def test_an_ignored_object_is_neither_missed_nor_wrong_to_find() -> None:
 
 
 def exported(tmp_path: Path, classes: int = 3, more: dict[str, object] | None = None) -> tuple[Path, GridDetector]:
-    from operators.training.export import export_network
+    from operators.learning.export import export_network
 
     torch.manual_seed(0)
     network = GridDetector(classes, width=0.25, channels=32).eval()

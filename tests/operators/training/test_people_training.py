@@ -25,8 +25,8 @@ from operators.weights import NetworkFileError
 
 pytest.importorskip("torch", reason="training needs the extra [train]")
 
+from operators.learning.balance import class_weights
 from operators.recognition.posture_training import PostureTask, mirrored
-from operators.training.balance import class_weights
 from operators.training.commands import train
 from operators.weights import trained_in_simulation
 

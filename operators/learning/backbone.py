@@ -10,7 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from operators.training.files import TrainingFileError, load_safely
+from operators.learning.files import TrainingFileError, load_safely
 
 # expansion, channels, repeats, stride of each stage (Sandler et al. 2018, table 2), without the last one, whose 320
 # channels serve the classifier.

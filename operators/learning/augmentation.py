@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 
 Affine = NDArray[np.float64]
 """(2, 3): pixel edges of the source image → pixel edges of the network's input; (0, 0) is the top left corner."""

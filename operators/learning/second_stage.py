@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from operators.training.augmentation import Variation
-from operators.training.export import export_rows, without_second
-from operators.training.files import TrainingFileError
+from operators.learning.augmentation import Variation
+from operators.learning.export import export_rows, without_second
+from operators.learning.files import TrainingFileError
 
 Image = TypeVar("Image")
 Shown = TypeVar("Shown", covariant=True)

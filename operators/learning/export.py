@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from operators.training.files import whole
+from operators.learning.files import whole
 from operators.weights.network_file import KEY, SECOND
 
 _OPSET = 17

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from operators.training.files import TrainingFileError
+from operators.learning.files import TrainingFileError
 from operators.weights.network_file import read_facts
 
 MOST_IMAGES = 64

@@ -14,15 +14,15 @@ from torch import nn  # noqa: E402
 from operators.detection.custom.folder import read_detection_data  # noqa: E402
 from operators.detection.custom.network import FINE_STRIDES, GridHead  # noqa: E402
 from operators.detection.custom.training import DetectorTask  # noqa: E402
+from operators.learning.augmentation import fitted, tensor_of, warp  # noqa: E402
+from operators.learning.backbone import SmallResNet  # noqa: E402
+from operators.learning.files import TrainingFileError  # noqa: E402
+from operators.learning.loop import Settings, train  # noqa: E402
+from operators.learning.network_weights import begin_with, sample_images  # noqa: E402
 from operators.segmentation.dataset import read_segmentation_data  # noqa: E402
 from operators.segmentation.network import ClassDecoder  # noqa: E402
 from operators.segmentation.training import SegmenterTask  # noqa: E402
 from operators.sources.simulator.classes import CLASSES, THINGS  # noqa: E402
-from operators.training.augmentation import fitted, tensor_of, warp  # noqa: E402
-from operators.training.backbone import SmallResNet  # noqa: E402
-from operators.training.files import TrainingFileError  # noqa: E402
-from operators.training.loop import Settings, train  # noqa: E402
-from operators.training.network_weights import begin_with, sample_images  # noqa: E402
 from operators.training.pair import PairTask  # noqa: E402
 from operators.weights import open_network, read_facts, shipped, trained_in_simulation  # noqa: E402
 

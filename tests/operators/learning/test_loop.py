@@ -14,9 +14,9 @@ torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
 from torch import Tensor, nn  # noqa: E402
 
-from operators.training.backbone import MobileNetV2, load_backbone, start_from  # noqa: E402
-from operators.training.files import TrainingFileError, load_safely, save_atomically  # noqa: E402
-from operators.training.loop import Settings, Silent, batches, schedule, train  # noqa: E402
+from operators.learning.backbone import MobileNetV2, load_backbone, start_from  # noqa: E402
+from operators.learning.files import TrainingFileError, load_safely, save_atomically  # noqa: E402
+from operators.learning.loop import Settings, Silent, batches, schedule, train  # noqa: E402
 
 
 class Line:

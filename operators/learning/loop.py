@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from operators.training.files import TrainingFileError, load_safely, save_atomically
+from operators.learning.files import TrainingFileError, load_safely, save_atomically
 
 _AHEAD = 3  # batches prepared ahead of the one in training
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 
 EXTENT = st.integers(8, 400)
 
