@@ -24,7 +24,7 @@ from operators.detection import CustomDetector, FocusDetector, Reclassifier
 from operators.detection.custom.evaluation import DetectionScore, ScoredImage, score_detections
 from operators.detection.decode import Candidates
 from operators.detection.focus.model import FocusModel
-from operators.sources.simulator.classes import THINGS
+from operators.simulator.classes import THINGS
 from operators.training.simulated_worlds import FOCAL, HELD_OUT, WorldImage, render, worlds
 from operators.weights import shipped
 

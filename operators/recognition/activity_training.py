@@ -26,7 +26,7 @@ from operators.recognition.activity_score import macro_f1
 from operators.recognition.agent_features import NAMES
 from operators.recognition.episodes import Episode
 from operators.recognition.sensed_people import SensedTrack
-from operators.sources.simulator.classes import ACTIVITIES
+from operators.simulator.classes import ACTIVITIES
 from operators.training.balance import class_weights
 from operators.training.export import export_steps
 

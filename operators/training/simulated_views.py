@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.detection.focus.views import CLASSES, MOST, NONE, Views
-from operators.sources.simulator import color
-from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
-from operators.sources.simulator.noise import NoisePool
-from operators.sources.simulator.optics import Optics, View
-from operators.sources.simulator.renderer import Renderer
-from operators.sources.simulator.scene import Thing
-from operators.sources.simulator.settings import ColorCamera
-from operators.sources.simulator.worlds import make_world
+from operators.simulator import color
+from operators.simulator.frames import BODY_TO_OPTICAL, mounted
+from operators.simulator.noise import NoisePool
+from operators.simulator.optics import Optics, View
+from operators.simulator.renderer import Renderer
+from operators.simulator.scene import Thing
+from operators.simulator.settings import ColorCamera
+from operators.simulator.worlds import make_world
 from operators.training.made_worlds import Chosen, file_of, write_lacking
 
 Array = NDArray[np.float64]

@@ -23,9 +23,9 @@ from rich.console import Console
 from rich.progress import track
 
 from dataflow.messages import Detections2D, Image, SegmentationMap
-from operators.sources.simulated_robot import SimulatedRobot
-from operators.sources.simulator.classes import CLASSES, THINGS
-from operators.sources.simulator.worlds import INDOOR
+from operators.simulator.classes import CLASSES, THINGS
+from operators.simulator.robot import SimulatedRobot
+from operators.simulator.worlds import INDOOR
 
 VGA, QVGA = (640, 480), (320, 240)
 """Width and height of the images: of worlds with even seeds, of the others."""

@@ -108,7 +108,7 @@ def train_reclassifier(
 
 def _views(folder: Path, training: int, validation: int, processes: int, quiet: bool) -> tuple[Views, Views]:
     """Makes the views that a folder lacks, and reads all."""
-    from operators.sources.simulator.worlds import INDOOR
+    from operators.simulator.worlds import INDOOR
     from operators.training import made_worlds
     from operators.training.simulated_views import TRAINING, VALIDATION, read_views, write_views
 

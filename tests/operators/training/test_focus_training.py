@@ -14,7 +14,7 @@ from operators.detection.focus.model import FocusModel
 from operators.detection.focus.targets import NOTHING, UNKNOWN, targets
 from operators.detection.focus.views import CLASSES, MOST, NONE, Views
 from operators.detection.nms import intersection_over_union
-from operators.sources.simulator.worlds import INDOOR
+from operators.simulator.worlds import INDOOR
 from operators.training import simulated_views
 from operators.training.made_worlds import file_of, worlds
 from operators.weights import NetworkFileError

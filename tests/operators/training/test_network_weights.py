@@ -17,7 +17,7 @@ from operators.detection.custom.training import DetectorTask  # noqa: E402
 from operators.segmentation.dataset import read_segmentation_data  # noqa: E402
 from operators.segmentation.network import ClassDecoder  # noqa: E402
 from operators.segmentation.training import SegmenterTask  # noqa: E402
-from operators.sources.simulator.classes import CLASSES, THINGS  # noqa: E402
+from operators.simulator.classes import CLASSES, THINGS  # noqa: E402
 from operators.training.augmentation import fitted, tensor_of, warp  # noqa: E402
 from operators.training.averaging import average  # noqa: E402
 from operators.training.backbone import SmallResNet  # noqa: E402

@@ -14,7 +14,7 @@ from operators.detection.custom.dataset import DataError  # noqa: E402
 from operators.detection.custom.folder import read_detection_data  # noqa: E402
 from operators.segmentation import Segmenter  # noqa: E402
 from operators.segmentation.dataset import VOID, read_segmentation_data  # noqa: E402
-from operators.sources.simulator.classes import CLASSES  # noqa: E402
+from operators.simulator.classes import CLASSES  # noqa: E402
 from operators.training import simulated_worlds  # noqa: E402
 from operators.training.augmentation import Variation  # noqa: E402
 from operators.training.backbone import SmallResNet  # noqa: E402
