@@ -8,7 +8,7 @@ import numpy as np
 
 from dataflow.messages import Diagnostics, Message, PointCloud
 from dataflow.operator import In, Operator, Out, Param
-from operators.watching import Watching
+from operators.monitoring.watching import Watching
 
 
 class ScanWatch(Watching, Operator):

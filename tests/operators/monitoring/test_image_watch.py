@@ -7,7 +7,7 @@ import pytest
 
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Diagnostics, Image
-from operators.image import DepthWatch, ImageWatch
+from operators.monitoring import DepthWatch, ImageWatch
 
 
 def images(*levels: int, seed: int = 1) -> list[Image]:

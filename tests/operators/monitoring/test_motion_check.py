@@ -14,8 +14,8 @@ from dataflow import Played, play
 from dataflow.messages import Imu, Odometry, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
-from operators.crosscheck import MotionCheck
 from operators.geometry.se3 import exp
+from operators.monitoring import MotionCheck
 
 SECONDS = 12
 SPEED, TURN = 0.5, 0.4

@@ -10,10 +10,10 @@ import pytest
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
-from operators.crosscheck import DepthScanCheck
-from operators.crosscheck.depth_scan import DepthScanAgreement
 from operators.geometry.se3 import exp
-from tests.operators.crosscheck.rooms import T_BASE_DEPTH, T_BASE_LIDAR, K, extrinsics, info, views
+from operators.monitoring import DepthScanCheck
+from operators.monitoring.depth_scan import DepthScanAgreement
+from tests.operators.monitoring.rooms import T_BASE_DEPTH, T_BASE_LIDAR, K, extrinsics, info, views
 
 
 @cache

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from dataflow.messages import DepthImage, Diagnostics, Image, Message
 from dataflow.operator import In, Operator, Out, Param
-from operators.watching import Watching
+from operators.monitoring.watching import Watching
 
 
 class ImageWatch(Watching, Operator):

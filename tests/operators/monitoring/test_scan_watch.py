@@ -7,7 +7,7 @@ import pytest
 
 from dataflow import play
 from dataflow.messages import PointCloud
-from operators.cloud import ScanWatch
+from operators.monitoring import ScanWatch
 
 
 @pytest.mark.parametrize("kept", [0, 100], ids=["empty", "frozen"])

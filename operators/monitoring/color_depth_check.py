@@ -11,9 +11,9 @@ import numpy as np
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
-from operators.crosscheck.edge_alignment import EdgeAlignment, Shift, rims
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
+from operators.monitoring.edge_alignment import EdgeAlignment, Shift, rims
 from operators.status import counted_status
 
 

@@ -11,8 +11,8 @@ from dataflow import Played, play
 from dataflow.firing.failure import OperatorFailure
 from dataflow.messages import CameraInfo, DepthImage, Image, Odometry, PointCloud
 from dataflow.messages.diagnostics import Level
-from operators.crosscheck import ColorDepthCheck, DepthScanCheck
-from tests.operators.crosscheck.rooms import HEIGHT, WIDTH, extrinsics, info, views
+from operators.monitoring import ColorDepthCheck, DepthScanCheck
+from tests.operators.monitoring.rooms import HEIGHT, WIDTH, extrinsics, info, views
 
 BAD = range(4, 7)
 DEPTHS = {

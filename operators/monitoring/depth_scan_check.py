@@ -11,11 +11,11 @@ import numpy as np
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.crosscheck.depth_scan import DepthScanAgreement, Misfit
+from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
-from operators.odometry.lidar.scan import deskewed
+from operators.monitoring.depth_scan import DepthScanAgreement, Misfit
 from operators.status import counted_status
 
 _SURE = 4.0  # standard deviations by which a misfit must stand out

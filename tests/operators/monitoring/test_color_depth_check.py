@@ -11,9 +11,9 @@ import pytest
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Image, Transforms
 from dataflow.messages.diagnostics import Level
-from operators.crosscheck import ColorDepthCheck
-from operators.crosscheck.edge_alignment import EdgeAlignment, rims
-from tests.operators.crosscheck.rooms import K, extrinsics, info, views
+from operators.monitoring import ColorDepthCheck
+from operators.monitoring.edge_alignment import EdgeAlignment, rims
+from tests.operators.monitoring.rooms import K, extrinsics, info, views
 
 
 @cache

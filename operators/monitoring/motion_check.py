@@ -12,8 +12,8 @@ from dataflow.messages import Diagnostics, Imu, Message, Odometry, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
 from dataflow.operator import Batch, Context, Duration, In, Operator, Out, Param, Sampled
-from operators.crosscheck.motion_agreement import Contradiction, Limits, MotionAgreement, Track, Window
 from operators.geometry.extrinsics import transform_between
+from operators.monitoring.motion_agreement import Contradiction, Limits, MotionAgreement, Track, Window
 from operators.status import counted_status
 
 _NEWEST = 350_000_000  # ns: what an older pose says of the speed is not compared with the wheels'
