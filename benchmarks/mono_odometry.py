@@ -89,7 +89,7 @@ def simulated(cache: Path, world: str, seed: int, seconds: int) -> Drive:
 
 
 def _render(file: Path, world: str, seed: int, seconds: int) -> None:
-    from operators.sources import SimulatedRobot
+    from operators.simulator import SimulatedRobot
 
     robot = SimulatedRobot(
         world=world,

@@ -18,7 +18,7 @@ from operators.geometry.extrinsics import transform_between
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.odometry.tracking import Status, TrackResult
-from operators.sources import SimulatedRobot
+from operators.simulator import SimulatedRobot
 
 Array = NDArray[np.float64]
 

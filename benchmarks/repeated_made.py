@@ -42,7 +42,7 @@ graph: sensed
 namespace: robot1
 operators:
   robot:
-    use: operators.sources:SimulatedRobot
+    use: operators.simulator:SimulatedRobot
     params:
       duration: 600ms
       color_camera: {rate: 5}
@@ -71,7 +71,7 @@ graph: adapted
 namespace: robot1
 operators:
   robot:
-    use: operators.sources:SimulatedRobot
+    use: operators.simulator:SimulatedRobot
     params:
       duration: 1s
       color_camera: {rate: 10, read_noise: 6}
@@ -87,7 +87,7 @@ graph: plots
 namespace: robot1
 operators:
   robot:
-    use: operators.sources:SimulatedRobot
+    use: operators.simulator:SimulatedRobot
     params: {duration: 21s, seed: 11, first_stamp: 1700000000000000000}
   plots:
     use: operators.evaluation:TrajectoryPlots

@@ -33,7 +33,7 @@ from operators.detection import CustomDetector
 from operators.recognition import PostureRecognizer
 from operators.scene import ObjectLifter, SemanticMap
 from operators.segmentation import Segmenter
-from operators.sources.simulated_robot import SimulatedRobot
+from operators.simulator.robot import SimulatedRobot
 
 Route = Literal["tour", "watch"]
 KINDS = ("office", "table_top", "corridor")

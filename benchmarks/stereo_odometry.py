@@ -30,7 +30,8 @@ from operators.odometry.stereo.adjustment import StereoRig  # noqa: E402
 from operators.odometry.stereo.odometry import rig_of  # noqa: E402
 from operators.odometry.stereo.tracker import StereoOdometry  # noqa: E402
 from operators.odometry.tracking import MEASURED  # noqa: E402
-from operators.sources import KittiOdometry, SimulatedRobot  # noqa: E402
+from operators.simulator import SimulatedRobot  # noqa: E402
+from operators.sources import KittiOdometry  # noqa: E402
 
 Matrix = NDArray[np.float64]
 PERIOD = 100_000_000  # nanoseconds

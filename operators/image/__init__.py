@@ -1,4 +1,4 @@
-"""Operators that prepare images: without distortion, rectified, cropped, scaled, evenly bright, adapted, none twice."""
+"""Operators that prepare images: without distortion, rectified, cropped, scaled, evenly bright, adapted."""
 
 from typing import TYPE_CHECKING
 
@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from operators.image.image_adapter import ImageAdapter
     from operators.image.image_preprocess import ImagePreprocess
     from operators.image.stereo_preprocess import StereoPreprocess
-    from operators.image.watch import DepthWatch, ImageWatch
 else:
     __getattr__, __dir__ = lazily(
         __name__,
@@ -16,8 +15,7 @@ else:
             "image_adapter": ("ImageAdapter",),
             "image_preprocess": ("ImagePreprocess",),
             "stereo_preprocess": ("StereoPreprocess",),
-            "watch": ("DepthWatch", "ImageWatch"),
         },
     )
 
-__all__ = ["DepthWatch", "ImageAdapter", "ImagePreprocess", "ImageWatch", "StereoPreprocess"]
+__all__ = ["ImageAdapter", "ImagePreprocess", "StereoPreprocess"]

@@ -28,7 +28,7 @@ from operators.recognition.activity_score import macro_f1
 from operators.recognition.agent_features import NAMES
 from operators.recognition.episodes import Episode
 from operators.recognition.sensed_people import SensedTrack
-from operators.sources.simulator.classes import ACTIVITIES
+from operators.simulator.classes import ACTIVITIES
 from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 KIND = "activity"

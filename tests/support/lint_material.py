@@ -47,7 +47,7 @@ def every(period: float, first: float = 0.0, last: float = 10.0) -> list[int]:
 
 @cache
 def _simulated(sensors: str) -> dict[str, list[Message]]:
-    from operators.sources import SimulatedRobot
+    from operators.simulator import SimulatedRobot
 
     settings: dict[str, Any] = {
         "seed": 4,

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.lidar.map import Array, Pairs, PlaneMap
-from operators.odometry.lidar.scan import Scan, deskewed
+from operators.odometry.lidar.scan import Scan
 
 ITERATIONS = 20
 _KERNEL = 3.0  # standard deviations at which a residual loses three quarters of its weight

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.lidar.fit import Fit, Prior, fit
 from operators.odometry.lidar.map import PlaneMap
 from operators.odometry.lidar.motion import LidarMotion, as_left, as_right, corrected
-from operators.odometry.lidar.scan import Scan, deskewed, prepare
+from operators.odometry.lidar.scan import Scan, prepare
 from operators.odometry.lidar.search import TURNS, around
 
 FEWEST = 50  # points of a scan, and half as many in planes, that a pose may rest on

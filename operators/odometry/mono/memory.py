@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.mono.map import MonoMap, View
 from operators.odometry.mono.ranging import RangingMemory
 from operators.odometry.mono.scale import Scale
@@ -14,7 +15,6 @@ from operators.odometry.mono.tracker import MonoState
 from operators.odometry.mono.tracks import Tracks
 from operators.odometry.motion import Motion
 from operators.odometry.plain import fields_of
-from operators.odometry.watch import Watch
 
 
 def to_plain(state: MonoState) -> dict[str, Any]:

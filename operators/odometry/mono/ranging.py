@@ -15,6 +15,7 @@ from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import Points, project
 from operators.geometry.se3 import Matrix
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.mono.scale import Scale
 from operators.odometry.mono.settings import RangingConfig
 from operators.odometry.motion import Motion
@@ -22,7 +23,6 @@ from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.relocalizer import lifted
 from operators.odometry.rgbd.surface import Surface
 from operators.odometry.tracking import MEASURED, TrackResult
-from operators.odometry.watch import Watch
 
 AGREE = 0.15  # of the logarithm of a ratio: points farther from the median lie on something else than their depth
 DEVIATION = 1.4826  # standard deviations in a median absolute deviation of normal errors

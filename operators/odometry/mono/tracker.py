@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, Vector
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.features import detect_corners
 from operators.odometry.mono.initialisation import first_map
 from operators.odometry.mono.map import MonoMap, View
@@ -26,7 +27,6 @@ from operators.odometry.mono.two_view import Unsolved
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.keyframe import view_distance
 from operators.odometry.tracking import Status, TrackResult, moved_covariance, scaled_covariance
-from operators.odometry.watch import Watch
 
 # Variances are this much larger than residuals say: neighbouring tracks err together (calibrated against truth).
 SYSTEMATIC = 30.0

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import Pixels, project, unproject
 from operators.geometry.se3 import Matrix
+from operators.monitoring.image_flaws import Flaw, Watch
 from operators.odometry.features import Gray, detect_corners, track_both_ways
 from operators.odometry.mono.map import MonoMap, Numbers, View, found_in
 from operators.odometry.mono.two_view import turned
 from operators.odometry.rgbd.surface import scaled_intrinsics
-from operators.odometry.watch import Flaw, Watch
 
 BACK = 1.0  # pixels by which a track may miss its beginning when followed back
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.geometry.se3 import Matrix
+from operators.monitoring.image_flaws import Flaw, Watch
 from operators.odometry.features import Gray
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import Surface, scaled_intrinsics
-from operators.odometry.watch import Flaw, Watch
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.motion import Motion
 from operators.odometry.plain import fields_of
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.surface import Surface
 from operators.odometry.rgbd.tracker import State
-from operators.odometry.watch import Watch
 
 
 def to_plain(state: State) -> dict[str, Any]:

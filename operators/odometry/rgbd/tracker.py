@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, Vector
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.corners import Corners, Layer, renewed, with_new
@@ -36,7 +37,6 @@ from operators.odometry.rgbd.relocalizer import (
 )
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
-from operators.odometry.watch import Watch
 
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.motion import Motion
 from operators.odometry.plain import fields_of
 from operators.odometry.stereo.adjustment import Sightings
 from operators.odometry.stereo.map import StereoMap
 from operators.odometry.stereo.relocalizer import StereoKeyframe
 from operators.odometry.stereo.tracker import StereoState
-from operators.odometry.watch import Watch
 
 
 def to_plain(state: StereoState) -> dict[str, Any]:

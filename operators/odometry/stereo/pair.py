@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.features import Gray
-from operators.odometry.watch import Watch
 
 Watches = tuple[Watch, Watch]
 

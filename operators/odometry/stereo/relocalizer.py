@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from operators.depth.stereo_matching import MatchingConfig, StereoMatcher
 from operators.geometry.se3 import Matrix
+from operators.monitoring.image_flaws import Flaw, Watch
 from operators.odometry.features import Gray
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
@@ -29,7 +30,6 @@ from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import DepthNoise, Surface, scaled_intrinsics
 from operators.odometry.stereo.adjustment import StereoRig
 from operators.odometry.tracking import scaled_covariance
-from operators.odometry.watch import Flaw, Watch
 
 WIDTH = 320  # images are reduced by whole factors to no less than this
 TYPICAL = 2.0  # units that things of a scene are typically away

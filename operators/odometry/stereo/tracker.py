@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.features import Gray, Mask, Pixels, detect_corners, track_both_ways
 from operators.odometry.mono.pose import solved
 from operators.odometry.motion import Motion
@@ -23,7 +24,6 @@ from operators.odometry.stereo.pair import StereoPair, Watches, observe
 from operators.odometry.stereo.relocalizer import TYPICAL, FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
-from operators.odometry.watch import Watch
 
 # Variances are this much larger than residuals say: neighbouring tracks err together (calibrated against truth).
 SYSTEMATIC = 500.0

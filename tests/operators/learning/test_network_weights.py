@@ -22,7 +22,7 @@ from operators.learning.network_weights import begin_with, sample_images  # noqa
 from operators.segmentation.dataset import read_segmentation_data  # noqa: E402
 from operators.segmentation.network import ClassDecoder  # noqa: E402
 from operators.segmentation.training import SegmenterTask  # noqa: E402
-from operators.sources.simulator.classes import CLASSES, THINGS  # noqa: E402
+from operators.simulator.classes import CLASSES, THINGS  # noqa: E402
 from operators.training.pair import PairTask  # noqa: E402
 from operators.weights import open_network, read_facts, shipped, trained_in_simulation  # noqa: E402
 

@@ -17,7 +17,7 @@ from operators.learning.backbone import SmallResNet  # noqa: E402
 from operators.learning.loop import Settings, train  # noqa: E402
 from operators.segmentation import Segmenter  # noqa: E402
 from operators.segmentation.dataset import VOID, read_segmentation_data  # noqa: E402
-from operators.sources.simulator.classes import CLASSES  # noqa: E402
+from operators.simulator.classes import CLASSES  # noqa: E402
 from operators.training import simulated_worlds  # noqa: E402
 from operators.training.pair import PairTask  # noqa: E402
 

@@ -17,7 +17,7 @@ from operators.recognition.posture_data import BODY, POSTURES, Postures
 from operators.recognition.posture_model import PostureModel
 from operators.recognition.sensed_people import SensedTrack, write_tracks
 from operators.recognition.silhouette import MIDDLE, SIDE
-from operators.sources.simulator.classes import ACTIVITIES
+from operators.simulator.classes import ACTIVITIES
 from operators.training import simulated_postures
 from operators.training.made_worlds import worlds
 from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, write_episodes

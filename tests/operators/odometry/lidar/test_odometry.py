@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Odometry, PointCloud, Transforms
 from dataflow.messages.geometry import invert
 from dataflow.testing import Played, play
+from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.odometry import LidarOdometry
 from operators.odometry.lidar.map import PlaneMap, thinned
-from operators.odometry.lidar.scan import deskewed
 from operators.odometry.lidar.sweep import Sweep
 
 Array = NDArray[np.float64]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.evidence import gathered, seeing
@@ -19,7 +20,6 @@ from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.relocalizer import candidates, recognised
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
-from operators.odometry.watch import Watch
 
 FOCAL, WIDTH, HEIGHT = 260.0, 320, 240
 K = np.array([[FOCAL, 0.0, 159.5], [0.0, FOCAL, 119.5], [0.0, 0.0, 1.0]])
