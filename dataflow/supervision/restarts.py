@@ -67,7 +67,8 @@ class LiveRestarts(RestartPolicy):
 
     def _policy(self, process: Supervised) -> Restart:
         if process.is_sink:
-            return RECORDER if process.plan.options["storage"]["on_failure"] == "go_on" else Restart(0)
+            goes_on = process.plan.sink == "record" and process.plan.options["storage"]["on_failure"] == "go_on"
+            return RECORDER if goes_on else Restart(0)
         policies = [self.run.graph.nodes[name].live.restart for name in process.nodes]
         return Restart(min((p.max for p in policies), default=0), max((p.backoff for p in policies), default=0))
 
