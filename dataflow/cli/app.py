@@ -47,7 +47,9 @@ def dataflow(
     show_traceback: Annotated[
         bool,
         typer.Option(
-            "--traceback", metavar=FLAG, help="Show where an error comes from. Environment: DATAFLOW_TRACEBACK=1."
+            "--traceback",
+            metavar=FLAG,
+            help="Show where an error comes from; also behind the command. Environment: DATAFLOW_TRACEBACK=1.",
         ),
     ] = False,
 ) -> None:

@@ -137,7 +137,7 @@ def execute(
         open_saved(outputs.view_file)
     if report.interrupted:
         raise typer.Exit(INTERRUPTED)
-    if any("lost" in facts for facts in report.files.values()):
+    if any(facts.get("lost") or facts.get("deaths") for facts in report.files.values()):
         raise typer.Exit(DIFFERENT)
     return report
 

@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.segment import Segment
 from rich.text import Text
 
-from dataflow.text import visible_json, visible_lines
+from dataflow.text import visible, visible_json, visible_lines
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -200,11 +200,23 @@ def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) 
     from rich import box
     from rich.table import Table
 
-    made = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    class Rows(Table):
+        """Shows a line break in a cell as its escape: a name in somebody's file cannot pass for another row."""
+
+        def add_row(self, *cells: RenderableType | None, **more: Any) -> None:
+            super().add_row(*(_one_line(cell) for cell in cells), **more)
+
+    made = Rows(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
         number = column in right
         made.add_column(column, justify="right" if number else "left", no_wrap=number, overflow="fold")
     return made
+
+
+def _one_line(cell: RenderableType | None) -> RenderableType | None:
+    if isinstance(cell, str):
+        return visible(cell)
+    return Text(visible(cell.plain), style=cell.style) if isinstance(cell, Text) and "\n" in cell.plain else cell
 
 
 def count(number: float) -> str:

@@ -22,6 +22,7 @@ from dataflow.cli.output import (
     size,
     table,
 )
+from dataflow.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -95,7 +96,7 @@ def _facts(described: Description) -> Table:
     grid.add_column(overflow="fold")
 
     def row(name: str, value: str, style: str = "") -> None:
-        grid.add_row(name, Text(value, style=style))
+        grid.add_row(name, Text(visible(value), style=style))
 
     made = described.metadata
     uncompressed = sum(s.bytes for s in described.streams)

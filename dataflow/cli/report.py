@@ -115,6 +115,11 @@ def _losses_in_short(report: RunReport) -> Text:
     for facts in report.files.values():
         if lost := facts.get("lost"):
             words.append(_not_recorded(lost))
+        if deaths := facts.get("deaths"):
+            words.append(
+                f"what the recorder, which died {plural(deaths, 'time')}, had not stored, and what came until the next "
+                "one began: the files before lie beside the last ones"
+            )
     return Text(f"lost    {'; '.join(words) or 'nothing'}", style="yellow" if words else "")
 
 

@@ -56,6 +56,9 @@ class PartsSink:
     ) -> None:
         self._path, self._graph, self._streams, self._options = path, graph, streams, options
         self._storage: Storage = options["storage"]
+        self._before = life - 1
+        self._earlier: dict[Path, int] = {}
+        """Parts of the recorders before, and their sizes."""
         self._numbered = self._storage.splitting.splits or life > 1
         self._static = {stream for stream in streams if graph.streams[stream].static}
         self._statics: dict[str, tuple[Message, int, int]] = {}
@@ -75,6 +78,8 @@ class PartsSink:
         if options["overwrite"] and self._storage.splitting.splits and life == 1:
             for old in parts_of(path):
                 old.unlink()
+        elif life > 1 and self._storage.splitting.splits:
+            self._earlier = {file: file.stat().st_size for file in parts_of(path)}
         self._current: Part | None = self._open(None)
 
     # What comes
@@ -156,13 +161,15 @@ class PartsSink:
             "bytes": self.size,
             "parts": [str(part.path) for part in self._closed],
             "deleted": self._deleted,
+            "deaths": self._before,
         }
         return {**facts, "lost": self.lost.as_json()} if self.lost.any else facts
 
     @property
     def size(self) -> int:
         """Bytes of all parts that there are."""
-        return sum(part.bytes for part in self._closed) + sum(p.sink.writer.saved_bytes for p in self._open_parts())
+        closed = sum(part.bytes for part in self._closed) + sum(self._earlier.values())
+        return closed + sum(part.sink.writer.saved_bytes for part in self._open_parts())
 
     # Parts
 
@@ -201,7 +208,7 @@ class PartsSink:
         if not self._numbered:
             self._numbered = True
             return self._path
-        first = len(self._closed) + self._deleted + (self._full is not None)
+        first = self._before + len(self._closed) + self._deleted + (self._full is not None)
         numbers = range(first, first + 10**6)
         names = (part_path(self._path, number) for number in numbers)
         return next(name for name in names if not name.exists())
@@ -274,8 +281,11 @@ class PartsSink:
 
     def _keep_to_limit(self) -> None:
         """Deletes the oldest parts while all together take more of the disk than they may."""
-        while self._storage.keep is not None and self._closed and self.size > self._storage.keep:
-            self._closed.pop(0).path.unlink(missing_ok=True)
+        most = self._storage.keep
+        while most is not None and (self._earlier or self._closed) and self.size > most:
+            oldest = next(iter(self._earlier)) if self._earlier else self._closed.pop(0).path
+            self._earlier.pop(oldest, None)
+            oldest.unlink(missing_ok=True)
             self._deleted += 1
 
     # Firing records

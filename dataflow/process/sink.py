@@ -110,7 +110,9 @@ class SinkProcess:
         self.sink: StreamSink | None = None
         static = [s for s in config.streams if self.graph.streams[s].static]
         losses = losses_of(config.label, channel, live=config.live)
-        self.inlet = Inlet(channel, self._deliver, static=static, losses=losses, from_start=config.live)
+        self.inlet = Inlet(
+            channel, self._deliver, static=static, losses=losses, from_start=config.live and config.life == 1
+        )
         self.batches = 0
         """Batches of firing records that were taken."""
         self.written = 0
@@ -208,7 +210,9 @@ class SinkProcess:
         """
         assert self.sink is not None
         last = batch.records[-1]
-        following = self._recorded.get(batch.operator, (-1, 0))
+        first = batch.records[0]
+        begin = (-1, 0) if self.config.life == 1 else (first.incarnation, first.index)
+        following = self._recorded.get(batch.operator, begin)
         lacking = self._lacking.setdefault(batch.operator, set())
         places = [(r.incarnation, r.index) for r in batch.records]
         due = following[1] if batch.incarnation == following[0] else 0
@@ -220,10 +224,10 @@ class SinkProcess:
         self._recorded[batch.operator] = max(following, (places[-1][0], places[-1][1] + 1))
         if len(fresh) == len(batch.records):
             self.sink.firings(batch.operator, batch.records, batch.data)
-            return batch.last
+            return batch.last or last.kind == "finish"
         for part in consecutive(fresh):
             self.sink.firings(batch.operator, part, encode_batch(part, last=batch.last and part[-1] is last))
-        return batch.last
+        return batch.last or last.kind == "finish"
 
     def _note_taken(self, operator: str, stamp: int) -> None:
         if operator in self._taken and stamp > 0:
@@ -286,6 +290,9 @@ class SinkProcess:
                 self._drain()
                 if self.sink is not None:
                     self.sink.summaries(fields.get("summaries", {}))
+            case "ended_elsewhere":
+                self._open.difference_update(fields["streams"])
+                self.frontiers |= dict.fromkeys(self.frontiers.keys() & set(fields["streams"]), FOREVER)
             case "lost":
                 self._drain()
                 raise ChannelClosed("the supervisor is gone")

@@ -22,6 +22,8 @@ from dataflow.supervision.run_state import Phase, RunState
 from dataflow.supervision.supervised import Supervised
 
 EDGES_WITHIN = 5.0
+RECORDER = Restart(max=5, backoff=1_000_000_000)
+"""Policy of the recorder of a run that goes on without it: the next one begins another file."""
 
 
 class RestartPolicy(Part):
@@ -58,12 +60,15 @@ class LiveRestarts(RestartPolicy):
     # Policy
 
     def may_restart(self, process: Supervised) -> bool:
-        return not self._closing() and not process.is_sink and self._policy(process).max > 0
+        return not self._closing() and self._policy(process).max > 0
 
     def _closing(self) -> bool:
         return self.run.phase in (Phase.CLOSING, Phase.OVER)
 
     def _policy(self, process: Supervised) -> Restart:
+        if process.is_sink:
+            goes_on = process.plan.sink == "record" and process.plan.options["storage"]["on_failure"] == "go_on"
+            return RECORDER if goes_on else Restart(0)
         policies = [self.run.graph.nodes[name].live.restart for name in process.nodes]
         return Restart(min((p.max for p in policies), default=0), max((p.backoff for p in policies), default=0))
 
@@ -122,6 +127,9 @@ class LiveRestarts(RestartPolicy):
             self._remains.forget(process.nodes)
             process.begins = {}
             self.run.spawn(process)
+        elif process.is_sink:
+            process.done.clear()  # it owes nothing of what was before it
+            self.run.spawn(process)
         else:
             restarts = self.run.status.restarts
             resume = {n: self._remains.resumed(n) | {"restarts": restarts.get(n, 0)} for n in process.nodes}
@@ -156,10 +164,14 @@ class LiveRestarts(RestartPolicy):
         if unproven:
             run.note(f"{process.describe()} goes on without: {', '.join(sorted(unproven))}")
         run.send(process, "go", first=run.release.first, at=run.release.at.wall)
-        taken = set(process.plan.subscribe)
+        taken = run.takes(process)
         for reason in sorted(set(self._ended_streams.values())):
             over = sorted(s for s in taken if self._ended_streams.get(s) == reason)
             run.send(process, "ended_elsewhere", streams=over, reason=reason)
+        if process.is_sink:  # of what the recorder before had not stored, operators have kept the records
+            for each in run.working():
+                for name in each.nodes:
+                    run.send(each, "lacks", operator=name)
         self._tell("back", process)
         run.event("restarted", f"{process.describe()} is back", operators=list(process.nodes))
 

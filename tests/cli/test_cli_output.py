@@ -13,9 +13,10 @@ import typer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from rich.text import Text
 
 from dataflow.cli.arguments import chosen_streams, existing, graph_file, output_file, window
-from dataflow.cli.output import about_a_file, friendly_errors, jsonable, plural, seconds, size
+from dataflow.cli.output import about_a_file, friendly_errors, jsonable, plural, seconds, size, table
 from dataflow.cli.progress import RunDisplay, shown
 from dataflow.cli.report import print_report, report_json
 from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
@@ -351,3 +352,15 @@ def test_a_start_says_which_processes_it_waits_for() -> None:
         "2",
         "more",
     ]
+
+
+def test_a_line_break_in_a_name_makes_no_row() -> None:
+    console = Console(file=io.StringIO(), width=120)
+    made = table("stream", "messages")
+    made.add_row(Text("imu\nforged/stream  1,000"), "3\n4")
+
+    console.print(made)
+
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert [line for line in lines if "forged" in line] == [line for line in lines if "imu" in line]
+    assert any("3\\n4" in line for line in lines)

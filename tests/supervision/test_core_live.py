@@ -8,8 +8,9 @@ import pytest
 from plays import LEFT, STEP, Play, asked_where, killed, sent, spawned
 
 from dataflow.chaos.plan import Fault
+from dataflow.recording.parts import Storage
 from dataflow.records.firing import Emission, FiringRecord
-from dataflow.supervision.commands import Send, Signal
+from dataflow.supervision.commands import Send, Signal, Spawn
 from dataflow.supervision.events import Begin, Died, NotReading, Said, Tick
 from dataflow.sync import FOREVER
 
@@ -181,12 +182,22 @@ def test_a_process_that_reads_nothing_is_killed_and_restarted_by_its_policy() ->
 
 
 def test_one_that_lost_what_it_needs_ends_the_run_without_a_policy() -> None:
-    play = robot(record="run.mcap").starts()
+    play = robot(record="run.mcap", storage=Storage(on_failure="end")).starts()
     play.deaf.add("@recorder")
     play.tell(NotReading("@recorder", 9.0, 500, overflowed=True))
     play.wait(20.0)
 
     assert play.failure() == "process '@recorder' has read nothing for 9 s"
+
+
+def test_a_recorder_that_lost_what_it_needs_is_followed_by_another() -> None:
+    play = robot(record="run.mcap").starts()
+    assert killed(play.tell(NotReading("@recorder", 9.0, 500))) == []  # it may wait for its disk
+    assert killed(play.tell(NotReading("@recorder", 9.0, 500, overflowed=True))) == ["@recorder"]
+    play.wait(3.0)
+
+    assert any("'@recorder' has read nothing for 9.0 s; started again" in note for note in play.core.status.notes)
+    assert sum(isinstance(c, Spawn) and c.label == "@recorder" for c in play.commands) == 2
 
 
 def covered(play: Play, stamp: int) -> tuple[int, int]:

@@ -21,6 +21,7 @@ from typing import Any
 from dataflow.graph import Graph
 from dataflow.graph.load import load_bundle
 from dataflow.recording import Recording, RecordingError
+from dataflow.recording.parts import Storage
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.plan import RunPlan
@@ -83,6 +84,7 @@ def _plan(scenario: Scenario, graph: Graph, path: Path) -> RunPlan:
         record=path,
         live=scenario.live,
         rate=scenario.rate,
+        storage=Storage(on_failure="end"),
         faults=iter(scenario.faults) if scenario.faults and scenario.live else None,
         window=(scenario.window, 1 << 20),
         start_timeout=TIMEOUT,

@@ -197,6 +197,7 @@ class Simulation:
             ("dataflow.process.handed", "BACKLOG"): (1, 1),
             (f"{supervision}.run", "machine_facts"): lambda environment: facts,
             ("dataflow.recording.container", "os"): self.disk,
+            ("dataflow.recording.parts", "os"): self.disk,
             ("dataflow.firing.source", "Tripwire"): _NoTripwire,
         }
 
