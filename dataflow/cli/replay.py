@@ -19,6 +19,7 @@ from dataflow.cli.arguments import (
     Network,
     Settings,
     Start,
+    Strict,
     existing_recording,
     find_modules_in,
     graph_file,
@@ -60,6 +61,7 @@ def replay(
     ] = None,
     maps: Map = None,
     clock: Clock = "auto",
+    strict: Strict = False,
     settings: Settings = None,
     path: ModuleFolders = None,
     start: Start = None,
@@ -170,9 +172,8 @@ def replay(
             options |= {"early": early, "paused": step, "controls": keys(quiet or json), **packing}
             if loop != 1:
                 raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
-            replay_bag(
-                recording, loaded, maps or (), clock, start, end, outputs, options, began=began, json=json, quiet=quiet
-            )
+            words = (recording, loaded, maps or (), clock, start, end, outputs, options)
+            replay_bag(*words, strict=strict, began=began, json=json, quiet=quiet)
             return
         with Recording(recording) as opened:
             if graph is None:

@@ -10,12 +10,13 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.json_format import ParseDict, ParseError
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from dataflow.messages import DepthImage, Image
+from dataflow.messages import DepthImage, Image, Image16
 from dataflow.messages.base import Message
 from dataflow.recording.codecs import SchemaText, build
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, stamp_of
 from dataflow.recording.json_codec import decode_object
+from dataflow.recording.pixels import is_16_bit
 
 DEPTH_ENCODINGS = ("32FC1", "16UC1")
 _PREFERRED = {"foxglove.PoseInFrame": "Pose", "foxglove.RawImage": "Image"}
@@ -60,8 +61,8 @@ def _stamp(proto: Any, log_time: int) -> int:
 
 def _message(schema: FoxgloveSchema, proto: Any, log_time: int) -> Message:
     if isinstance(proto, RawImage):
-        depth = proto.encoding in DEPTH_ENCODINGS
-        schema = FOXGLOVE_SCHEMAS[DepthImage if depth else Image]
+        kind = DepthImage if proto.encoding in DEPTH_ENCODINGS else Image16 if is_16_bit(proto.encoding) else Image
+        schema = FOXGLOVE_SCHEMAS[kind]
     return build(schema.message, _stamp(proto, log_time), schema.decode(proto))
 
 

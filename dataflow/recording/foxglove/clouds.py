@@ -36,6 +36,7 @@ _CLOUD_COLUMNS: tuple[tuple[str, tuple[str, ...], str, int], ...] = (
 )
 """Field of `PointCloud`, its packed columns in the order written, their dtype."""
 OPAQUE = 255
+CLOUD_EXTRAS = ("precise", "columns")
 
 
 def encode_cloud(message: PointCloud) -> tuple[Parts, tuple[str, ...]]:
@@ -61,12 +62,13 @@ def encode_cloud(message: PointCloud) -> tuple[Parts, tuple[str, ...]]:
             proto.fields.add(name="alpha", offset=offset, type=NUMERIC.UINT8)
             offset += 1
     proto.point_stride = offset
+    lacks = tuple(name for name in CLOUD_EXTRAS if getattr(message, name) is not None)
     if names == ["points"]:
-        return with_field(proto, "data", message.points), ()
+        return with_field(proto, "data", message.points), lacks
     packed = np.empty(len(message.points), np.dtype({"names": names, "formats": formats}))
     for name in names:
         packed[name] = OPAQUE if name == "alpha" else getattr(message, name)
-    return with_field(proto, "data", packed.view(np.uint8)), ()
+    return with_field(proto, "data", packed.view(np.uint8)), lacks
 
 
 def decode_cloud(proto: PointCloudProto) -> Fields:
