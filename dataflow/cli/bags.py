@@ -14,7 +14,7 @@ from rich.text import Text
 
 from dataflow.cli.arguments import span, window
 from dataflow.cli.execution import Outputs, execute
-from dataflow.cli.output import DIFFERENT, count, err, out, plural, print_json, say, seconds, size, table
+from dataflow.cli.output import DIFFERENT, count, err, out, plural, print_json, say, seconds, shown, size, table
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -131,6 +131,7 @@ def describe_bag(path: Path, *, json: bool) -> None:
         kind, notes = bag.kind, (*bag.notes, *shortfalls(bag))
     finally:
         bag.close()
+    shown(notes)
     whole = total(rows)
     if json:
         facts = {"path": str(path), "format": kind, "notes": list(notes), "bytes": _bytes(path)}

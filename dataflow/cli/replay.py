@@ -154,6 +154,7 @@ def replay(
         from dataflow.interop.opening import is_foreign, open_bag
         from dataflow.recording import Recording
         from dataflow.recording.cutting import cut_of
+        from dataflow.recording.index import NO_END
         from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
         from dataflow.supervision.replay import plan_replay
         from dataflow.supervision.run import replay as replay_recording
@@ -196,7 +197,7 @@ def replay(
             begin, finish = window(whole, start, end, recording)
             if opened.torn:
                 name = escape(str(recording))
-                say(f"[yellow]{name} has no proper end:[/] what its writer had not stored when it died is missing")
+                say(f"[yellow]{name} {escape(NO_END)}[/]")
             part = cut_of(opened.metadata)
             begin = part.start if begin is None and part is not None else begin
             if begin is not None:

@@ -13,7 +13,7 @@ from mcap.records import Channel
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
 from dataflow.interop.channels import join
 from dataflow.recording.codecs import SchemaText
-from dataflow.recording.index import McapFile
+from dataflow.recording.index import NO_END, McapFile
 from dataflow.recording.layout import Kind
 from dataflow.recording.ordering import in_file_order
 
@@ -47,12 +47,7 @@ class McapBag:
         what = " ROS 2" if profiles == {"ros2"} else " ROS 1" if profiles == {"ros1"} else ""
         self.kind = f"MCAP{what}" + (f", {len(files)} files" if len(files) > 1 else "")
         self.notes: tuple[str, ...] = tuple(
-            [
-                f"{f.path.name} has no proper end: it is being written, or its writer died; what follows its last "
-                f"whole chunk is not read (`dataflow recover` saves it)"
-                for f in self.files
-                if f.torn
-            ]
+            [f"{f.path.name} {NO_END}" for f in self.files if f.torn]
             + [note for f in self.files for note in f.damage]
             + list(joined.notes)
         )

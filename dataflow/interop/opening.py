@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dataflow.interop.bag import Bag, BagError
+from dataflow.interop.bag import Bag, BagError, shortfalls
 from dataflow.interop.mcap_bag import McapBag
 from dataflow.interop.unpacking import Unpacked, unpack
 from dataflow.recording.container import MAGIC
 from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RECORDING
+from dataflow.recording.notices import notice
 
 ROS1_MAGIC = b"#ROSBAG V"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -21,6 +22,13 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 def open_bag(path: Path) -> Bag:
+    """Opens a bag, and announces what is unusual about it (`notices`). Raises as `bag_at`."""
+    bag = bag_at(path)
+    notice(path, [*bag.notes, *shortfalls(bag)])
+    return bag
+
+
+def bag_at(path: Path) -> Bag:
     """Opens a ROS 1 bag, a ROS 2 bag (folder, .db3 or .mcap) or any other MCAP file.
 
     Raises `BagError` that says what else is there, `RecordingError` for a damaged MCAP file.

@@ -198,7 +198,7 @@ class BagStreams:
             count += 1
             for message in self._parts(played, stored):
                 if isinstance(message, Transforms):
-                    for child, place in _places(message):
+                    for child, place in places_of(message):
                         if given.setdefault(child, place) != place:
                             changed[child] = changed.get(child, 0) + 1
                             given[child] = place
@@ -345,7 +345,7 @@ def recorded_streams(path: Path, opening: Mapping[str, Any] | None) -> Recording
     return BagStreams(path, played, opening["clock"], strict=opening["strict"])
 
 
-def _places(message: Transforms) -> Iterator[tuple[str, bytes]]:
+def places_of(message: Transforms) -> Iterator[tuple[str, bytes]]:
     """(child frame, its parent and place as bytes) of each transform."""
     for i, child in enumerate(message.child_frames):
         place = message.translations[i].tobytes() + message.rotations[i].tobytes()

@@ -170,6 +170,13 @@ def _ros_reader(topic: Topic) -> TopicReader:
     return RosReader(kind, topic.encoding == "ros1", convert)
 
 
+def is_known(topic: Topic) -> bool:
+    """Tells whether a topic's type has a counterpart here."""
+    if topic.encoding in ("cdr", "ros1"):
+        return ros_type(topic.schema.name) in CONVERSIONS
+    return foreign_decoder(topic.encoding, topic.schema) is not None
+
+
 class Reading:
     """A topic as it can be played: how its messages are read, and the type that the first one becomes.
 

@@ -11,7 +11,7 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudPro
 
 from dataflow.messages import PointCloud
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.foxglove.values import Fields, Parts, frozen, pose_of, timestamp_of, with_field
+from dataflow.recording.foxglove.values import Fields, Parts, frozen, placed_by, pose_of, timestamp_of, with_field
 
 NUMERIC = PackedElementField
 _NUMERIC_DTYPES: dict[int, np.dtype[Any]] = {
@@ -84,6 +84,12 @@ def decode_cloud(proto: PointCloudProto) -> Fields:
             found[field] = _columns(proto.data, count, stride, present, dtype)
     if "points" not in found:
         raise RecordingError(f"PointCloud needs the fields x, y and z, got {', '.join(offsets) or 'none'}")
+    place = placed_by(proto.pose)
+    if place is not None:
+        for field, shift in (("points", place[:3, 3]), ("normals", np.zeros(3))):
+            if field in found:
+                moved = found[field].astype(np.float64) @ place[:3, :3].T + shift
+                found[field] = frozen(moved, "<f4", moved.shape)
     return found
 
 
