@@ -68,6 +68,11 @@ def is_foreign(path: Path) -> bool:
         file.close()
 
 
+def is_ros_bag(path: Path) -> bool:
+    """Tells whether a file is a ROS 1 bag or a database of a ROS 2 bag, whole or not."""
+    return path.is_file() and _head(path).startswith((ROS1_MAGIC, SQLITE_MAGIC))
+
+
 def _ros_bag(path: Path) -> Bag:
     from dataflow.interop.ros_bags import RosBag  # rosbags takes long to import, and most files are no such bags
 
