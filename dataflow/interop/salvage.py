@@ -1,7 +1,7 @@
 """Saves the messages of broken ROS bags, by reading records wherever they lie and believing no index.
 
-SQLite: leaf pages of tables hold rows (SQLite file format 2.6), whose large values go on in overflow pages. ROS 1: records
-follow each other, in chunks or not (ROS bag format 2.0).
+SQLite: leaf pages of tables hold rows (SQLite file format 1.6), whose large values go on in overflow pages. ROS 1:
+records follow each other, in chunks or not (ROS bag format 2.0).
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -37,9 +38,7 @@ class Seen:
         return tuple(dict.fromkeys([*self._unread("", root), *self.losses]))
 
     def _unread(self, where: str, frame: str | None) -> Iterator[str]:
-        for name in getattr(self._value, "__dataclass_fields__", ()):
-            if name in ELSEWHERE or name.startswith("__"):
-                continue
+        for name in _names(self._value):
             place = f"{where}.{name}" if where else name
             value = getattr(self._value, name)
             if name not in self._read:
@@ -61,6 +60,11 @@ def lose(message: Any, what: str) -> None:
         message.losses.append(what)
 
 
+def _names(value: Any) -> list[str]:
+    """The fields of a message that count; its constants are none."""
+    return [each.name for each in fields(value) if each.name not in ELSEWHERE]
+
+
 def _wrapped(value: Any, losses: list[str]) -> Any:
     if isinstance(value, list):
         return [_wrapped(one, losses) for one in value]
@@ -79,8 +83,7 @@ def _holds_something(value: Any) -> bool:
     if hasattr(value, "__dataclass_fields__"):
         return any(
             _holds_something(getattr(value, name))
-            for name in value.__dataclass_fields__
-            if name not in ELSEWHERE and not name.startswith("__")
+            for name in _names(value)
         )
     if isinstance(value, np.ndarray):
         return bool(value.size) and bool(np.asarray(value != 0).any())

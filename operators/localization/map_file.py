@@ -23,7 +23,8 @@ def read_map(path: Path, frame: str, stamp: int = 0) -> OccupancyGrid:
 
     A pixel's darkness is its occupancy. `mode` says what is made of it: `trinary` (the default) taken above
     `occupied_thresh`, free below `free_thresh`, unknown between them; `scale` the same with shares of 100 between them,
-    unknown where the image is transparent; `raw` the pixel itself, unknown above 100. Raises ValueError for a file that is no such map, FileNotFoundError where file or image is missing.
+    unknown where the image is transparent; `raw` the pixel itself, unknown above 100. Raises ValueError for a file that
+    is no such map, FileNotFoundError where file or image is missing.
     """
     try:
         content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
