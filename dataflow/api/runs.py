@@ -148,6 +148,7 @@ def replay(
     path = Path(recording)
     facts: dict[str, dict[str, str]] = {}
     played: set[str] | None = None
+    shift = 0
     if graph is not None and is_foreign(path):
         from dataflow.interop.playing import play  # bags need libraries that no recording does
 
@@ -157,6 +158,7 @@ def replay(
             log = plan_replay(bag, built, start=start, end=end)
             warn_of_gap(built, bag)
             facts, played = {BAG: bag.facts()}, {p.topic for p in bag.played.values()}
+            shift = bag.clock.shift
     else:
         with Recording(path) as opened:
             built = recorded_graph(opened) if graph is None else resolved(graph, settings)
@@ -167,7 +169,7 @@ def replay(
         record=file, metadata=facts | metadata_of(built, "replay"), overwrite=overwrite, watch=watch
     )
     if file is not None and played is not None:
-        keep_untouched(file, path, played, log.start, log.end)
+        keep_untouched(file, path, played, log.start, log.end, shift=shift)
     return RunResult(report, file)
 
 

@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from dataflow.cli import completion
 from dataflow.cli.arguments import FLAG
-from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, interrupted_by_user, wants_traceback
+from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, forget_notes, interrupted_by_user, wants_traceback
 from dataflow.cli.plugins import CommandGroup, renamed
 from dataflow.cli.standard_output import OutputFailed
 from dataflow.extras import missing_extra
@@ -80,6 +80,7 @@ def dataflow(
 def call() -> None:
     """Calls the command that the arguments name."""
     completion.prepare()
+    forget_notes()
     try:
         app()
     except OutputFailed:

@@ -23,11 +23,16 @@ from dataflow.recording.ending import MAGIC
 from dataflow.recording.errors import DamagedError, RecordingError
 from dataflow.recording.limits import MAX_CHUNK_BYTES
 from dataflow.recording.message_index import LoadedIndex, MessageIndex
+from dataflow.recording.notices import notice
 from dataflow.recording.rawfile import RECORD, RawFile
 from dataflow.recording.scan import scan
 from dataflow.recording.seals import Seal, seal_of
 from dataflow.recording.summary import TAIL_BYTES, Footer, Summary, read_footer, read_summary
 
+NO_END = (
+    "has no proper end: it is being written, or its writer died; what its writer had not stored is missing "
+    "(`dataflow recover` saves what follows its last whole chunk)"
+)
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_FIXED = _MESSAGE.size - RECORD.size
 
@@ -72,6 +77,7 @@ class McapFile:
         self._attachments = contents.attachments
         self._chunks = contents.chunks
         self._loose_bytes = contents.loose_bytes
+        notice(path, [*([NO_END] if self.torn else ()), *self.damage])
 
     def close(self) -> None:
         """Closes the file. Idempotent."""

@@ -17,6 +17,7 @@ from dataflow.messages import (
     DepthImage,
     Detections2D,
     Image,
+    Image16,
     Mesh,
     Message,
     Planes,
@@ -28,7 +29,7 @@ from dataflow.messages import (
 )
 from dataflow.view.pacing import Pace
 
-COLOR: tuple[type[Message], ...] = (Image, CompressedImage)
+COLOR: tuple[type[Message], ...] = (Image, CompressedImage, Image16)
 DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth, RelativeDepth)
 OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
 
