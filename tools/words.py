@@ -1,6 +1,6 @@
 """Lists wording that the style of this project avoids, in docstrings, messages, comments and pages.
 
-Run `python tools/words.py [PATH ...]`; without paths it reads the product and the pages. It ends with 1 if it finds any.
+Run `python tools/words.py [PATH ...]`; without paths it reads product and pages. It ends with 1 if it finds any.
 """
 
 from __future__ import annotations
