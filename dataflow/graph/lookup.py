@@ -62,7 +62,7 @@ def find_operator(use: str) -> type[Operator] | NotFound:
         )
     if not is_concrete(found):
         return NotFound(
-            f"{use!r} is abstract: it declares no ports of its own",
+            f"{use!r} is abstract: it declares no ports",
             did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
         )
     return found
@@ -120,7 +120,7 @@ def lost_exports(module: ModuleType) -> Iterator[tuple[str, str, str]]:
 
 
 def is_concrete(cls: type[Operator]) -> bool:
-    """True when the class declares ports of its own, so that it can be made."""
+    """Returns whether the class itself declares ports, so that it can be instantiated."""
     return cls not in (Operator, Source) and "spec" in vars(cls)
 
 

@@ -1,7 +1,7 @@
 """The resolved graph: what a graph file means once every name, stream, parameter and policy in it is settled.
 
 Everything here is plain data that travels between processes as JSON (`Graph.to_json`, `Graph.from_json`); a node's
-operator class is imported only when somebody asks for it, so a process imports its own operators and no others.
+operator class is imported at its first use, so a process imports its own operators and no others.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def current_placement(placement: Any) -> Any:
 
 
 class OperatorImportError(ImportError):
-    """An operator that cannot be had from its import path: says which part of the path fails and why."""
+    """An operator cannot be imported from its path; the message names the part that fails, and why."""
 
 
 MOVED = "MOVED_OPERATORS"

@@ -112,7 +112,7 @@ def _dtype_bytes(dtype: np.dtype[Any]) -> bytes:
     return b"\x01" + dtype.str.encode()
 
 
-@lru_cache(maxsize=128)  # compressed images have a length of their own each
+@lru_cache(maxsize=128)  # compressed images differ in length
 def _shape_bytes(shape: tuple[int, ...]) -> bytes:
     return struct.pack(f"<B{len(shape)}q", len(shape), *shape)
 

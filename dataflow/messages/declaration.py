@@ -98,7 +98,7 @@ class Declaration:
 
 
 class GenericMessage(Message):
-    """A message of a type that this program knows by its declaration alone.
+    """A message of a type that is known by its declaration alone.
 
     It has the fields of the type, encodes to the same bytes and has the same digest; the type's own checks, properties
     and methods are in the module that declares it, which was not imported.

@@ -46,7 +46,7 @@ class ScalarField:
 
 
 def little_endian(dtype: str) -> np.dtype[Any]:
-    """The dtype of that name, little-endian: the one object that numpy has for it, so that `is` tells it."""
+    """The dtype of that name, little-endian: numpy's single object for it, so that `is` compares it."""
     return np.dtype(np.dtype(dtype).newbyteorder("<").str)
 
 

@@ -110,7 +110,7 @@ class DepthImage(Message):
 
 
 class RelativeDepth(Message):
-    """Nearness per pixel: inverse depth up to an unknown factor and constant, as one image alone tells it."""
+    """Nearness per pixel: inverse depth up to an unknown factor and constant, as estimated from one image."""
 
     frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
     data: F32 = array(

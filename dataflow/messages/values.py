@@ -40,7 +40,7 @@ class Switch(Message):
 
 
 class Alarm(Message):
-    """Something that somebody should know, now."""
+    """Something that needs attention at once."""
 
     level: str = scalar("str", "how serious it is", choices=ALARM_LEVELS)
     name: str = scalar("str", "what it is about, such as `battery` or `camera/driver`")
