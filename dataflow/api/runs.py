@@ -141,7 +141,7 @@ def replay(
 
     Recorded streams replace the sources; everything else runs again. `start`, `end`: seconds from the first message;
     operators begin in the state that they had at `start`. A ROS bag (file or folder) or any MCAP plays into `graph`
-    too, and its other topics are in the recording as they are: `maps` says which topic stands in for which stream
+    too, and its other topics are in the recording as they are: `maps` assigns topics to streams
     (`{"/camera/image_raw": "camera/image"}`), where types leave a choice; `clock` whether headers or log times stamp
     it. Raises `ReplayError`, `GraphError`, `RunFailed`, and `MappingError` that lists the topics.
     """
@@ -184,7 +184,7 @@ def launch(
     watch: Watch | None = None,
     **options: Any,
 ) -> RunResult:
-    """Runs a graph in processes of its own, as `dataflow run` does, and returns when it is done.
+    """Runs a graph in separate processes, as `dataflow run` does, and returns when it is done.
 
     `live`: sources run by the clock. Further options are the fields of `RunPlan`: `placement`, `rate`, `view_file`.
     Raises `GraphError`, `RunFailed`, and `ValueError` for operators of a notebook, which other processes cannot find.
@@ -250,7 +250,7 @@ def _defined_here(graph: ResolvedGraph) -> list[str]:
 
 
 def metadata_of(graph: ResolvedGraph, mode: str) -> dict[str, dict[str, str]]:
-    """Returns what a recording made here says of itself; the thread settings are those of this process."""
+    """Returns the metadata of a recording made here; the thread settings are those of this process."""
     facts = {
         "mode": mode,
         "started": str(time.time_ns()),

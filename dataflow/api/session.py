@@ -101,7 +101,7 @@ class Session:
     def put(self, stamp: int, messages: Mapping[str, Message]) -> Made:
         """Hands in the messages of one stamp, by stream, and returns what the graph makes of them.
 
-        A step without messages says that time has passed. Raises `ValueError` for a stamp that does not come after
+        A step without messages advances time. Raises `ValueError` for a stamp that does not come after
         the last one and for streams that are not the sources', `TypeError` for messages of another type, and
         `RunFailed` with the operator that failed, after which the session is closed.
         """

@@ -52,7 +52,7 @@ def write_part(
     overwrite: bool = False,
     watch: Watch = unwatched,
 ) -> Edited:
-    """Writes a part of `origin` into a file of its own. Raises `RecordingError`."""
+    """Writes a part of `origin` into a separate file. Raises `RecordingError`."""
     done = Edited(str(out))
     firings = _firings(origin, part, done)
     needed = {} if firings is None else firings.needed

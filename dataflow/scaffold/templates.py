@@ -149,7 +149,7 @@ class Device:
 class $Class(Source):
     """Readings of a thermometer, as they come."""
 
-    live = True  # it does not wait for anybody: `dataflow run --live` reads it on a thread of its own
+    live = True  # it waits for no consumer: `dataflow run --live` reads it on a separate thread
 
     temperature: Out[Number] = Out(doc="degrees Celsius")
 
