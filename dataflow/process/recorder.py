@@ -7,18 +7,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgpack
+
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import diagnostics_key
 from dataflow.recording import LogLine, RecordingWriter
-from dataflow.recording.layout import ENDS, OUTCOME, firings_topic
+from dataflow.recording.layout import ENDS, OUTCOME, PARAMETERS, TOLD, firings_topic
 from dataflow.recording.limits import MAX_STATE_BYTES
 from dataflow.recording.parts import OWNER_ONLY
 from dataflow.records.firing import decode_batch, encode_batch
 
 GOES_ON = "goes on"
 """The outcome that a file names which is not the last one of its run."""
+PARAMETER_MARK = msgpack.packb("value")
+"""Stands in every batch with a parameter that was changed, as a key of its detail, and in few others."""
 
 
 class RecorderSink:
@@ -35,6 +39,7 @@ class RecorderSink:
             overwrite=options["overwrite"],
             mode=options.get("mode", OWNER_ONLY),
         )
+        self.writer.add_metadata(TOLD, {"events": PARAMETERS})
         self._added: set[str] = set()
         self._ends: dict[str, dict[str, Any]] = {}
         self.messages = 0
@@ -82,10 +87,16 @@ class RecorderSink:
 
     def _write_firings(self, operator: str, stamp: int, payload: bytes) -> None:
         """Writes a batch; one whose states make it too large is written record by record."""
-        if len(payload) <= MAX_STATE_BYTES:
+        if len(payload) <= MAX_STATE_BYTES and PARAMETER_MARK not in payload:
             self.writer.write_firings(operator, stamp, payload)
             return
         batch = decode_batch(payload)
+        for record in batch.records:
+            if record.kind == "param":
+                self.writer.write_event(PARAMETERS, record.stamp, {"operator": operator, "name": record.detail["name"]})
+        if len(payload) <= MAX_STATE_BYTES:
+            self.writer.write_firings(operator, stamp, payload)
+            return
         self._unflushed.setdefault(operator, []).extend([0] * (len(batch.records) - 1))  # an entry for each message
         for record in batch.records:
             data = encode_batch([record], last=batch.last and record is batch.records[-1])

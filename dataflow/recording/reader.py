@@ -134,8 +134,9 @@ class Recording:
             yield record
             del record
 
-    def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
-        """(operator, payload) of every batch of firing records, of one operator or of all, in file order.
+    def firings(self, operator: str | None = None, start: int | None = None) -> Iterator[tuple[str, bytes]]:
+        """(operator, payload) of every batch of firing records, of one operator or of all, in file order: all of them,
+        or those with log times from `start` (ns) on, which are those of a batch's last record.
 
         One pass: they lie in chunks of their own, without the messages of streams (in older recordings among them).
         """
@@ -144,7 +145,7 @@ class Recording:
             for c in self._channels_of(Kind.FIRINGS)
             if operator is None or c.metadata.get("operator", "") == operator
         }
-        for raw in self._in_file_order(list(channels)):
+        for raw in self._in_file_order(list(channels), start):
             yield channels[raw.channel], bytes(raw.data)
 
     def firing_batches(self) -> Mapping[str, int]:
@@ -155,12 +156,13 @@ class Recording:
             counts[name] = counts.get(name, 0) + self._file.index.count(channel.id)
         return dict(sorted(counts.items()))
 
-    def counts(self, stream: str) -> Mapping[int, int]:
-        """Stored messages of a stream by incarnation; empty for a stream that the file does not hold."""
+    def counts(self, stream: str, start: int | None = None) -> Mapping[int, int]:
+        """Stored messages of a stream by incarnation, all or those with log times from `start` (ns) on; empty for a
+        stream that the file does not hold."""
         found: dict[int, int] = {}
         if stream in self._streams:
             for channel in self._streams[stream].channels:
-                found[channel.incarnation] = found.get(channel.incarnation, 0) + channel.count
+                found[channel.incarnation] = found.get(channel.incarnation, 0) + channel.count_from(start)
         return found
 
     def events(self) -> Iterator[Event]:

@@ -99,6 +99,12 @@ class StreamChannel:
         """Messages of the channel."""
         return self.index.count(self.record.id)
 
+    def count_from(self, start: int | None) -> int:
+        """Messages with log times from `start` (ns) on."""
+        if start is None:
+            return self.count
+        return sum(int((part.times >= start).sum()) for part in self.index.blocks(self.record.id, start, None))
+
     @property
     def span(self) -> tuple[int, int] | None:
         """The smallest and the largest log time (ns); None where there is no message."""

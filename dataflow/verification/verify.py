@@ -17,6 +17,7 @@ from dataflow.recording.layout import RECOVERED
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog, beginning, whole
+from dataflow.records.window import records_from
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, processes_of
 from dataflow.supervision.report import OperatorCounts, Watch
@@ -170,7 +171,7 @@ def _prepare(
         if early is not None:
             wanted = with_makers(recording.streams.keys(), played, chosen_operators(played, first, only))
             early.foresee({played.nodes[name].use.partition(":")[0] for name in wanted})
-        log = FiringLog.read(recording)
+        log = _read_records(recording, played, start)
         told = [n for n in played.nodes if accountable(recording, played, log, n)]
         incomplete = incomplete_streams(recording, played, log, told)
         held = recording.streams.keys() - incomplete
@@ -212,6 +213,19 @@ def _prepare(
             placed=processes_of(recording),
             absent=absent,
         )
+
+
+def _read_records(recording: Recording, graph: Graph, start: float | None) -> FiringLog:
+    if start is None:
+        return FiringLog.read(recording)
+    again = [node for node in graph.nodes.values() if not node.source and not node.external]
+    return records_from(
+        recording,
+        graph.nodes.values(),
+        _span(recording, start)[0],
+        stateless={node.name for node in again if node.operator.stateless},
+        stateful={node.name for node in again if not node.operator.stateless},
+    )
 
 
 def _locate(task: _Task) -> Locate:
