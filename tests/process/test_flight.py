@@ -256,3 +256,14 @@ def test_a_flight_recorder_that_cannot_be_is_refused_where_it_stands(tmp_path: P
     (tmp_path / "a.yaml").write_text(GRAPH.replace("{keep: 4s, after: 2s, snapshots: 1s}", said))
     with pytest.raises(GraphError, match=fault):
         load_graph(tmp_path / "a.yaml")
+
+
+def test_a_restart_is_kept_with_the_line_and_the_traceback_of_its_failure() -> None:
+    failed = {"text": "operator 'a' failed", "operators": ["a"], "where": "crashy.py:12", "traceback": "Traceback …"}
+    triggers = Triggers([Trigger("raise")])
+
+    assert list(triggers.event("restart", failed)) == [
+        {"what": "operator 'a' failed", "operators": ["a"], "where": "crashy.py:12", "traceback": "Traceback …"}
+    ]
+    killed = {"text": "process 'a' was killed", "operators": ["a"]}
+    assert list(triggers.event("restart", killed)) == [{"what": "process 'a' was killed", "operators": ["a"]}]
