@@ -58,16 +58,8 @@ class LiveRunner(OperatorRunner):
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
         fault: Fault = lambda firing: None,
     ) -> None:
-        super().__init__(
-            node,
-            emitter,
-            static=static,
-            seed=seed,
-            paranoid=paranoid,
-            operator=operator,
-            lossy=True,
-            snapshots=snapshots,
-        )
+        more: dict[str, Any] = {"paranoid": paranoid, "operator": operator, "snapshots": snapshots}
+        super().__init__(node, emitter, static=static, seed=seed, lossy=True, **more)
         triggers = {
             stream: port.name
             for port in self.spec.triggers

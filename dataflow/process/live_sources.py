@@ -23,6 +23,7 @@ from dataflow.messages.base import Message
 from dataflow.process.awake import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
+from dataflow.process.outlived import tell_outlived
 from dataflow.process.pace import Pace
 from dataflow.process.speech import SOURCE_THREAD
 
@@ -280,13 +281,7 @@ class LiveSources:
         restarts = self._restarts[runner.node.name]
         if self.stopping.is_set() or not restarts.failed():
             raise failure
-        self._channel.send(
-            "restarting",
-            operator=failure.operator,
-            when=failure.when,
-            summary=failure.summary,
-            pause=restarts.due_in(),
-        )
+        tell_outlived(self._channel, failure, restarts.due_in())
 
     def _restart(self, runner: SourceRunner) -> None:
         try:

@@ -65,7 +65,7 @@ def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
             _verify_from_middle(path)
         drops = 0
         if report is not None:
-            drops = _check_losses(path, graph, report)
+            drops = _check_losses(path, graph, report, live=scenario.live)
             if not scenario.live:
                 _check_window(path, graph, scenario, report)
         replayed = replay and report is not None and verdict == "identical" and _may_replay(scenario, report)
@@ -201,7 +201,7 @@ Place = tuple[str, int, int]
 """Stream, incarnation and number of a message."""
 
 
-def _check_losses(path: Path, graph: Graph, report: RunReport) -> int:
+def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) -> int:
     """Every message that was made is taken by each trigger it reaches, or dropped or missed and counted."""
     counted = 0
     with Recording(path) as recording:
@@ -227,8 +227,8 @@ def _check_losses(path: Path, graph: Graph, report: RunReport) -> int:
         for input_name in triggers:
             for stream in node.inputs.get(input_name, ()):
                 made = _made(graph, log, stream, report)
-                if over and node.spec.inputs[input_name].kind == "batch":  # what follows its end is for nothing
-                    made = {place: stamp for place, stamp in made.items() if last is not None and stamp <= last}
+                if over and node.spec.inputs[input_name].kind == "batch":  # what comes after its end is for nothing
+                    made = {p: stamp for p, stamp in made.items() if not live and last is not None and stamp <= last}
                 lost = made.keys() - taken
                 if len(lost) > missed + unlisted:
                     raise Violation(
