@@ -16,6 +16,7 @@ from dataflow.firing.judge import Judge
 from dataflow.firing.memory import WATCHED, MemoryGuard
 from dataflow.firing.ports import Emitter
 from dataflow.firing.protocol import Runner
+from dataflow.firing.restarts import close_quietly
 from dataflow.firing.seeding import VERSION
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
@@ -111,6 +112,10 @@ class RecordedRunner(Runner):
                 when = f"taking the recorded value of parameter {name!r}"
                 raise OperatorFailure(self.node.name, when, error) from error
 
+    def close(self) -> None:
+        """Closes the operator. What it raises is printed: no record says what it raised in the run."""
+        close_quietly(self.operator)
+
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
         if self._position < len(self._records) and not self.ended:
@@ -165,7 +170,7 @@ class RecordedRunner(Runner):
 
     def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
         """A fresh operator, with the parameters as they were last set; its static messages."""
-        self.operator.close()
+        self.close()
         self.operator = self.calls.operator = self.node.make()
         self._change(self._changed, incarnation)
         return self.calls.setup()
