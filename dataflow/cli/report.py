@@ -16,15 +16,13 @@ from rich.text import Text
 from dataflow.cli.output import count, plural, seconds, size, table
 from dataflow.records.figures import figures
 from dataflow.supervision.report import RunReport
-from dataflow.sync import TICK
+from dataflow.sync import MISSES, TICK
 from dataflow.sync.stamps import format_stamp
 
 _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""
 
 
-MISSES = frozenset({"unmatched", "unused", "no_sample"})
-"""Reasons that are no loss: nothing needed the message, or there was nothing that it could have been joined with."""
 SCORES = ("rmse", "precision", "recall", "f1", "iou", "accuracy", "error")
 """Parts of the names of figures that say how good something is."""
 MOST_SCORES, MOST_LOSSES, MOST_KEPT = 3, 4, 5

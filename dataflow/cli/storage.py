@@ -1,4 +1,4 @@
-"""How a recording is stored, as options say it: the name by time, parts, limits, and who may read it."""
+"""Storage of a recording, as options say it: its name by the time, its parts, limits, and readers."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def recording_file(path: Path, splitting: Splitting | None, *, overwrite: bool, 
 
 
 def splitting_of(every: str | None, size: str | None, keep: str | None = None) -> Splitting:
-    """What splits a recording, by the options."""
+    """The limits of one file, by the options."""
     from dataflow.recording.parts import Splitting
 
     time_ns = None if every is None else parsed_duration("--split-every", every)

@@ -14,6 +14,7 @@ from dataflow.process.channel import Channel
 from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.runners import Runners
+from dataflow.sync import MISSES
 
 REPORT_EVERY = 0.02
 REPORT_IDLE = 0.01
@@ -110,7 +111,7 @@ class Progress:
             refused = source.refused.total()
             counts[source.node.name] = _row(source, source.ports.emitted, refused, source.last)
         for runner in operators:
-            drops = sum(runner.drops.values())
+            drops = sum(n for (_, why), n in runner.drops.items() if why not in MISSES)
             counts[runner.node.name] = _row(runner, runner.ports.emitted, drops, runner.done)
         for log in self._feeding.logs:
             counts["@log"] = _row(log, log.emitted, 0, log.last)

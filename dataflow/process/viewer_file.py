@@ -23,7 +23,7 @@ class ViewerFileSink:
 
     def __init__(self, path: str, graph: Graph, streams: list[str]) -> None:
         self.path = Path(path)
-        self.viewer = ViewerSink(Save(self.path))
+        self.viewer = ViewerSink(Save(self.path, at_end=True))
         self._logs, self._clock = logs_key(graph.namespace), 0
         self.viewer.open({**{s: graph.message_types(s)[0] for s in streams}, self._logs: Alarm}, graph)
 

@@ -82,6 +82,8 @@ class RunPlan:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "placement", current_placement(self.placement))
+        on_failure = self.storage.on_failure or ("go_on" if self.live else "end")
+        object.__setattr__(self, "storage", replace(self.storage, on_failure=on_failure))
 
     @property
     def keeps_records(self) -> bool:
@@ -127,8 +129,7 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
         if edge.stream in streams and edge.consumer not in replaced:
             taken_in[edge.stream].add(labels[edge.consumer])
 
-    on_failure = plan.storage.on_failure or ("go_on" if plan.live else "end")
-    storage = replace(plan.storage, on_failure=on_failure).to_json()
+    storage = plan.storage.to_json()
     sinks: dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]] = {}
     options: dict[str, Any]
     if plan.record is not None:

@@ -97,11 +97,10 @@ class Supervisor:
 
     def run(self) -> RunReport:
         """Runs to the end. Raises `RunFailed` with the first cause; no process is left in either case."""
-        with contextlib.ExitStack() as stack:
+        with adopting(), contextlib.ExitStack() as stack:
             stack.callback(self._close_pipe)
             stack.callback(self._reserved.close)
             stack.enter_context(self._announced)
-            stack.enter_context(adopting())
             self._rings = self._make_rings()
             stack.callback(self._rings.close)
             self._log_file = stack.enter_context(contextlib.closing(LogFile()))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dataflow.firing.source import SourceRunner
-from dataflow.graph import load_graph
+from dataflow.graph import load_graph, load_text
 from dataflow.recording import Recording
 from dataflow.recording.layout import RUN
 from dataflow.records.firing import FiringRecord
@@ -75,3 +75,14 @@ class Outlets:
 
     def record(self, record: FiringRecord) -> None:
         pass
+
+
+def test_the_report_of_a_device_has_the_span_of_its_stamps() -> None:
+    graph = load_text("graph: one\noperators:\n  device: {use: 'faulty_operators:Device', params: {steps: 20}}\n")
+
+    report = run(graph, live=True)
+
+    assert report.sources == ("device",)
+    assert report.first is not None
+    assert report.last is not None
+    assert report.last - report.first >= 19 * 10_000_000
