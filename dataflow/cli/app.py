@@ -70,6 +70,7 @@ def dataflow(
       dataflow view run.mcap
       dataflow run --help
     """
+    forget_notes()
     if show_traceback:
         os.environ[TRACEBACK] = "1"
 
@@ -77,7 +78,6 @@ def dataflow(
 def call() -> None:
     """Calls the command that the arguments name."""
     completion.prepare()
-    forget_notes()
     try:
         app()
     except OutputFailed:

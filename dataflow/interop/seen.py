@@ -81,10 +81,7 @@ def _named(value: Any, place: str, frame: str | None) -> Iterator[str]:
 
 def _holds_something(value: Any) -> bool:
     if hasattr(value, "__dataclass_fields__"):
-        return any(
-            _holds_something(getattr(value, name))
-            for name in _names(value)
-        )
+        return any(_holds_something(getattr(value, name)) for name in _names(value))
     if isinstance(value, np.ndarray):
         return bool(value.size) and bool(np.asarray(value != 0).any())
     return bool(value)
