@@ -73,6 +73,7 @@ def dataflow(
       dataflow view run.mcap
       dataflow run --help
     """
+    forget_notes()
     if show_traceback:
         os.environ[TRACEBACK] = "1"
 
@@ -80,7 +81,6 @@ def dataflow(
 def call() -> None:
     """Calls the command that the arguments name."""
     completion.prepare()
-    forget_notes()
     try:
         app()
     except OutputFailed:

@@ -30,7 +30,7 @@ from dataflow.cli.arguments import (
     named_once,
     output_file,
 )
-from dataflow.cli.output import DIFFERENT, count, err, fail, friendly_errors, out, plural, print_json, say, table
+from dataflow.cli.output import DIFFERENT, count, err, fail, friendly_errors, out, plural, print_json, say, shown, table
 
 if TYPE_CHECKING:
     from dataflow.interop.account import Account
@@ -164,6 +164,7 @@ def convert(
         ):
             done = _export(material, place, to, watch, action, task, lossy=lossy)
         done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
+        shown([*material.account.notes, *material.account.short])
     account = material.account
     if json:
         print_json(done.as_json() | {"source": account.as_json()})
@@ -178,9 +179,10 @@ def convert(
     for line in account.lines(lambda topic: topic.strip("/")):
         say(f"[yellow]{escape(line)}[/]")
     _print_left_out(done)
-    shown = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
-    for file in shown:
+    files = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
+    for file in files:
         out.print(f"wrote {escape(file)}", soft_wrap=True)
+    _fail_if_short(account)
 
 
 def _left_by_rrd(recording: Path) -> tuple[Account, Exported]:

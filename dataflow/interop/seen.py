@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from typing import Any
 
 import numpy as np
@@ -61,8 +61,8 @@ def lose(message: Any, what: str) -> None:
 
 
 def _names(value: Any) -> list[str]:
-    """The fields of a message that count; its constants are none."""
-    return [each.name for each in fields(value) if each.name not in ELSEWHERE]
+    """The fields of a message that count; its constants, which have a default, do not."""
+    return [each.name for each in fields(value) if each.default is MISSING and each.name not in ELSEWHERE]
 
 
 def _wrapped(value: Any, losses: list[str]) -> Any:

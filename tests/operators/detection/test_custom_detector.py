@@ -243,7 +243,7 @@ def test_a_bad_yolo_row_is_named_with_file_and_line(tmp_path: Path, row: str, fa
     ("change", "fault"),
     [
         (lambda c: c["annotations"][1].update(bbox=[1, 2, 3]), r"annotations\[1\] \(id 1\): bbox is \[1, 2, 3\]"),
-        (lambda c: c["annotations"][1].update(bbox=[1, 2, 0, 3]), r"annotations\[1\] .*has no area"),
+        (lambda c: c["annotations"][1].update(bbox=[1, 2, -1, 3]), r"annotations\[1\] .*has no area"),
         (lambda c: c["annotations"][1].update(bbox=[150, 2, 50, 3]), r"reaches over the image of 160x128"),
         (lambda c: c["annotations"][1].update(image_id=1), r"image_id 1 is not among the images"),
         (lambda c: c["annotations"][1].update(category_id=9), r"category_id 9 is not among the categories \[3, 7\]"),
@@ -268,6 +268,19 @@ def test_a_bad_coco_entry_is_named(tmp_path: Path, change, fault: str) -> None: 
     file.write_text(json.dumps(content))
     with pytest.raises(DataError, match=fault):
         read_detection_data(tmp_path)
+
+
+def test_boxes_without_width_or_height_are_left_out_and_counted(tmp_path: Path) -> None:
+    file = write_coco(tmp_path, 3) / "annotations.json"
+    before = read_detection_data(tmp_path)
+    content = json.loads(file.read_text())
+    flat = content["annotations"][0] | {"id": 918, "bbox": [29.5, 88.0, 1.0, 0.0]}
+    file.write_text(json.dumps(content | {"annotations": [*content["annotations"], flat]}))
+
+    data = read_detection_data(tmp_path)
+
+    assert [len(image.boxes) for image in data.training] == [len(image.boxes) for image in before.training]
+    assert data.notes[0] == "annotations.json: 1 boxes without width or height left out (id 918)"
 
 
 @pytest.mark.parametrize(
