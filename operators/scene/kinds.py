@@ -14,7 +14,7 @@ from operators.scene.matching import LARGE
 
 Array = NDArray[np.float64]
 _SMALL, _STILL = 0.5, 0.2  # metres, and metres a second
-_ODD = 4.0  # spreads from the usual size, beyond which nothing of a class is
+_ODD = 4.0  # spreads above the usual size, from which an object is doubted
 
 
 class Kinds:
@@ -83,8 +83,19 @@ class Kinds:
         """Returns how much of an object's foot may be hidden, metres; 0 where its class does not stand on the floor."""
         return max((u.foot for u in self.usual.get(object.class_id, ())), default=0.0)
 
-    def may_be_so_large(self, object: MapObject) -> bool:
-        """Tells whether an object has a size that things of its class may have, seen in part or whole."""
+    def doubt(self, object: MapObject, label: float) -> float:
+        """Returns the share, in [0, 1), of an object's existence that its class puts in doubt; 0 for none.
+
+        Half where no thing of the class is usually so large, seen in part or whole. A class whose things are small and
+        leave their places is often called so by mistake: where its mean label is below `label`, what that lacks.
+        """
+        kept = 1.0 if self.has_usual_size(object) else 0.5
+        if object.label < label and self.may_leave(object):
+            kept *= object.label / label
+        return 1 - kept
+
+    def has_usual_size(self, object: MapObject) -> bool:
+        """Returns whether no side is more than four spreads above a usual one; True where the class has none."""
         most = self._most.get(object.class_id)
         if most is None:
             return True

@@ -27,8 +27,8 @@ _SLACK = 0.02  # of the distance, by which points stray
 class MapSettings:
     """Lengths in metres, times in seconds, evidence in log odds; noise of ranges at one metre, grows by the square.
 
-    `label` is the mean of what labels of its class count, over its views, from which a mug, a bottle or a ball is
-    given: other things are often called so, but not surely.
+    `label` is the mean of what labels of its class count, over its views, below which a small thing that moves or is
+    carried is doubted: other things are often called so, but not surely.
     """
 
     voxel: float = 0.03

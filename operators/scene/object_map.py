@@ -115,10 +115,12 @@ class ObjectMap:
         return self._heading
 
     def confirmed(self) -> list[MapObject]:
-        """Returns the objects that are surely there, by rising id."""
-        s, sure = self._settings, [o for _, o in sorted(self.objects.items()) if self._is_sure(o)]
-        called = (o for o in sure if o.label >= s.label or not self._kinds.may_leave(o))
-        return [o for o in called if self._kinds.may_be_so_large(o)]
+        """Returns the objects that were seen often enough, whatever their size and class, by rising id."""
+        return [o for _, o in sorted(self.objects.items()) if self._is_sure(o)]
+
+    def doubt(self, object: MapObject) -> float:
+        """Returns the share of an object's existence that its size or a weak label puts in doubt, in [0, 1)."""
+        return self._kinds.doubt(object, self._settings.label)
 
     def _alone(self, each: Observation, view: RangeView) -> Observation:
         """Returns an observation without what is behind the thing, or is another one of its class beside it."""

@@ -267,34 +267,31 @@ def test_a_snapshot_from_before_times_of_views_were_summed_is_taken_up() -> None
     assert [o.sightings for o in again.objects.values()] == [5]
 
 
-@pytest.mark.parametrize(("length", "given"), [(0.14, 1), (0.8, 0)])
-def test_a_thing_larger_than_any_of_its_class_is_not_given(length: float, given: int) -> None:
+@pytest.mark.parametrize(("length", "doubt"), [(0.14, 0.0), (0.8, 0.5)])
+def test_a_thing_larger_than_any_of_its_class_is_given_with_its_doubt(length: float, doubt: float) -> None:
     size = {BOX: (Usual((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)}
     known = ObjectMap(3, [], MapSettings(), size)
-    T = looking(0.0)
     for k in range(6):
         eye = looking(0.2 * k)
         seen = [observation(((2.0, 0.0, 0.1), (0.12, length, 0.12)), BOX, eye)]
-        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), T, 0.012))
-    assert len(known.objects) == 1
-    assert len(known.confirmed()) == given
+        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), looking(0.0), 0.012))
+    assert known.doubt(only(known)) == doubt
 
 
 @pytest.mark.parametrize(
-    ("class_id", "score", "given"), [(MUG, 0.32, 0), (MUG, 0.4, 1), (BOX, 0.32, 1)], ids=["unsure", "sure", "a box"]
+    ("class_id", "score", "doubt"), [(MUG, 0.28, 0.2), (MUG, 0.4, 0.0), (BOX, 0.28, 0.0)], ids=["weak", "sure", "a box"]
 )
-def test_what_is_seldom_surely_called_a_mug_is_not_given_as_one(class_id: int, score: float, given: int) -> None:
+def test_a_weak_label_of_a_small_thing_is_doubted(class_id: int, score: float, doubt: float) -> None:
     known = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE, portable=[MUG])
     for k in range(12):
         T = looking(0.4 * np.sin(k))
         seen = [replace(observation(THING, class_id, T), score=score)]
         known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), T, 0.012))
-    assert len(known.objects) == 1
-    assert len(known.confirmed()) == given
+    assert known.doubt(only(known)) == pytest.approx(doubt)
 
 
-@pytest.mark.parametrize(("mugs", "balls", "given"), [(12, 0, 1), (6, 6, 0), (3, 9, 1)])
-def test_what_is_called_a_mug_and_a_ball_alike_is_given_as_neither(mugs: int, balls: int, given: int) -> None:
+@pytest.mark.parametrize(("mugs", "balls", "doubt"), [(12, 0, 0.0), (6, 6, 1 / 7), (3, 9, 0.0)])
+def test_a_thing_called_a_mug_and_a_ball_alike_is_given_with_its_doubt(mugs: int, balls: int, doubt: float) -> None:
     """Labels of 0.6: by turns, that is a mean of 0.3 for each class."""
     known = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE, portable=[MUG])
     labels = [MUG, BALL] * min(mugs, balls) + [MUG if mugs > balls else BALL] * abs(mugs - balls)
@@ -302,7 +299,7 @@ def test_what_is_called_a_mug_and_a_ball_alike_is_given_as_neither(mugs: int, ba
         T = looking(0.4 * np.sin(k))
         seen = [replace(observation(THING, label, T), score=0.6)]
         known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), T, 0.012))
-    assert len(known.confirmed()) == given
+    assert known.doubt(only(known)) == pytest.approx(doubt)
 
 
 @pytest.mark.parametrize(("foot", "reaches_down"), [(0.2, True), (0.0, False)])
