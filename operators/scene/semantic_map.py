@@ -27,7 +27,7 @@ from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_po
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import in_range
 from operators.geometry.extrinsics import transform_between
-from operators.scene.class_sizes import CLASS_SIZES, TELLING
+from operators.scene.class_sizes import CLASS_SIZES
 from operators.scene.cuboid import ImageView
 from operators.scene.map_file import LearnedFile, SavedMap, learned_files, together
 from operators.scene.map_nodes import nodes_of, seen_surfaces
@@ -46,13 +46,12 @@ class SemanticMap(Operator):
     """Accumulates objects and surfaces in the world, each with class, box, existence and when it was last seen.
 
     What a view shows is joined to the map by place, class and colour; two entries that come to share their place and
-    are not seen beside each other are one. Books in a shelf show their spines, and others hide the rest of them. Each
-    view also says where nothing is: an object whose place is empty goes, and one of its class, size and colour that
-    appears elsewhere takes its id, moved and not doubled. Classes that move by themselves are followed instead, and
-    forgotten after a while out of sight. Everything else is kept while it is out of sight. What is seen often enough is
-    given, whatever its size: where no thing of its class is so large, or where a small class was seldom surely
-    detected, it is doubted, which halves its score or lowers it by what the label lacks. Surfaces are joined by their
-    planes and by where they lie; there is one floor, and people stand on it.
+    are not seen beside each other are one. Each view also says where nothing is: an object whose place is empty goes,
+    and one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move
+    by themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is
+    out of sight. What is seen often enough is given, whatever its size: where no thing of its class is so large, or
+    where a small class was seldom surely detected, it is doubted, which halves its score or lowers it by what the label
+    lacks. Surfaces are joined by their planes and by where they lie; there is one floor, and people stand on it.
 
     With `save` the map is written at the end, and with it the classes that were learned for it; `map_file` begins with
     such a map, in whose frame the pose must be. What moves by itself is not taken over.
@@ -262,11 +261,10 @@ class SemanticMap(Operator):
         )
         movers = [k for k, name in enumerate(self._classes) if name in self.movers]
         usual = {k: CLASS_SIZES[name] for k, name in enumerate(self._classes) if name in CLASS_SIZES}
-        telling = {k: TELLING[name] for k, name in enumerate(self._classes) if name in TELLING}
         carriers, portable = (
             [k for k, name in enumerate(self._classes) if name in names] for names in (self.carriers, self.portable)
         )
-        return ObjectMap(max(len(self._classes), 1), movers, settings, usual, telling, carriers, portable)
+        return ObjectMap(max(len(self._classes), 1), movers, settings, usual, carriers, portable)
 
     def _observation(
         self,

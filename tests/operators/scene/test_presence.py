@@ -69,7 +69,7 @@ def test_only_small_things_of_classes_that_move_or_are_taken_may_leave() -> None
     ball, crate = thing(2.0), thing(2.0, CRATE)
     assert KINDS.may_leave(ball)
     assert not KINDS.may_leave(crate)
-    assert Kinds([], {}, None, (), [CRATE]).may_leave(crate)
+    assert Kinds([], {}, (), [CRATE]).may_leave(crate)
     ball.size = np.full(3, 0.8)
     assert not KINDS.may_leave(ball)
 
