@@ -37,7 +37,6 @@ from operators.training.refining import BORDERS, REFINER, BorderEpochs, RefinerE
 from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data, variation_of
 from operators.training.torchvision_command import train_torchvision
 from operators.training.trunk_command import train_trunk
-from operators.training.views_commands import train_focus, train_reclassifier
 
 __all__ = ["evaluate", "train"]
 
@@ -53,11 +52,10 @@ train = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
-for name, command in (
-    ("activity", train_activity), ("focus", train_focus), ("posture", train_posture),
-    ("reclassifier", train_reclassifier), ("torchvision", train_torchvision), ("trunk", train_trunk),
-):  # fmt: skip
-    train.command(name)(command)
+train.command("activity")(train_activity)
+train.command("posture")(train_posture)
+train.command("torchvision")(train_torchvision)
+train.command("trunk")(train_trunk)
 for each in (REFINER, BORDERS):
     train.command(each.kind)(command_of(each))
 

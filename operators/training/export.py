@@ -62,18 +62,6 @@ def export_rows(
     _write(model, file)
 
 
-def export_areas(
-    network: nn.Module, pixels: Tensor, outputs: Sequence[str], facts: Mapping[str, Any], file: Path
-) -> None:
-    """Exports a network for images of any size; its input are pixels (1, H, W, 3), its outputs are (1, C, h, w).
-
-    Weights are stored as those of `export_network`.
-    """
-    axes = {"pixels": {1: "height", 2: "width"}} | {name: {2: "rows", 3: "columns"} for name in outputs}
-    still = copy.deepcopy(network).cpu().eval()
-    _write(_model(still, (pixels,), ["pixels"], list(outputs), axes, facts), file)
-
-
 def attach_second(file: Path, second: Path, out: Path) -> None:
     """Writes a network file with another as its second network, in the place of one that it has."""
     import onnx
