@@ -46,7 +46,7 @@ class MaskedImage:
 
 @dataclass(frozen=True)
 class SegmentationData:
-    """Class names, images to train on and images to score on; `notes` says what was assumed in reading them, `origin`
+    """Class names, images to train on and images to score on; `notes` holds the assumptions of reading them, `origin`
     what made them (see `origin_of`)."""
 
     classes: tuple[str, ...]
@@ -112,6 +112,6 @@ def _divided(folder: Path, names: tuple[str, ...], pairs: list[MaskedImage], see
         training = validation
         notes = (
             *notes,
-            "all images are for validation: they are trained on too, so the score says little",
+            "all images are for validation: they are trained on too, so the score means little",
         )
     return SegmentationData(names, tuple(training), tuple(validation), notes, origin_of(folder))

@@ -24,7 +24,7 @@ class Segmenter(Operator):
 
     The network works on its own input size; its answer is enlarged to the image without inventing classes. Where the
     file has a second network (training adds one), the borders between classes are looked at once more, in the image's
-    own pixels. Without a file, the network that comes with the project is used; it knows the simulated worlds.
+    own pixels. Without a file, the network that comes with the project is used; it was trained on simulated worlds.
     """
 
     stateless = True
