@@ -10,6 +10,7 @@ from dataflow.interop.mcap_bag import McapBag
 from dataflow.recording.ending import MAGIC
 from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RECORDING
+from dataflow.recording.parts import parts_in
 
 ROS1_MAGIC = b"#ROSBAG V"
 SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -43,7 +44,8 @@ def open_bag(path: Path) -> Bag:
 def is_foreign(path: Path) -> bool:
     """Tells whether a file or folder is a recording of another program: anything but an MCAP that this one wrote."""
     if path.is_dir():
-        return True
+        parts = parts_in(path)
+        return not parts or is_foreign(parts[0])
     with path.open("rb") as opened:
         head = opened.read(HEAD_BYTES)
     if not head.startswith(MAGIC):
