@@ -197,8 +197,9 @@ def verify(
                 "jobs": 1 if one_process else jobs,
                 "paranoid": paranoid,
             }
-            single = len(recordings) == 1 and not recordings[0].is_dir()
-            checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)
+            found = recordings_in(recordings)
+            single = len(recordings) == 1 and recordings[0] == found[0][0]
+            checked = _check(found, known, options, quiet=quiet, single=single)
             _report(checked, single=single, json=json, junit=junit)
             if known is not None:
                 _mind_baseline(known, checked, accept=accept, whole=not single)

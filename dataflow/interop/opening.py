@@ -11,6 +11,7 @@ from dataflow.recording.ending import MAGIC
 from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RECORDING
 from dataflow.recording.notices import notice
+from dataflow.recording.part_folder import parts_in
 
 ROS1_MAGIC = b"#ROSBAG V"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -54,7 +55,8 @@ def bag_at(path: Path) -> Bag:
 def is_foreign(path: Path) -> bool:
     """Tells whether a file or folder is a recording of another program: anything but an MCAP that this one wrote."""
     if path.is_dir():
-        return True
+        parts = parts_in(path)
+        return not parts or is_foreign(parts[0])
     with path.open("rb") as opened:
         head = opened.read(HEAD_BYTES)
     if not head.startswith(MAGIC):

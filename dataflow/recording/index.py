@@ -84,6 +84,16 @@ class McapFile:
         self._file.close()
         self._chunks.clear()
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the file."""
+        return self._file.size
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks."""
+        return len(self._chunks)
+
     def read(self, channel: int, chunk: int, offset: int, log_time: int) -> RawMessage:
         """The message that an entry of the index points to. Raises `DamagedError` where another one is there."""
         if chunk == UNCHUNKED:

@@ -21,6 +21,7 @@ from dataflow.recording.json_columns import Values
 from dataflow.recording.layout import FORMAT, RECORDING, Kind
 from dataflow.recording.logs import LogLine
 from dataflow.recording.ordering import NOWHERE, Row, in_file_order, merged, rows
+from dataflow.recording.part_folder import PartedFile, parts_in
 from dataflow.recording.streams import (
     IndexedStream,
     StreamChannel,
@@ -35,13 +36,15 @@ from dataflow.recording.tracks import tracks
 class Recording:
     """A recording opened for reading: a context manager, with random access. Not thread-safe.
 
-    Opens our own recordings and anybody's MCAP. A file without an index (torn by `kill -9`, or foreign) is indexed by a
-    pass over it. Raises `RecordingError` for a file that is no MCAP or is damaged.
+    Opens our own recordings, a folder of the parts of one (NAME_000.mcap and so on), and anybody's MCAP. A file without
+    an index (torn by `kill -9`, or foreign) is indexed by a pass over it. Raises `RecordingError` for a file that is no
+    MCAP or is damaged.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._file = McapFile(self.path)
+        parts = parts_in(self.path) if self.path.is_dir() else []
+        self._file: McapFile | PartedFile = PartedFile(self.path, parts) if parts else McapFile(self.path)
         try:
             self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
             _check_format(self.path, self.metadata)
@@ -55,6 +58,11 @@ class Recording:
     def torn(self) -> bool:
         """Tells whether the file has no proper end: it is being written, or its writer died. The rest can be read."""
         return self._file.torn
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the file, or of all parts."""
+        return self._file.nbytes
 
     @property
     def lost_bytes(self) -> int:

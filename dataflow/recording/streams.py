@@ -20,6 +20,7 @@ from dataflow.recording.foreign import foreign_decoder
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.layout import Kind
 from dataflow.recording.message_index import MessageIndex
+from dataflow.recording.part_folder import PartedFile
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,8 @@ class StreamInfo:
 
 
 Decode = Callable[[RawMessage, memoryview | None], Message]
+File = McapFile | PartedFile
+"""A recording in one file or in parts."""
 TypeOf = Callable[[], type[Message] | None]
 
 
@@ -128,7 +131,7 @@ class IndexedStream:
 class StreamFinder:
     """Finds the streams of a file by its channels, without decoding messages other than one of each foreign stream."""
 
-    def __init__(self, file: McapFile) -> None:
+    def __init__(self, file: File) -> None:
         self._file = file
 
     def all(self) -> dict[str, IndexedStream]:
@@ -226,7 +229,7 @@ class StreamFinder:
         return SchemaText("", "", b"") if schema is None else SchemaText(schema.name, schema.encoding, schema.data)
 
 
-def unordered(file: McapFile, stream: str, channel: StreamChannel) -> Iterator[Message]:
+def unordered(file: File, stream: str, channel: StreamChannel) -> Iterator[Message]:
     """The messages of a foreign channel in the order of its entries."""
     entries = channel.entries
     for i in range(len(entries)):

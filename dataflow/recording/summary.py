@@ -25,7 +25,7 @@ _FOOTER = struct.Struct("<BQQQI")
 TAIL_BYTES = _FOOTER.size + len(MAGIC)
 BLOCK_BYTES = 2**24
 """Of the summary, in memory at a time."""
-LONG = 2**16
+LONG = 2**14
 """Chunks of a file beyond which its message indexes are read as they are needed: all would take seconds."""
 
 

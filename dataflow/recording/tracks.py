@@ -9,13 +9,12 @@ import numpy.typing as npt
 
 from dataflow.recording.contents import Entries
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.index import McapFile
 from dataflow.recording.ordering import Block, Pairs, Track, companions_of
-from dataflow.recording.streams import IndexedStream, StreamChannel, unordered
+from dataflow.recording.streams import File, IndexedStream, StreamChannel, unordered
 
 
 def tracks(
-    file: McapFile, stream: IndexedStream, start: int | None, end: int | None, *, by_log_time: bool = False
+    file: File, stream: IndexedStream, start: int | None, end: int | None, *, by_log_time: bool = False
 ) -> Iterator[Track]:
     """The incarnations of a stream, one after the other, or all channels of a foreign one."""
     if stream.own:
@@ -30,7 +29,7 @@ def tracks(
 
 
 def _blocks(
-    file: McapFile, stream: IndexedStream, channel: StreamChannel, by_log_time: bool, start: int | None, end: int | None
+    file: File, stream: IndexedStream, channel: StreamChannel, by_log_time: bool, start: int | None, end: int | None
 ) -> Iterator[Block]:
     """The messages of one incarnation."""
     for entries in file.index.blocks(channel.record.id, start, end):
@@ -39,7 +38,7 @@ def _blocks(
             yield Block([entries], [entries.times], [companions])
 
 
-def _companions(file: McapFile, stream: IndexedStream, channel: StreamChannel, entries: Entries) -> Pairs | None:
+def _companions(file: File, stream: IndexedStream, channel: StreamChannel, entries: Entries) -> Pairs | None:
     if channel.companion is None:
         return None
     whole = len(entries) == channel.count
@@ -54,7 +53,7 @@ def _companions(file: McapFile, stream: IndexedStream, channel: StreamChannel, e
     return found
 
 
-def _stamps(file: McapFile, stream: IndexedStream, channel: StreamChannel) -> npt.NDArray[np.int64]:
+def _stamps(file: File, stream: IndexedStream, channel: StreamChannel) -> npt.NDArray[np.int64]:
     """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass.
 
     Foreign messages of which two carry the same time are stamped with their log times instead.

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
+from dataflow.recording.part_folder import parts_in
 from dataflow.records.comparison import Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed
@@ -199,13 +200,16 @@ class Baseline:
 
 
 def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
-    """Files as they are, of folders every .mcap in them, at any depth: (path, name to show).
+    """Files, and folders of the parts of a recording, as they are, of others every .mcap in them, at any depth: (path,
+    name to show).
 
     Raises `ReplayError` for what is not there, and for a folder that holds no recording.
     """
     found: dict[Path, str] = {}
     for target in targets:
-        if target.is_dir():
+        if target.is_dir() and parts_in(target):
+            found.setdefault(target, target.name)
+        elif target.is_dir():
             inside = sorted(p for p in target.rglob("*.mcap") if p.is_file())
             if not inside:
                 raise ReplayError(f"folder {target} holds no recording (no .mcap file, at any depth)")
