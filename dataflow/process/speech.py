@@ -110,7 +110,15 @@ class _Handler(logging.Handler):
         except Exception as error:  # arguments that do not fit their text
             text = f"{record.msg} {record.args} (cannot be formatted: {error})"
         severity = ("debug", "info", "warning", "error", "fatal")[min(max(record.levelno // 10 - 1, 0), 4)]
-        _say(2, severity, text, record.name, record.pathname, record.lineno, operator=getattr(record, "operator", ""))
+        _say(
+            2,
+            severity,
+            text,
+            record.name,
+            record.pathname,
+            record.lineno,
+            operator=str(getattr(record, "operator", "")),
+        )
 
 
 class _Lines(io.TextIOBase):

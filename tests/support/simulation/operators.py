@@ -156,7 +156,7 @@ class Smooth(Operator, every="25ms"):
     def restore(self, state: Any) -> None:
         self.state, self.calls = state["state"], state["calls"]
 
-    def finish(self) -> FeatureVector:
+    def finish(self) -> FeatureVector | None:
         return value(2 * START, self.state)
 
 
