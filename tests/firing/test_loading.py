@@ -80,7 +80,7 @@ class Does(Operator):
 def made(todo: Callable[[], float], *, calls: int = 1, version: int = 3) -> list[float]:
     """What an operator emits that does `todo` in each call."""
     operator, collector = Does(), Collector()
-    operator.todo = todo  # type: ignore[method-assign]
+    operator.todo = todo
     runner = OperatorRunner(node(Does, {"x": ["t/s/x"]}), collector, static=frozenset(), operator=operator)
     runner.calls = Calls(runner.node, operator, 0, version=version)
     runner.setup()

@@ -166,7 +166,7 @@ class LazyLibrary(Hard):
         import cv2
 
         found = np.zeros((1, 4), np.float32)
-        cv2.randu(found, 0, 1)
+        cv2.randu(found, 0, 1)  # type: ignore[call-overload]
         return found[0]
 
 
@@ -397,8 +397,12 @@ class Overwrite(Hard):
 class KeepsEmitted(Hard):
     """Writes into the message that it emitted before."""
 
+    def setup(self) -> None:
+        super().setup()
+        self.emitted: FeatureVector | None = None
+
     def process(self, x: FeatureVector) -> FeatureVector:
-        if self.calls:
+        if self.emitted is not None:
             self.emitted.vectors.flags.writeable = True
             self.emitted.vectors[:] = -5
         self.emitted = super().process(x)
@@ -409,6 +413,6 @@ class Before(Hard):
     """Adds the input before to each input."""
 
     def work(self, x: FeatureVector) -> float:
-        before = self.x if self.calls > 1 else x
-        self.x = x
+        before = self.last if self.calls > 1 else x
+        self.last = x
         return float(x.vectors[0, 0] + before.vectors[0, 0])
