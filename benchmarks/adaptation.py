@@ -30,9 +30,9 @@ from operators.image import ImageAdapter
 from operators.odometry import VisualOdometry
 from operators.segmentation import Segmenter
 from operators.segmentation.score import confusion, mean_iou
-from operators.sources import SimulatedRobot
-from operators.sources.simulator.classes import CLASSES, THINGS
-from operators.sources.simulator.worlds import INDOOR
+from operators.simulator import SimulatedRobot
+from operators.simulator.classes import CLASSES, THINGS
+from operators.simulator.worlds import INDOOR
 
 HELD_OUT, EVERY = 41_000, 10
 VISIBLE, PIXELS = 0.6, 50

@@ -29,8 +29,8 @@ from dataflow.messages import (
 from operators.cloud import CloudBuilder, CloudFilter, Clusterer, PlaneSegmenter
 from operators.cloud.plane_search import covered_area
 from operators.depth import DepthFilter
-from operators.sources import SimulatedRobot
-from operators.sources.simulator.worlds import make_world
+from operators.simulator import SimulatedRobot
+from operators.simulator.worlds import make_world
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -106,8 +106,8 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
     They are made of the true trajectory: nothing is drawn, so that many runs are cheap.
     """
     from dataflow.messages import Imu, Pose, Transforms
-    from operators.sources.simulator.settings import Gnss, Inertial
-    from operators.sources.simulator.worlds import make_world
+    from operators.simulator.settings import Gnss, Inertial
+    from operators.simulator.worlds import make_world
 
     rng = np.random.default_rng([seed, 7])
     imu, gnss, rate = Inertial(), Gnss(), 100

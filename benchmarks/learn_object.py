@@ -29,15 +29,15 @@ from dataflow.messages.geometry import invert
 from operators.detection import CustomDetector
 from operators.evaluation.detection_score import ScoredFrame, score_frames
 from operators.recognition import LearnedDetector
-from operators.sources.simulator.classes import THINGS
-from operators.sources.simulator.color import expose
-from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
-from operators.sources.simulator.optics import Optics
-from operators.sources.simulator.renderer import Renderer
-from operators.sources.simulator.scene import Thing, World
-from operators.sources.simulator.shapes import Array, pose
-from operators.sources.simulator.truth import detections
-from operators.sources.simulator.worlds import make_world
+from operators.simulator.classes import THINGS
+from operators.simulator.color import expose
+from operators.simulator.frames import BODY_TO_OPTICAL, mounted
+from operators.simulator.optics import Optics
+from operators.simulator.renderer import Renderer
+from operators.simulator.scene import Thing, World
+from operators.simulator.shapes import Array, pose
+from operators.simulator.truth import detections
+from operators.simulator.worlds import make_world
 from operators.training.learning import learn as command
 
 OPTICS = Optics(640, 480, 544.0, 544.0, 319.5, 239.5)

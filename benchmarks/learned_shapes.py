@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from operators.sources.simulator.shapes import Material, Shape, at, box, ellipsoid, lathe
+from operators.simulator.shapes import Material, Shape, at, box, ellipsoid, lathe
 
 
 def cone() -> Shape:

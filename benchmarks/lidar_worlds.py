@@ -57,7 +57,7 @@ def rendered(cache: Path, world: str, seed: int, seconds: int, speed: float, rou
 
 
 def _render(file: Path, world: str, seed: int, seconds: int, speed: float, route: str) -> None:
-    from operators.sources import SimulatedRobot
+    from operators.simulator import SimulatedRobot
 
     off = {"rate": 0.0}
     truth_of: dict[str, Any] = {"poses": 10.0, "boxes": False, "relations": 0.0, "activities": 0.0}

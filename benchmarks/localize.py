@@ -30,7 +30,7 @@ SENSORS = {"lidar": ("points",), "landmarks": ("sightings",), "both": ("points",
 
 def drive(world: str, seed: int, seconds: int = 60, kidnaps: Any = KIDNAPS, faults: Any = ()) -> tuple[Any, Streams]:
     """The streams of a drive, static ones apart."""
-    from operators.sources import SimulatedRobot
+    from operators.simulator import SimulatedRobot
 
     robot = SimulatedRobot(
         world=world,

@@ -36,7 +36,7 @@ from dataflow.messages.geometry import transform_points  # noqa: E402
 from operators.cloud.back_projection import Rays, beside_edge, within_range  # noqa: E402
 from operators.mapping import OccupancyMapper, TsdfMap  # noqa: E402
 from operators.mapping.placing import placed  # noqa: E402
-from operators.sources import SimulatedRobot  # noqa: E402
+from operators.simulator import SimulatedRobot  # noqa: E402
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -32,9 +32,9 @@ from numpy.typing import NDArray  # noqa: E402
 from dataflow.messages.geometry import invert  # noqa: E402
 from operators.geometry import se3  # noqa: E402
 from operators.geometry.extrinsics import transform_between  # noqa: E402
-from operators.odometry.camera import RgbdCamera  # noqa: E402
-from operators.odometry.mono_odometry import MonoOdometry  # noqa: E402
-from operators.odometry.mono_ranging import MetricDepth  # noqa: E402
+from operators.odometry.mono.ranging import MetricDepth  # noqa: E402
+from operators.odometry.mono.tracker import MonoOdometry  # noqa: E402
+from operators.odometry.rgbd.camera import RgbdCamera  # noqa: E402
 from operators.odometry.tracking import MEASURED  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ def simulated(cache: Path, world: str, seed: int, seconds: int) -> Drive:
 
 
 def _render(file: Path, world: str, seed: int, seconds: int) -> None:
-    from operators.sources import SimulatedRobot
+    from operators.simulator import SimulatedRobot
 
     robot = SimulatedRobot(
         world=world,

@@ -29,7 +29,7 @@ from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.decode import Candidates
 from operators.segmentation import Segmenter
 from operators.segmentation.score import Confusion, confusion, mean_iou, named
-from operators.sources.simulator.classes import CLASSES, THINGS
+from operators.simulator.classes import CLASSES, THINGS
 from operators.training.simulated_worlds import FOCAL, HELD_OUT, TRAINING, VALIDATION, WorldImage, render, worlds
 from operators.weights import read_facts, shipped
 

@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 from visual_odometry import REPOSITORY, read, score
 
 from dataflow.messages.geometry import invert
-from operators.odometry.camera import RgbdCamera
-from operators.odometry.rgbd_odometry import RgbdOdometry
-from operators.odometry.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.odometry.tracking import MEASURED
 
 Frame = tuple[NDArray[np.uint8], NDArray[np.float32]]

@@ -12,8 +12,8 @@ from odometry_worlds import Drive, rendered
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import project
-from operators.odometry.rgbd_odometry import RgbdOdometry
-from operators.odometry.surface import Surface
+from operators.odometry.rgbd.surface import Surface
+from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.odometry.tracking import MEASURED
 
 Array = NDArray[np.float64]

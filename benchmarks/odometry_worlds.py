@@ -15,10 +15,10 @@ from operators.codec import DepthDecoder, ImageDecoder
 from operators.evaluation.trajectory import align
 from operators.geometry import se3
 from operators.geometry.extrinsics import transform_between
-from operators.odometry.camera import RgbdCamera
-from operators.odometry.rgbd_odometry import RgbdOdometry
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.odometry.tracking import Status, TrackResult
-from operators.sources import SimulatedRobot
+from operators.simulator import SimulatedRobot
 
 Array = NDArray[np.float64]
 

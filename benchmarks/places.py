@@ -32,8 +32,8 @@ from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages import Image  # noqa: E402
 from operators.recognition import FeatureExtractor  # noqa: E402
-from operators.sources import SimulatedRobot  # noqa: E402
-from operators.sources.simulator.worlds import INDOOR, make_world  # noqa: E402
+from operators.simulator import SimulatedRobot  # noqa: E402
+from operators.simulator.worlds import INDOOR, make_world  # noqa: E402
 
 Pixels = NDArray[np.uint8]
 Describe = Callable[[Pixels], NDArray[np.float32]]
@@ -138,7 +138,7 @@ def with_head(weights: Path, file: Path) -> Path:
     """Weights of mobilenet_v2 may come without their last layer, which a description does not use."""
     import torch
 
-    from operators.training.backbone import current_names
+    from operators.learning.backbone import current_names
 
     state = dict(current_names(torch.load(weights, map_location="cpu", weights_only=True)))
     state.setdefault("classifier.1.weight", torch.zeros(1000, 1280))

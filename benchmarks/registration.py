@@ -32,7 +32,8 @@ from operators.cloud import CloudRegistration  # noqa: E402
 from operators.cloud.back_projection import Rays, within_range  # noqa: E402
 from operators.geometry import se3  # noqa: E402
 from operators.odometry import LidarOdometry  # noqa: E402
-from operators.sources import KittiRaw, SimulatedRobot  # noqa: E402
+from operators.simulator import SimulatedRobot  # noqa: E402
+from operators.sources import KittiRaw  # noqa: E402
 
 Array = NDArray[np.float64]
 Posed = tuple[PointCloud, Array]  # a cloud, and the true pose (4, 4) of its sensor

@@ -42,7 +42,7 @@ graph: sensed
 namespace: robot1
 operators:
   robot:
-    use: operators.sources:SimulatedRobot
+    use: operators.simulator:SimulatedRobot
     params:
       duration: 600ms
       color_camera: {rate: 5}
@@ -71,7 +71,7 @@ graph: adapted
 namespace: robot1
 operators:
   robot:
-    use: operators.sources:SimulatedRobot
+    use: operators.simulator:SimulatedRobot
     params:
       duration: 1s
       color_camera: {rate: 10, read_noise: 6}
@@ -87,7 +87,7 @@ graph: plots
 namespace: robot1
 operators:
   robot:
-    use: operators.sources:SimulatedRobot
+    use: operators.simulator:SimulatedRobot
     params: {duration: 21s, seed: 11, first_stamp: 1700000000000000000}
   plots:
     use: operators.evaluation:TrajectoryPlots
@@ -123,8 +123,8 @@ def recognition(folder: Path) -> list[str]:
     """Part of graphs/recognition.yaml, with the network of `dataflow train classifier` before it has learned."""
     import torch
 
+    from operators.learning.export import export_network
     from operators.recognition.network import ClassifierNetwork, DeployedClassifier
-    from operators.training.export import export_network
 
     torch.manual_seed(7)
     file, facts = folder / "things.onnx", {"kind": "classifier", "classes": ["a", "b", "c"], "width": 64, "height": 64}

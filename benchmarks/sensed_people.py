@@ -16,7 +16,7 @@ from scene_graph import acts
 from sensed_worlds import World, ids_in_view, mapped, sensed
 
 from operators.recognition.sensed_people import SensedTrack, sensed_tracks, write_tracks
-from operators.sources.simulator.classes import ACTIVITIES
+from operators.simulator.classes import ACTIVITIES
 
 
 def tracks_of(world: World, every: int) -> list[SensedTrack]:

@@ -29,11 +29,11 @@ from dataflow.messages import (
     Transforms,
 )
 from operators.cloud import CloudBuilder, PlaneSegmenter
-from operators.detection import CustomDetector, FocusDetector, Reclassifier
+from operators.detection import CustomDetector
 from operators.recognition import PostureRecognizer
 from operators.scene import ObjectLifter, SemanticMap
 from operators.segmentation import Segmenter
-from operators.sources.simulated_robot import SimulatedRobot
+from operators.simulator.robot import SimulatedRobot
 
 Route = Literal["tour", "watch"]
 KINDS = ("office", "table_top", "corridor")
@@ -152,14 +152,12 @@ def sense(kind: str, seed: int, route: Route) -> World:
             "min_pixels": 50,
         },
     )
-    builder, detector, focus, names, segmenter = (
+    builder, detector, segmenter = (
         CloudBuilder(stride=3, max_range=6.0),
         CustomDetector(score_threshold=0.1),
-        FocusDetector(),
-        Reclassifier(),
         Segmenter(),
     )
-    for operator in (robot, builder, detector, focus, names, segmenter):
+    for operator in (robot, builder, detector, segmenter):
         operator.setup()
     static: dict[str, Any] = dict(robot.static_outputs())
     frames = []
@@ -170,7 +168,7 @@ def sense(kind: str, seed: int, route: Route) -> World:
         assert isinstance(cloud, PointCloud)
         frames.append(
             Frame(
-                detections=names.process(m["image"], focus.process(m["image"], detector.process(m["image"]))),
+                detections=detector.process(m["image"]),
                 segmentation=segmenter.process(m["image"]),
                 cloud=cloud,
                 camera=m["ground_truth"],

@@ -16,7 +16,7 @@ from typing import Any
 
 import cv2
 
-from operators.sources import SimulatedRobot
+from operators.simulator import SimulatedRobot
 
 HERE = Path(__file__).resolve().parents[1]
 WORLDS = ("office", "corridor", "table_top")

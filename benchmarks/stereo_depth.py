@@ -26,7 +26,8 @@ from operators.depth.stereo_matching import MatchingConfig, StereoMatcher  # noq
 from operators.geometry.pinhole import project, unproject  # noqa: E402
 from operators.geometry.stereo import rectified_pair  # noqa: E402
 from operators.image.preparation import grey_of  # noqa: E402
-from operators.sources import KittiOdometry, SimulatedRobot  # noqa: E402
+from operators.simulator import SimulatedRobot  # noqa: E402
+from operators.sources import KittiOdometry  # noqa: E402
 
 Disparity = NDArray[np.float32]
 Match = Callable[[NDArray[np.uint8], NDArray[np.uint8]], Disparity]

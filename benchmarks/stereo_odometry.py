@@ -26,11 +26,12 @@ from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
 from operators.geometry.extrinsics import transform_between  # noqa: E402
-from operators.odometry.stereo_adjustment import StereoRig  # noqa: E402
-from operators.odometry.stereo_odometry import StereoOdometry  # noqa: E402
-from operators.odometry.stereo_visual_odometry import rig_of  # noqa: E402
+from operators.odometry.stereo.adjustment import StereoRig  # noqa: E402
+from operators.odometry.stereo.odometry import rig_of  # noqa: E402
+from operators.odometry.stereo.tracker import StereoOdometry  # noqa: E402
 from operators.odometry.tracking import MEASURED  # noqa: E402
-from operators.sources import KittiOdometry, SimulatedRobot  # noqa: E402
+from operators.simulator import SimulatedRobot  # noqa: E402
+from operators.sources import KittiOdometry  # noqa: E402
 
 Matrix = NDArray[np.float64]
 PERIOD = 100_000_000  # nanoseconds

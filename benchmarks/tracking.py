@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.messages import Detections2D, TrackState
-from operators.sources.simulated_robot import SimulatedRobot
+from operators.simulator.robot import SimulatedRobot
 from operators.tracking.box_tracker import BoxTracker, BoxTrackerSettings
 
 REPORTED, CHOSEN_ON = 100, 0

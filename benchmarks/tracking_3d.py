@@ -14,7 +14,7 @@ import numpy as np
 
 from dataflow.messages import SceneGraph, TrackState
 from dataflow.messages.geometry import yaw_of
-from operators.sources.simulated_robot import SimulatedRobot
+from operators.simulator.robot import SimulatedRobot
 from operators.tracking.box_tracker_3d import BoxTracker3D, BoxTracker3DSettings, Solids
 
 RATE, SECONDS, FIRST = 10.0, 20, 700

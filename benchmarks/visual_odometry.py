@@ -35,11 +35,11 @@ from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
 from operators.geometry import se3  # noqa: E402
-from operators.odometry.camera import RgbdCamera  # noqa: E402
-from operators.odometry.rgbd_odometry import RgbdOdometry  # noqa: E402
-from operators.odometry.settings import RgbdOdometryConfig  # noqa: E402
+from operators.odometry.rgbd.camera import RgbdCamera  # noqa: E402
+from operators.odometry.rgbd.settings import RgbdOdometryConfig  # noqa: E402
+from operators.odometry.rgbd.tracker import RgbdOdometry  # noqa: E402
 from operators.odometry.tracking import TrackResult  # noqa: E402
-from operators.sources.simulator.native import open3d  # noqa: E402
+from operators.simulator.native import open3d  # noqa: E402
 
 Matrix = NDArray[np.float64]
 Track = Callable[[NDArray[np.uint8], NDArray[np.float32], int], Matrix]

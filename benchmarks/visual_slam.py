@@ -31,9 +31,9 @@ from odometry_worlds import Drive  # noqa: E402
 from dataflow.messages.geometry import invert  # noqa: E402
 from operators.evaluation.trajectory import align  # noqa: E402
 from operators.geometry import se3  # noqa: E402
-from operators.odometry.camera import RgbdCamera  # noqa: E402
-from operators.odometry.rgbd_odometry import RgbdOdometry  # noqa: E402
-from operators.odometry.settings import RgbdOdometryConfig  # noqa: E402
+from operators.odometry.rgbd.camera import RgbdCamera  # noqa: E402
+from operators.odometry.rgbd.settings import RgbdOdometryConfig  # noqa: E402
+from operators.odometry.rgbd.tracker import RgbdOdometry  # noqa: E402
 from operators.slam.keyframe_graph import Node  # noqa: E402
 from operators.slam.rgbd_slam import RgbdSlam, SlamResult  # noqa: E402
 from operators.slam.visual_graph import GraphSettings  # noqa: E402
@@ -59,8 +59,8 @@ def rendered(cache: Path, world: str, seed: int, seconds: int, mount: str | None
 
 
 def _render(file: Path, world: str, seed: int, seconds: int, mount: str | None) -> None:
-    from operators.sources import SimulatedRobot
-    from operators.sources.simulator.worlds import make_world
+    from operators.simulator import SimulatedRobot
+    from operators.simulator.worlds import make_world
 
     color: dict[str, Any] = {"rate": 10}
     speed = 0.8 if mount is None else float(MOUNTS[mount]["speed"])

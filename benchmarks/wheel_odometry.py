@@ -17,7 +17,7 @@ from dataflow.messages import Odometry
 from dataflow.messages.geometry import invert, yaw_of
 from dataflow.testing import play
 from operators.odometry import WheelOdometry
-from operators.sources import SimulatedRobot
+from operators.simulator import SimulatedRobot
 
 Array = NDArray[np.float64]
 WORLDS = ("office", "corridor", "table_top")

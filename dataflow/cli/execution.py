@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +41,8 @@ def checked_outputs(
     saves = view is not None and view.endswith(".rrd")
     if view is not None and view not in ("spawn", "serve") and not saves:
         raise fail(f"--view {view!r}: expected spawn, serve, or a file name that ends in .rrd")
+    if view is not None:
+        import_module("rerun")  # before a run begins whose viewer could not
     if open_view and not saves:
         raise fail("--open opens a saved file: it needs --view FILE.rrd")
     if view == "spawn":

@@ -22,6 +22,7 @@ from dataflow.cli.arguments import FLAG
 from dataflow.cli.commands import Commands, paragraphs
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, say, wants_traceback
 from dataflow.cli.values import take_plainly
+from dataflow.extras import missing_extra
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -162,6 +163,7 @@ def _command(entry: EntryPoint) -> Any:
 def _broken(entry: EntryPoint, error: Exception) -> Any:
     package = f" of package {entry.dist.name}" if entry.dist is not None else ""
     reason = f"{entry.value}{package}: {type(error).__name__}: {error}"
+    reason = "; ".join(filter(None, (reason, missing_extra(error))))
     app = typer.Typer(add_completion=False)
     trace = "".join(traceback.format_exception(error)).rstrip()
 

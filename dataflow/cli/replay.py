@@ -19,6 +19,7 @@ from dataflow.cli.arguments import (
     Network,
     Settings,
     Start,
+    Strict,
     existing_recording,
     find_modules_in,
     graph_file,
@@ -62,6 +63,7 @@ def replay(
     ] = None,
     maps: Map = None,
     clock: Clock = "auto",
+    strict: Strict = False,
     settings: Settings = None,
     path: ModuleFolders = None,
     start: Start = None,
@@ -161,6 +163,7 @@ def replay(
         from dataflow.interop.opening import is_foreign, open_bag
         from dataflow.recording import Recording
         from dataflow.recording.cutting import cut_of
+        from dataflow.recording.index import NO_END
         from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
         from dataflow.supervision.replay import plan_replay
         from dataflow.supervision.run import replay as replay_recording
@@ -181,20 +184,8 @@ def replay(
                 raise fail("of a bag no split recording is made; split it afterwards: dataflow split FILE.mcap")
             if loop != 1:
                 raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
-            replay_bag(
-                recording,
-                loaded,
-                maps or (),
-                clock,
-                start,
-                end,
-                outputs,
-                options,
-                began=began,
-                json=json,
-                quiet=quiet,
-                verbose=verbose,
-            )
+            words = (recording, loaded, maps or (), clock, start, end, outputs, options)
+            replay_bag(*words, strict=strict, began=began, json=json, quiet=quiet, verbose=verbose)
             return
         with Recording(recording) as opened:
             if graph is None:
@@ -217,7 +208,7 @@ def replay(
             begin, finish = window(whole, start, end, recording)
             if opened.torn:
                 name = escape(str(recording))
-                say(f"[yellow]{name} has no proper end:[/] what its writer had not stored when it died is missing")
+                say(f"[yellow]{name} {escape(NO_END)}[/]")
             part = cut_of(opened.metadata)
             begin = part.start if begin is None and part is not None else begin
             if begin is not None:

@@ -1,7 +1,7 @@
 """A recorder from outside of a running graph: a plain subscriber, which takes what it is given and counts what it
 missed.
 
-It knows nothing of the operators' calls, so what it writes holds no firing records.
+It does not see the operators' calls, so its files hold no firing records.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Tally:
 class AttachedRecorder:
     """Writes envelopes of a graph's streams into one file, or into one after the other. A context manager.
 
-    `metadata` goes into each file. Static messages are written at the beginning of each. What is missing is known from
+    `metadata` goes into each file. Static messages are written at the beginning of each. Gaps are known from
     the numbers of messages, which have no gaps.
     """
 
@@ -257,7 +257,7 @@ def record(
     goes_on: Iterator[bool],
     idle: float = 0.1,
 ) -> None:
-    """Writes what comes until `goes_on` says no; then what still waits. Raises `RecordingError`."""
+    """Writes what comes until `goes_on` returns False; then what still waits. Raises `RecordingError`."""
     due = time.monotonic() + FLUSH_EVERY
     for on in goes_on:
         payload = subscription.take(idle if on else 0.0)

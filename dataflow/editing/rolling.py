@@ -35,7 +35,7 @@ def keep_span(
 ) -> Edited:
     """Writes the span of a run whose messages lie in `files`, one after the other, and whose firing records are given.
 
-    Messages that several files hold are taken once; those that no firing record tells of yet, since it is on its way,
+    Messages that several files hold are taken once; those that no firing record names yet, since it is on its way,
     are left out. `metadata` is added to that of the files; `mode`: permissions of the new file.
     """
     done = Edited(str(out))
@@ -80,7 +80,7 @@ def _told(
 
 
 def _until(origin: Origin, masks: Mapping[int, Mask], told: Mapping[str, tuple[int, int]]) -> dict[int, Mask]:
-    """Of the messages of operators, those up to the last one that a record tells of."""
+    """Of the messages of operators, those up to the last one that a record names."""
     found = dict(masks)
     for channel in origin.of_kind(Kind.STREAM, Kind.COMPANION).values():
         stream, incarnation = origin.stream(channel), origin.incarnation(channel)

@@ -10,6 +10,7 @@ from typing import Any
 
 from dataflow.firing.calls import Calls
 from dataflow.firing.failure import OperatorFailure, readable
+from dataflow.firing.loading import LOADS
 from dataflow.firing.log import FiringLog
 from dataflow.firing.ports import Emitter, OutputPorts
 from dataflow.firing.seeding import change_seed, seed_generators
@@ -117,6 +118,9 @@ class SourceRunner:
                     return messages
         except BaseException as error:
             raise OperatorFailure(self.node.name, f"stream() after stamp {self._read}", error) from error
+        finally:
+            if not self._live:
+                LOADS.seed = None
         return None
 
     def _check_stamps(self, messages: Mapping[str, Message]) -> None:

@@ -17,6 +17,7 @@ from dataflow.graph.graph_parameters import GraphParameters
 from dataflow.graph.keys import NAME_RULE, has_wildcard, key_fault, name_fault
 from dataflow.graph.limits import MAX_DEPTH, MAX_OPERATORS, Budget
 from dataflow.graph.lookup import NotFound, find_operator
+from dataflow.graph.model import current_path
 from dataflow.graph.operator_parameters import operator_parameters
 from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
 from dataflow.graph.references import substitute
@@ -247,7 +248,7 @@ class Expander:
                 name=full,
                 place=entry.key.place,
                 file=scope.file,
-                use=use,
+                use=current_path(use),
                 cls=cls,
                 params=operator_parameters(
                     full, cls, values, params.key.place if params else entry.key.place, self.problems

@@ -178,7 +178,7 @@ class Resolver:
         self.problems.add(
             draft.inputs_place,
             f"{draft.name}: {spec.name} ticks every {format_duration(every)}, but every wired input is static or "
-            "'before': nothing says when ticks begin and end",
+            "'before': the beginning and the end of ticks are unknown",
             "wire an input to a stream that is neither",
         )
 

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -297,8 +298,9 @@ class PartsSink:
         else:
             if part is self._current and operator not in self._introduced:
                 self._introduced.add(operator)
-                before = [encode_batch(each) for each in consecutive(self._folded.get(operator, ()))]
-                self._store(part, lambda: [part.sink.firings(operator, part.start or 0, each) for each in before])
+                for before in consecutive(self._folded.get(operator, ())):
+                    told = partial(part.sink.firings, operator, part.start or 0, encode_batch(before))
+                    self._store(part, told)
             self._store(part, lambda: part.sink.firings(operator, records[-1].stamp, payload, calls=calls))
         self._folded[operator] = folded([*self._folded.get(operator, ()), *records])
 

@@ -7,16 +7,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgpack
+
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import diagnostics_key
 from dataflow.recording import LogLine, RecordingWriter
-from dataflow.recording.layout import ENDS, OUTCOME, firings_topic
+from dataflow.recording.layout import ENDS, OUTCOME, PARAMETERS, TOLD, firings_topic
+from dataflow.recording.limits import MAX_STATE_BYTES
 from dataflow.recording.parts import OWNER_ONLY
+from dataflow.records.firing import decode_batch, encode_batch
 
 GOES_ON = "goes on"
 """The outcome that a file names which is not the last one of its run."""
+PARAMETER_MARK = msgpack.packb("value")
+"""Stands in every batch with a parameter that was changed, as a key of its detail, and in few others."""
 
 
 class RecorderSink:
@@ -33,6 +39,7 @@ class RecorderSink:
             overwrite=options["overwrite"],
             mode=options.get("mode", OWNER_ONLY),
         )
+        self.writer.add_metadata(TOLD, {"events": PARAMETERS})
         self._added: set[str] = set()
         self._ends: dict[str, dict[str, Any]] = {}
         self.messages = 0
@@ -74,14 +81,31 @@ class RecorderSink:
         show no long nothing before it."""
         self._unflushed.setdefault(operator, []).append(calls)
         if stamp > 0 or self._clock > 0:
-            self.writer.write_firings(operator, stamp if stamp > 0 else self._clock, payload)
+            self._write_firings(operator, stamp if stamp > 0 else self._clock, payload)
         else:
             self._early.append((operator, payload))
+
+    def _write_firings(self, operator: str, stamp: int, payload: bytes) -> None:
+        """Writes a batch; one whose states make it too large is written record by record."""
+        if len(payload) <= MAX_STATE_BYTES and PARAMETER_MARK not in payload:
+            self.writer.write_firings(operator, stamp, payload)
+            return
+        batch = decode_batch(payload)
+        for record in batch.records:
+            if record.kind == "param":
+                self.writer.write_event(PARAMETERS, record.stamp, {"operator": operator, "name": record.detail["name"]})
+        if len(payload) <= MAX_STATE_BYTES:
+            self.writer.write_firings(operator, stamp, payload)
+            return
+        self._unflushed.setdefault(operator, []).extend([0] * (len(batch.records) - 1))  # an entry for each message
+        for record in batch.records:
+            data = encode_batch([record], last=batch.last and record is batch.records[-1])
+            self.writer.write_firings(operator, stamp, data)
 
     def _write_early(self) -> None:
         early, self._early = self._early, []
         for operator, payload in early:
-            self.writer.write_firings(operator, max(self._clock, 0), payload)
+            self._write_firings(operator, max(self._clock, 0), payload)
         logs, self._early_logs = self._early_logs, []
         for line in logs:
             self.writer.write_log(self._clock, line)

@@ -19,6 +19,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
+from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
@@ -309,8 +310,9 @@ class SinkProcess:
 
     def _drain(self) -> None:
         """Takes what has arrived: all others have left, or nobody can say whether they have."""
-        deadline = time.monotonic() + DRAIN_WITHIN
-        while not self.inbox.empty() and time.monotonic() < deadline:
+        clock = AwakeClock()
+        deadline = clock() + DRAIN_WITHIN
+        while not self.inbox.empty() and clock() < deadline:
             item = self.inbox.get_nowait()
             if item[0] == "envelope":
                 self._handle(item)

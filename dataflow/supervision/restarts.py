@@ -85,7 +85,7 @@ class LiveRestarts(RestartPolicy):
     def await_turn(self, process: Supervised, how: str) -> None:
         run = self.run
         process.take(Step.AWAIT, run.steady)
-        process.cause = how
+        process.cause, failed_in = how, process.failed_in
         for name in process.nodes:
             run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
         if run.release is not None:
@@ -98,6 +98,7 @@ class LiveRestarts(RestartPolicy):
             f"{process.describe()} {how}; started again in {self._attempts[process.label].due_in():.2g} s",
             operators=list(process.nodes),
             cause=how,
+            **failed_in,
         )
 
     def _tell_producers(self, process: Supervised) -> None:
@@ -183,12 +184,15 @@ class LiveRestarts(RestartPolicy):
             case "restarting":
                 name = fields["operator"]
                 run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
+                where = f" ({fields['where']})" if fields["where"] else ""
                 run.event(
                     "restart",
-                    f"operator {name!r} failed in {fields['when']}: {fields['summary']}; "
+                    f"operator {name!r} failed in {fields['when']}: {fields['summary']}{where}; "
                     f"made anew in {fields['pause']:.2g} s",
                     operators=[name],
                     cause=fields["summary"],
+                    where=fields["where"],
+                    traceback=fields["traceback"],
                 )
             case "stream_ended":
                 self._ended_streams[fields["stream"]] = fields["reason"]

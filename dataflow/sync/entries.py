@@ -1,6 +1,6 @@
 """Inputs and outputs of an aligner: entries, firings and drops.
 
-Nobody changes them. Those that are made for every message are not frozen all the same: it would make them cost three
+They are never changed. Those that are made for every message are not frozen all the same: it would make them cost three
 times as much.
 """
 

@@ -22,7 +22,15 @@ from dataflow.verification.report import StandIn, VerifyReport
 FORMAT = 1
 
 OperatorVerdict = Literal[
-    "identical", "within tolerance", "accepted", "culprit", "downstream", "not as accepted", "changed", "unverifiable"
+    "identical",
+    "within tolerance",
+    "accepted",
+    "culprit",
+    "downstream",
+    "not as accepted",
+    "changed",
+    "unverifiable",
+    "not here",
 ]
 RecordingVerdict = Literal[
     "identical",
@@ -91,7 +99,7 @@ class Checked:
             return "different"
         if self.report.empty:
             return "nothing verified"
-        if "unverifiable" in found:
+        if found & {"unverifiable", "not here"}:
             return "not wholly verified"
         if "accepted" in found:
             return "accepted"
@@ -172,7 +180,9 @@ class Baseline:
         """Takes over what a recording came to. (operators accepted anew or otherwise, operators that cannot be)."""
         outcomes = {j.operator: j.outcome for j in checked.judged if j.outcome is not None and j.firm}
         refused = [
-            j.operator for j in checked.judged if not j.firm and (j.outcome is not None or j.verdict == "unverifiable")
+            j.operator
+            for j in checked.judged
+            if not j.firm and (j.outcome is not None or j.verdict in ("unverifiable", "culprit"))
         ]
         before = self.of(checked.path)
         changed = [name for name in {**before, **outcomes} if before.get(name) != outcomes.get(name)]
@@ -278,17 +288,18 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
     for v in report.operators:
         own, outcome = report.verdict(v), outcomes[v.operator]
         verdict: OperatorVerdict = own
-        if v.operator in accepted and outcome is None and v.whole:
+        if v.operator in accepted and outcome is None and v.whole and not v.wrote:
             verdict = "not as accepted"
-        elif outcome is not None and v.operator not in unexpected:
+        elif outcome is not None and v.operator not in unexpected and not v.wrote:
             verdict = "accepted"
         elif own == "downstream" and accepted and not _led_astray(v.operator, unexpected, report.producers):
             verdict = "culprit"
         if verdict in (*PASSES, "changed") and not v.whole:
             verdict = "unverifiable"
         steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
-        judged.append(Judged(v.operator, verdict, outcome, v.whole and steady))
-    return (*judged, *_judged_stand_ins(report, report.stand_ins))
+        judged.append(Judged(v.operator, verdict, outcome, v.whole and steady and not v.wrote))
+    absent = (Judged(name, "not here", firm=False) for name in report.absent)
+    return (*judged, *absent, *_judged_stand_ins(report, report.stand_ins))
 
 
 def _judged_stand_ins(report: VerifyReport, stand_ins: Iterable[StandIn]) -> Iterable[Judged]:

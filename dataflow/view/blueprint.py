@@ -36,7 +36,7 @@ def blueprint(
 ) -> rrb.Blueprint:
     """The views for `streams` (name → message type), less those that the graph hides.
 
-    `outlook` says where to look from; without it Rerun chooses. `following`: the viewer keeps up with what arrives.
+    `outlook` is the view point; without it Rerun chooses. `following`: the viewer keeps up with what arrives.
     """
     return blueprint_of(layout(streams, graph), outlook=outlook, following=following)
 

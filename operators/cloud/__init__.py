@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from operators.cloud.cloud_registration import CloudRegistration
     from operators.cloud.clusterer import Clusterer
     from operators.cloud.plane_segmenter import PlaneSegmenter
-    from operators.cloud.scan_watch import ScanWatch
 else:  # most need scipy, which a graph without them need not load
     __getattr__, __dir__ = lazily(
         __name__,
@@ -22,7 +21,6 @@ else:  # most need scipy, which a graph without them need not load
             "cloud_registration": ("CloudRegistration",),
             "clusterer": ("Clusterer",),
             "plane_segmenter": ("PlaneSegmenter",),
-            "scan_watch": ("ScanWatch",),
         },
     )
 
@@ -33,5 +31,4 @@ __all__ = [
     "CloudRegistration",
     "Clusterer",
     "PlaneSegmenter",
-    "ScanWatch",
 ]

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Odometry, PointCloud, Pose, Transforms
 from dataflow.messages.geometry import transform_points
+from operators.cloud.deskewing import deskewed
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix
-from operators.odometry.lidar_scan import deskewed
 
 Array = NDArray[np.float64]
 

@@ -6,21 +6,21 @@ from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
     from operators.odometry.base_odometry import BaseOdometry
-    from operators.odometry.lidar_odometry import LidarOdometry
-    from operators.odometry.mono_visual_odometry import MonoVisualOdometry
-    from operators.odometry.stereo_visual_odometry import StereoVisualOdometry
-    from operators.odometry.visual_odometry import VisualOdometry
-    from operators.odometry.wheel_odometry import WheelOdometry
+    from operators.odometry.lidar.odometry import LidarOdometry
+    from operators.odometry.mono.odometry import MonoVisualOdometry
+    from operators.odometry.rgbd.odometry import VisualOdometry
+    from operators.odometry.stereo.odometry import StereoVisualOdometry
+    from operators.odometry.wheels.odometry import WheelOdometry
 else:
     __getattr__, __dir__ = lazily(
         __name__,
         {
             "base_odometry": ("BaseOdometry",),
-            "lidar_odometry": ("LidarOdometry",),
-            "mono_visual_odometry": ("MonoVisualOdometry",),
-            "stereo_visual_odometry": ("StereoVisualOdometry",),
-            "visual_odometry": ("VisualOdometry",),
-            "wheel_odometry": ("WheelOdometry",),
+            "lidar.odometry": ("LidarOdometry",),
+            "mono.odometry": ("MonoVisualOdometry",),
+            "rgbd.odometry": ("VisualOdometry",),
+            "stereo.odometry": ("StereoVisualOdometry",),
+            "wheels.odometry": ("WheelOdometry",),
         },
     )
 

@@ -15,7 +15,7 @@ from operators.geometry.extrinsics import transform_between
 from operators.recognition.posture_model import PostureModel
 from operators.recognition.scene_agents import seen_times
 from operators.recognition.silhouette import silhouette
-from operators.weights import shipped
+from operators.weights import shipped, trained_in_simulation
 
 F32 = NDArray[np.float32]
 
@@ -47,6 +47,10 @@ class PostureRecognizer(Operator):
     postures: Out[Classification] = Out(doc="probabilities of what each person in view does, by the ids of the nodes")
 
     weights: str | None = Param(None, doc="network file of `dataflow train posture`; none means the shipped one")
+
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        return trained_in_simulation(params["weights"] or shipped("posture.onnx"))
 
     def setup(self) -> None:
         """Opens the network. Raises FileNotFoundError or NetworkFileError."""

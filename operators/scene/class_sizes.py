@@ -1,7 +1,4 @@
-"""Knowledge about the simulated world's classes: usual sizes, and what a label of a detector tells.
-
-Sizes tell how deep an object is of which only one side was seen.
-"""
+"""Usual sizes of the simulated world's classes: how deep an object is of which only one side was seen."""
 
 from __future__ import annotations
 
@@ -15,8 +12,7 @@ class Usual:
     What is `round` has the outline of an ellipse, as seen from above. What is leafy shows points that are inside its
     box, by the share `inset` of half its side. What stands on the floor may have so much of its `foot`
     hidden, metres; 0 for what does not. What lies `along` the room does so always: it stands at a wall, in one or in a
-    shelf. What stands in `rows` often has others of its class beside it. What is a `case` holds things side by side;
-    what shows its `spine` stands in one with its narrow side to the front.
+    shelf.
     """
 
     size: tuple[float, float, float]
@@ -25,9 +21,6 @@ class Usual:
     inset: float = 0.0
     foot: float = 0.0
     along: bool = False
-    rows: bool = False
-    case: bool = False
-    spine: bool = False
 
 
 CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
@@ -37,7 +30,7 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
     ),
     "chair": (Usual((0.47, 0.50, 0.96), (0.16, 0.13, 0.12), foot=0.2),),
     "table": (Usual((0.60, 1.50, 0.75), (0.40, 0.40, 0.16), foot=0.2),),
-    "shelf": (Usual((0.31, 1.04, 1.43), (0.12, 0.20, 0.25), foot=0.2, along=True, rows=True, case=True),),
+    "shelf": (Usual((0.31, 1.04, 1.43), (0.12, 0.20, 0.25), foot=0.2, along=True),),
     "door": (Usual((0.18, 1.06, 2.13), (0.50, 0.10, 0.05), foot=0.2, along=True),),
     "monitor": (Usual((0.20, 0.56, 0.48), (0.10, 0.12, 0.10)),),
     "plant": (
@@ -50,7 +43,7 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
     "bottle": (Usual((0.07, 0.07, 0.25), (0.12, 0.12, 0.15), True),),
     "robot": (Usual((0.39, 0.41, 0.73), (0.10, 0.10, 0.10), foot=0.2),),
     "book": (
-        Usual((0.035, 0.16, 0.23), (0.30, 0.12, 0.12), along=True, spine=True),
+        Usual((0.035, 0.16, 0.23), (0.30, 0.12, 0.12), along=True),
         Usual((0.16, 0.22, 0.035), (0.12, 0.12, 0.30)),
     ),
     "lamp": (
@@ -63,10 +56,3 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
 of office, corridor and table_top). People who stand or walk come before those who sit, whose depth is less than it is
 (0.86 m), since their legs are hidden and may be turned any way. Along the room, within two degrees, lie all of
 55 doors, 120 shelves and 1104 books that stand (seeds 10000 to 10005); of other classes at most 7 in 10."""
-
-TELLING: dict[str, float] = {"ball": 2.0}
-"""Labels of another class that one of this class outweighs, where that is not one.
-
-Far balls are often called mugs, mugs seldom balls: of the labels of balls in five worlds (seeds 501, 502, 601,
-603 and 604) 13 % are `mug`, below 16 pixels 62 %; of those of mugs 2 % are `ball`.
-"""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.inference import ModelError
 
 VOID = 255

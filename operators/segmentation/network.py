@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from operators.training.backbone import Backbone, ConvNorm, MobileNetV2, SeparableConv
+from operators.learning.backbone import Backbone, ConvNorm, MobileNetV2, SeparableConv
 
 _LEVELS = ((16, 64, 64), (8, 48, 48), (4, 32, 24), (2, 16, 24))
 """(stride, channels taken from the backbone, channels after merging) on the way back."""

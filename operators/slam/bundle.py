@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.geometry.pinhole import Points
-from operators.odometry.camera import RgbdCamera
+from operators.odometry.rgbd.camera import RgbdCamera
 from operators.slam import motions
 from operators.slam.pose_graph import DenseEdges, Edge
 

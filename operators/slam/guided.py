@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix
-from operators.odometry.camera import RgbdCamera
+from operators.odometry.rgbd.camera import RgbdCamera
 
 RATIO = 0.85  # of the distance of descriptors to that of the second nearest in the window
 FARTHEST = 0.5  # squared distance of rooted descriptors beyond which they do not show the same

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.geometry.se3 import Matrix
-from operators.odometry.lidar_tracker import State, Tracked
+from operators.odometry.lidar.tracker import State, Tracked
 from operators.slam.graph_memory import graph_from_plain, graph_to_plain, plain
 from operators.slam.lidar_graph import LidarGraph
 from operators.slam.lidar_view import LidarView

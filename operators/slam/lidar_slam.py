@@ -15,7 +15,7 @@ from dataflow.messages.geometry import invert, transform_points
 from dataflow.operator import Out, Param
 from operators.cloud.registration import Settings
 from operators.geometry.se3 import Matrix, adjoint
-from operators.odometry.lidar_odometry import LidarOdometry
+from operators.odometry.lidar.odometry import LidarOdometry
 from operators.slam.emission import corrections, map_poses, path_of, sizes, status_of
 from operators.slam.lidar_graph import LidarGraph, LidarSettings
 from operators.slam.lidar_map_file import points_of, read_lidar_map, write_lidar_map

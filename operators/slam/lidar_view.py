@@ -13,10 +13,10 @@ from dataflow.messages.geometry import invert
 from operators.cloud.registration import FEWEST, Prepared, Registered, Settings, best_of, explained, failure, refine
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix
-from operators.odometry.lidar_fit import Fit, Prior, fit
-from operators.odometry.lidar_map import PlaneMap, thinned
-from operators.odometry.lidar_scan import SPARSER, Scan
-from operators.odometry.lidar_search import TURNS, around
+from operators.odometry.lidar.fit import Fit, Prior, fit
+from operators.odometry.lidar.map import PlaneMap, thinned
+from operators.odometry.lidar.scan import SPARSER, Scan
+from operators.odometry.lidar.search import TURNS, around
 from operators.slam.keyframe_graph import Node
 from operators.slam.scan_context import Context, describe
 

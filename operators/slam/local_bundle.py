@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from operators.odometry.fitting import Fitter, systematic
+from operators.odometry.rgbd.fitting import Fitter, systematic
 from operators.slam.bundle import Observations, adjusted
 from operators.slam.keyframe_graph import KeyframeGraph
 from operators.slam.map_points import MapPoints

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import transform_points
 from operators.geometry.se3 import Matrix
-from operators.odometry.camera import RgbdCamera
+from operators.odometry.rgbd.camera import RgbdCamera
 from operators.slam.guided import guided_pairs
 from operators.slam.keyframe_graph import Node
 from operators.slam.visual_view import View

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.geometry.se3 import Matrix
-from operators.odometry.camera import RgbdCamera
-from operators.odometry.fitting import Fitter
-from operators.odometry.memory import from_plain, to_plain
-from operators.odometry.rgbd_odometry import RgbdOdometry
-from operators.odometry.settings import RgbdOdometryConfig
-from operators.odometry.surface import scaled_intrinsics
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.fitting import Fitter
+from operators.odometry.rgbd.memory import from_plain, to_plain
+from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.surface import scaled_intrinsics
+from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.odometry.tracking import Status, TrackResult
 from operators.slam.graph_memory import graph_from_plain, graph_to_plain
 from operators.slam.map_points import MapPoints

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from operators.odometry.surface import Surface
+from operators.odometry.rgbd.surface import Surface
 from operators.slam.keyframe_graph import Node
 from operators.slam.map_file import ends, joined, read_map, write_map
 from operators.slam.visual_graph import VisualGraph

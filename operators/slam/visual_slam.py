@@ -22,9 +22,9 @@ from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.odometry.emission import LEVELS as ODOMETRY_LEVELS
 from operators.odometry.emission import outputs
-from operators.odometry.settings import RgbdOdometryConfig
-from operators.odometry.surface import DepthNoise
-from operators.odometry.visual_odometry import Calibration, camera_of, same
+from operators.odometry.rgbd.odometry import Calibration, camera_of, same
+from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.surface import DepthNoise
 from operators.slam.emission import corrections, map_poses, path_of, sizes, status_of
 from operators.slam.rgbd_slam import RgbdSlam, SlamResult
 from operators.slam.visual_cloud import cloud_of

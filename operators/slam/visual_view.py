@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import transform_points
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix
-from operators.odometry.camera import RgbdCamera
-from operators.odometry.fitting import Fitter, Sighting
-from operators.odometry.frame import Frame
-from operators.odometry.keyframe import Keyframe
-from operators.odometry.local_map import LocalMap
+from operators.monitoring.image_flaws import Watch
 from operators.odometry.motion import Motion
-from operators.odometry.noise import Noise
 from operators.odometry.recognition import Description, match
-from operators.odometry.relocalizer import rough_points
-from operators.odometry.surface import Surface
-from operators.odometry.watch import Watch
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.fitting import Fitter, Sighting
+from operators.odometry.rgbd.frame import Frame
+from operators.odometry.rgbd.keyframe import Keyframe
+from operators.odometry.rgbd.local_map import LocalMap
+from operators.odometry.rgbd.noise import Noise
+from operators.odometry.rgbd.relocalizer import rough_points
+from operators.odometry.rgbd.surface import Surface
 from operators.slam.graph_memory import plain
 from operators.slam.guided import guided_pairs
 from operators.slam.place_index import rooted

@@ -1,4 +1,4 @@
-"""Sources: datasets, devices, made-up sequences and a simulated robot."""
+"""Sources: datasets, devices and made-up sequences."""
 
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         RecordedTransforms,
     )
     from operators.sources.rgbd_folder import RgbdFolder
-    from operators.sources.simulated_robot import SimulatedRobot
     from operators.sources.synthetic_rgbd import SyntheticRgbd
     from operators.sources.victoria_park import VictoriaPark
     from operators.sources.video import VideoFile, Webcam
@@ -41,7 +40,6 @@ else:  # most need a library of their own, which a graph without them need not l
                 "RecordedTransforms",
             ),
             "rgbd_folder": ("RgbdFolder",),
-            "simulated_robot": ("SimulatedRobot",),
             "synthetic_rgbd": ("SyntheticRgbd",),
             "victoria_park": ("VictoriaPark",),
             "video": ("VideoFile", "Webcam"),
@@ -61,7 +59,6 @@ __all__ = [
     "RecordedStereoCamera",
     "RecordedTransforms",
     "RgbdFolder",
-    "SimulatedRobot",
     "SyntheticRgbd",
     "VictoriaPark",
     "VideoFile",

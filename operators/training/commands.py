@@ -37,7 +37,6 @@ from operators.training.refining import BORDERS, REFINER, BorderEpochs, RefinerE
 from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data, variation_of
 from operators.training.torchvision_command import train_torchvision
 from operators.training.trunk_command import train_trunk
-from operators.training.views_commands import train_focus, train_reclassifier
 
 __all__ = ["evaluate", "train"]
 
@@ -53,11 +52,10 @@ train = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
-for name, command in (
-    ("activity", train_activity), ("focus", train_focus), ("posture", train_posture),
-    ("reclassifier", train_reclassifier), ("torchvision", train_torchvision), ("trunk", train_trunk),
-):  # fmt: skip
-    train.command(name)(command)
+train.command("activity")(train_activity)
+train.command("posture")(train_posture)
+train.command("torchvision")(train_torchvision)
+train.command("trunk")(train_trunk)
 for each in (REFINER, BORDERS):
     train.command(each.kind)(command_of(each))
 
@@ -105,7 +103,7 @@ def train_detector(
         keep_earlier(out, resume, overwrite)
         from operators.detection.custom.folder import read_detection_data
         from operators.detection.custom.training import DetectorTask
-        from operators.training.loop import Settings
+        from operators.learning.loop import Settings
 
         read = read_detection_data(data, seed)
         read = read if classes is None else read.only([name.strip() for name in classes.split(",") if name.strip()])
@@ -163,9 +161,9 @@ def train_segmenter(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
+        from operators.learning.loop import Settings
         from operators.segmentation.dataset import read_segmentation_data
         from operators.segmentation.training import SegmenterTask
-        from operators.training.loop import Settings
 
         read = read_segmentation_data(data, seed)
         task = SegmenterTask(
@@ -221,10 +219,10 @@ def train_classifier(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
+        from operators.learning.backbone import start_from
+        from operators.learning.loop import Settings
         from operators.recognition.dataset import read_classification_data
         from operators.recognition.training import ClassifierTask
-        from operators.training.backbone import start_from
-        from operators.training.loop import Settings
 
         read = read_classification_data(data, seed)
         task = ClassifierTask(
@@ -283,8 +281,8 @@ def train_pair(
         file = out / "pair.onnx"
         keep_earlier(file, resume, overwrite)
         from operators.detection.custom.folder import read_detection_data
+        from operators.learning.loop import Settings
         from operators.segmentation.dataset import read_segmentation_data
-        from operators.training.loop import Settings
         from operators.training.pair import DETECTOR, SEGMENTER, PairTask
 
         boxes, masks = read_detection_data(data, seed), read_segmentation_data(data, seed)

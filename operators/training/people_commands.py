@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.progress import track
 
-from operators.training.console import Json, friendly
-from operators.training.making import Chosen, Processes, Worlds, followed, tell
+from operators.training.console import Json, err_console, friendly
 from operators.training.options import Device, Every, Overwrite, Rate, Resume, Seed, Threads, Workers
 from operators.training.running import keep_earlier, report, run_task
 
 if TYPE_CHECKING:
     from operators.recognition.episodes import Episode
 
+Worlds = Annotated[int, typer.Option(min=1, help="Worlds to train on.")]
+Chosen = Annotated[int, typer.Option("--validation", min=1, help="Worlds by which the best epoch is chosen.")]
+Processes = Annotated[int, typer.Option(min=1, help="Worlds made at once.")]
 Folder = Annotated[Path, typer.Argument(help="Folder of episodes; those that it lacks are made.", show_default=False)]
 Silhouettes = Annotated[
     Path, typer.Argument(help="Folder of silhouettes; those that it lacks are made.", show_default=False)
@@ -64,9 +68,9 @@ def train_activity(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
+        from operators.learning.loop import Settings
         from operators.recognition.activity_training import ActivityTask
         from operators.recognition.sensed_people import read_tracks
-        from operators.training.loop import Settings
 
         training, choosing = _episodes(data, worlds, validation, processes, json)
         parts = [read_tracks(folder) if folder else [] for folder in (sensed, sensed_validation)]
@@ -74,7 +78,7 @@ def train_activity(
             training, choosing, sensed=parts[0], sensed_validation=parts[1], repeats=repeats, seed=seed,
             variations=variations,
         )  # fmt: skip
-        tell(f"{task.samples} tracks of {worlds} worlds to train on, {validation} worlds to choose by", json)
+        _tell(f"{task.samples} tracks of {worlds} worlds to train on, {validation} worlds to choose by", json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=1, threads=threads,
             device=device,
@@ -114,15 +118,15 @@ def train_posture(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
+        from operators.learning.loop import Settings
         from operators.recognition.posture_training import PostureTask
         from operators.training import made_worlds
-        from operators.training.loop import Settings
         from operators.training.simulated_postures import TRAINING, VALIDATION, read_postures, write_postures
 
         parts = made_worlds.worlds(TRAINING, worlds), made_worlds.worlds(VALIDATION, validation)
-        followed(write_postures(data, [*parts[0], *parts[1]], processes), worlds + validation, json)
+        _followed(write_postures(data, [*parts[0], *parts[1]], processes), worlds + validation, json)
         task = PostureTask(read_postures(data, parts[0]), read_postures(data, parts[1]), seed=seed)
-        tell(f"{task.samples} silhouettes of {worlds} worlds to train on, {validation} worlds to choose by", json)
+        _tell(f"{task.samples} silhouettes of {worlds} worlds to train on, {validation} worlds to choose by", json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
             device=device,
@@ -140,5 +144,17 @@ def _episodes(
 
     parts = worlds(TRAINING, training), worlds(VALIDATION, validation)
     made = write_episodes(folder, [*parts[0], *parts[1]], processes)
-    followed(made, training + validation, quiet)
+    _followed(made, training + validation, quiet)
     return read_episodes(folder, parts[0]), read_episodes(folder, parts[1])
+
+
+def _followed(made: Iterator[int], total: int, quiet: bool) -> None:
+    """Makes worlds, with a progress bar unless output is for programs."""
+    for _ in made if quiet else track(made, total=total, description="worlds", console=err_console):
+        pass
+
+
+def _tell(text: str, quiet: bool) -> None:
+    """Says what is learned from, unless output is for programs."""
+    if not quiet:
+        err_console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -18,9 +18,9 @@ from operators.training.running import keep_files, run_task, tell_data, tell_sco
 
 if TYPE_CHECKING:
     from operators.detection.custom.dataset import DetectionData
+    from operators.learning.augmentation import Variation
+    from operators.learning.loop import Outcome, Settings, Task
     from operators.segmentation.dataset import SegmentationData
-    from operators.training.augmentation import Variation
-    from operators.training.loop import Outcome, Settings, Task
     from operators.weights import Network
 
 First = Annotated[Path, typer.Argument(help="The first network's file (.onnx).", show_default=False)]
@@ -140,7 +140,7 @@ def add_second(task: Task, first: Path, out: Path, settings: Settings, resume: b
 
     Beside `out` stays its checkpoint, `.refiner.pt` or `.borders.pt`, from which `resume` goes on where it is there.
     """
-    from operators.training.export import attach_second
+    from operators.learning.export import attach_second
 
     alone = out.with_suffix(f".{task.kind}.onnx")
     outcome = run_task(task, settings, alone, resume and alone.with_suffix(".pt").exists(), quiet)
@@ -174,7 +174,7 @@ def command_of(second: Second) -> Callable[..., None]:
             out = weights if out is None else out
             written = (out, out.with_suffix(f".{second.kind}.pt"))
             keep_files([file for file in written if file != weights], resume, overwrite)
-            from operators.training.loop import Settings
+            from operators.learning.loop import Settings
             from operators.weights import open_network
 
             network = open_network(weights, second.first)

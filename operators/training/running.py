@@ -16,16 +16,16 @@ from operators.training.console import err_console, out_console, print_notes, sc
 if TYPE_CHECKING:
     from torch import nn
 
-    from operators.training.augmentation import Variation
-    from operators.training.backbone import Backbone as Extractor
-    from operators.training.loop import Outcome, Settings, Task
+    from operators.learning.augmentation import Variation
+    from operators.learning.backbone import Backbone as Extractor
+    from operators.learning.loop import Outcome, Settings, Task
 
 _LONGEST_SIDE, _MULTIPLE = 384, 32
 
 
 def run_task(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -> Outcome:
     """Trains with a progress bar, or without one where output is for programs."""
-    from operators.training.loop import train
+    from operators.learning.loop import train
     from operators.training.progress import TrainingBar
 
     if quiet:
@@ -46,14 +46,14 @@ class FineTuned(Protocol):
 
 def variation_of(flip: bool, strength: float) -> Variation:
     """The random changes of training images, of so much strength."""
-    from operators.training.augmentation import Variation
+    from operators.learning.augmentation import Variation
 
     return Variation(flip=0.5 if flip else 0.0).times(strength)
 
 
 def prepare(task: FineTuned, weights: Path | None, frozen_stride: int | None, initial: Path | None) -> None:
     """Gives a network its first weights and freezes the part of the backbone that came with them."""
-    from operators.training.backbone import start_from
+    from operators.learning.backbone import start_from
 
     if initial is not None and initial.suffix == ".onnx":
         task.begin_with(initial)

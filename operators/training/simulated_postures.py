@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert
 from operators.recognition.posture_data import BODY, POSTURES, Postures
 from operators.recognition.silhouette import HALF, MIDDLE, silhouette
-from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
-from operators.sources.simulator.optics import Optics, View, camera_rays
-from operators.sources.simulator.persons import Person
-from operators.sources.simulator.renderer import Renderer
-from operators.sources.simulator.scene import Thing, World
-from operators.sources.simulator.settings import ColorCamera, DepthCamera
-from operators.sources.simulator.worlds import make_world
+from operators.simulator.frames import BODY_TO_OPTICAL, mounted
+from operators.simulator.optics import Optics, View, camera_rays
+from operators.simulator.persons import Person
+from operators.simulator.renderer import Renderer
+from operators.simulator.scene import Thing, World
+from operators.simulator.settings import ColorCamera, DepthCamera
+from operators.simulator.worlds import make_world
 from operators.training.made_worlds import Chosen, file_of, write_lacking
 
 Array = NDArray[np.float64]

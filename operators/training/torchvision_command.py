@@ -25,7 +25,7 @@ from operators.training.options import (
 from operators.training.running import input_size, keep_earlier, report, run_task, tell_data, variation_of
 
 if TYPE_CHECKING:
-    from operators.training.augmentation import Variation
+    from operators.learning.augmentation import Variation
     from operators.training.torchvision_tasks import TorchvisionDetectorTask, TorchvisionSegmenterTask
 
 
@@ -75,8 +75,8 @@ def train_torchvision(
         keep_earlier(out, resume, overwrite, ".pth")
         if weights is not None and initial is not None:
             raise ValueError("give either --weights or --from: both are what to begin with")
+        from operators.learning.loop import Settings
         from operators.torch_models import cached_weights, family_of
-        from operators.training.loop import Settings
         from operators.training.torchvision_tasks import weights_in
 
         changes = variation_of(flip, variation)

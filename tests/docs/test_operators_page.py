@@ -39,7 +39,7 @@ def test_every_port_and_parameter_has_a_row_with_a_meaning(found: Catalogue, pag
             assert not row.endswith("|  |"), f"{cls.spec.name}.{name} has no documentation"
 
 
-GEOMETRY = ["cloud", "crosscheck", "depth", "evaluation", "frames", "fusion", "image", "localization", "mapping"]
+GEOMETRY = ["cloud", "depth", "evaluation", "frames", "fusion", "image", "localization", "mapping", "monitoring"]
 GEOMETRY += ["odometry", "slam"]
 
 
@@ -50,7 +50,7 @@ def test_every_operator_of_geometry_stands_in_a_graph(found: Catalogue) -> None:
 
 
 def test_operators_of_nested_graphs_are_counted_to_the_graph_that_holds_them() -> None:
-    assert "perception_kitti.yaml" in graphs_of()["operators.crosscheck:MotionCheck"]
+    assert "perception_kitti.yaml" in graphs_of()["operators.monitoring:MotionCheck"]
 
 
 def test_an_operator_that_a_parameter_names_is_the_one_that_is_run() -> None:

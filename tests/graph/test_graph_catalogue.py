@@ -44,6 +44,15 @@ def test_every_operator_of_a_module_is_found() -> None:
     assert "graph_operators:Fuse" in shown(table(catalogue))
 
 
+def test_an_operator_is_found_by_its_former_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = {"graph_operators:Merger": "graph_operators:Fuse", "graph_operators:Gone": "graph_operators:Nowhere"}
+    monkeypatch.setattr(graph_operators, "MOVED_OPERATORS", moved, raising=False)
+
+    assert look_up("graph_operators:Merger") == Described("graph_operators:Fuse", graph_operators.Fuse)
+    with pytest.raises(LookupError, match="module 'graph_operators' has no operator 'Nowhere'"):
+        look_up("graph_operators:Gone")
+
+
 def test_a_failing_module_is_reported_and_the_others_still_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

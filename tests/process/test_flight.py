@@ -291,3 +291,14 @@ def test_a_full_disk_is_outlived_and_what_comes_after_is_kept(
         ("first", "second", "slow"), "identical"
     )
     assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_restart_is_kept_with_the_line_and_the_traceback_of_its_failure() -> None:
+    failed = {"text": "operator 'a' failed", "operators": ["a"], "where": "crashy.py:12", "traceback": "Traceback …"}
+    triggers = Triggers([Trigger("raise")])
+
+    assert list(triggers.event("restart", failed)) == [
+        {"what": "operator 'a' failed", "operators": ["a"], "where": "crashy.py:12", "traceback": "Traceback …"}
+    ]
+    killed = {"text": "process 'a' was killed", "operators": ["a"]}
+    assert list(triggers.event("restart", killed)) == [{"what": "process 'a' was killed", "operators": ["a"]}]

@@ -2,16 +2,21 @@
 
 `run.mcap` is a run and `live.mcap` a live run of `robot.yaml`, both of file format 1; the live one has drops, timeouts,
 late messages, a changed parameter, an operator that raised, a process that was killed, and a clock that jumped back.
+`perception.mcap` is 0.6 s of `graphs/perception.yaml`; operators of it may be deleted, and the others go on verifying.
 """
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
+from dataflow.graph.model import import_operator
 from dataflow.recording import Recording
+from dataflow.reexecution.recorded_run import recorded_graph
 from dataflow.supervision.run import replay
 from dataflow.verification.verify import verify
 
@@ -45,6 +50,7 @@ VERIFIED = {
     "live.mcap": {"look": 22, "smooth": 42, "busy": 117, "tally": 122},
 }
 FILES = sorted(DIGESTS)
+OPERATORS = ("Robot", "Beacon", "Look", "Smooth", "Busy", "Tally")
 
 
 @pytest.mark.parametrize("file", FILES)
@@ -80,3 +86,35 @@ def test_the_kept_run_verifies_from_its_middle_by_a_recorded_state() -> None:
 
     assert report.identical, report.as_json()
     assert {v.operator: v.began for v in report.operators}["smooth"] == "snapshot"
+
+
+def test_the_kept_run_verifies_with_operators_that_have_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copy(HERE / "kept_operators.py", tmp_path / "kept_elsewhere.py")
+    moved = {f"kept_operators:{name}": f"kept_elsewhere:{name}" for name in OPERATORS}
+    (tmp_path / "kept_operators.py").write_text(f"MOVED_OPERATORS = {moved}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "kept_operators", raising=False)
+
+    report = verify(HERE / "run.mcap", start=0.9)
+
+    assert report.identical, report.as_json()
+    assert {v.operator: v.began for v in report.operators}["smooth"] == "snapshot"
+    with Recording(HERE / "run.mcap") as recording:
+        nodes = recorded_graph(recording).nodes.values()
+    assert {node.use for node in nodes} == set(moved.values())
+    assert {import_operator(former) for former in moved} == {node.operator for node in nodes}
+    del sys.modules["kept_operators"]
+
+
+DELETED = {"perception/focus", "perception/names"}
+"""Operators that `perception.mcap` may name in vain."""
+UNCHANGED = {"perception/image_watch", "perception/depth_watch", "perception/scan_watch"}
+"""Operators that only count and compare. Others round as the kernels for a CPU do, or have changed since."""
+
+
+def test_the_kept_perception_verifies_but_for_operators_that_were_deleted() -> None:
+    report = verify(HERE / "perception.mcap")
+
+    assert report.absent.keys() <= DELETED
+    assert {v.operator for v in report.operators if v.verdict == "identical"} >= UNCHANGED
+    assert all(v.verified == v.firings for v in report.operators)

@@ -32,7 +32,7 @@ def test_a_live_run_with_drops_and_timeouts_is_verified_in_another_placement(pla
     assert ("mix", "timeout") in waited
     assert "timeout" not in {reason for _, reason in reasons}
     with Recording(path) as recording:
-        assert recording.metadata[RUN]["seeding"] == "2"
+        assert recording.metadata[RUN]["seeding"] == "3"
         overflowed = [d for r in recorded_firings(recording, "slow") for d in r.drops if d.reason == "overflow"]
         assert len(overflowed) == sum(n for _, why, n in report.drops["slow"] if why == "overflow")
     verified = verify(path, jobs=1 if placement == "process_each" else None)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.lint.finding import Finding
 from dataflow.lint.material import Stamps, StreamFacts
 from dataflow.messages import Message
 
@@ -32,6 +33,9 @@ class MadeMaterial:
         facts |= {name: StreamFacts("Other", False, len(found), False) for name, found in self._stamps.items()}
         self.streams = facts
 
+    def file_findings(self, *, whole: bool) -> Iterator[Finding]:
+        return iter(())
+
     def stamps(self, stream: str) -> Stamps:
         found = self._stamps.get(stream)
         return np.array([m.stamp for m in self._messages[stream]] if found is None else found, np.int64)
@@ -47,7 +51,7 @@ def every(period: float, first: float = 0.0, last: float = 10.0) -> list[int]:
 
 @cache
 def _simulated(sensors: str) -> dict[str, list[Message]]:
-    from operators.sources import SimulatedRobot
+    from operators.simulator import SimulatedRobot
 
     settings: dict[str, Any] = {
         "seed": 4,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.geometry import se3
-from operators.odometry.stereo_adjustment import StereoRig
+from operators.odometry.stereo.adjustment import StereoRig
 
 Gray = NDArray[np.uint8]
 Matrix = NDArray[np.float64]

@@ -14,6 +14,7 @@ from urllib.parse import quote
 import numpy as np
 import xxhash
 
+from dataflow.extras import missing_extra
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Message
@@ -81,8 +82,8 @@ def export_parquet(material: Material, folder: Path, done: Exported) -> None:
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ImportError:
-        raise RecordingError("--to parquet needs pyarrow: pip install pyarrow") from None
+    except ImportError as error:
+        raise RecordingError(f"--to parquet needs pyarrow; {missing_extra(error)}") from None
     for name, columns in _tables(material, done):
         path = file_of(folder, material.names[name], ".parquet", done.files)
         kind = material.streams[name].message_type

@@ -26,7 +26,7 @@ from dataflow.operator import Context, ParameterError
 from dataflow.testing import play
 from operators.fusion import EkfFusion
 from operators.geometry.geodesy import earth_centred, east_north_up
-from operators.sources.simulator.gnss import geodetic
+from operators.simulator.gnss import geodetic
 
 
 def twist(stamp: int, frame: str = "base_link") -> Twist:
@@ -227,6 +227,15 @@ def test_what_is_ignored_is_counted_with_its_reason() -> None:
     assert status.names[0] == "filter"  # type: ignore[attr-defined]
     assert status.pairs(0)["robot/imu: not finite"] == "1"  # type: ignore[attr-defined]
     assert "robot/fix" in status.names  # type: ignore[attr-defined]
+
+
+def test_odometry_begins_without_an_altitude_and_the_status_says_what_is_missing() -> None:
+    robot = Robot(10.0)
+    operator, played = fused({"robot/imu": robot.imu, "robot/fix": robot.fixes(altitude=False)}, **HEADING)
+
+    assert len(played["odometry"]) > 400
+    assert "height" in played["status"][-1].names  # type: ignore[attr-defined]
+    assert any("altitude" in name for name in operator.summary())
 
 
 def test_a_fix_without_altitude_counts_horizontally() -> None:

@@ -13,21 +13,21 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dataflow.messages import Image
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.segmentation import Segmenter
 from operators.segmentation.borders import BLOCK, Blocks, best_cells, found_blocks, look_again, worked
 from operators.weights import NetworkFileError, open_network
 
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
+from operators.learning.augmentation import Variation  # noqa: E402
+from operators.learning.export import attach_second, export_network, without_second  # noqa: E402
+from operators.learning.files import TrainingFileError  # noqa: E402
+from operators.learning.loop import Settings, train  # noqa: E402
 from operators.segmentation.border_training import BorderTask  # noqa: E402
 from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData  # noqa: E402
 from operators.segmentation.network import DeployedSegmenter, ScoringSegmenter, SegmentationNetwork  # noqa: E402
 from operators.segmentation.training import SegmenterTask  # noqa: E402
-from operators.training.augmentation import Variation  # noqa: E402
-from operators.training.export import attach_second, export_network, without_second  # noqa: E402
-from operators.training.files import TrainingFileError  # noqa: E402
-from operators.training.loop import Settings, train  # noqa: E402
 from operators.training.quantization import quantize_network  # noqa: E402
 from operators.training.refining import add_second  # noqa: E402
 

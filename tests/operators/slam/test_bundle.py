@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import project
-from operators.odometry.camera import RgbdCamera
+from operators.odometry.rgbd.camera import RgbdCamera
 from operators.slam.bundle import CAUCHY, Bundle, Observations, adjusted
 from operators.slam.pose_graph import Edge
 from operators.sources.room import look_at

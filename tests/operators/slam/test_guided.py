@@ -14,8 +14,8 @@ from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix
-from operators.odometry.camera import RgbdCamera
-from operators.odometry.surface import Surface
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.surface import Surface
 from operators.slam.guided import guided_pairs
 from operators.slam.visual_view import View
 

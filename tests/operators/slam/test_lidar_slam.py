@@ -17,7 +17,7 @@ from dataflow.testing import Played, play
 from operators.cloud.registration import Settings
 from operators.geometry.se3 import Matrix
 from operators.odometry import LidarOdometry
-from operators.odometry.lidar_tracker import State, Tracked
+from operators.odometry.lidar.tracker import State, Tracked
 from operators.slam import LidarSlam
 from operators.slam.lidar_graph import LidarGraph, LidarSettings
 from operators.slam.lidar_map_file import read_lidar_map

@@ -12,11 +12,11 @@ from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix
-from operators.odometry.camera import RgbdCamera
-from operators.odometry.fitting import Fitter
-from operators.odometry.noise import Noise
-from operators.odometry.rgbd_odometry import RgbdOdometry
-from operators.odometry.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.fitting import Fitter
+from operators.odometry.rgbd.noise import Noise
+from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.slam.keyframe_graph import KeyframeGraph, Node
 from operators.slam.local_bundle import adjust_newest
 from operators.slam.map_points import LONE, MapPoints

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix
-from operators.odometry.camera import RgbdCamera
-from operators.odometry.fitting import Fitter
-from operators.odometry.noise import Noise
 from operators.odometry.recognition import match
-from operators.odometry.rgbd_odometry import RgbdOdometry
-from operators.odometry.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.fitting import Fitter
+from operators.odometry.rgbd.noise import Noise
+from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.slam.visual_view import STRIDE, Judge, Sight, View, relief, sight
 from operators.sources.room import Room, camera_path, look_at
 

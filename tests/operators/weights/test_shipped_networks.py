@@ -14,7 +14,7 @@ from dataflow.messages import Detections2D, Image
 from operators.detection import CustomDetector
 from operators.detection.nms import intersection_over_union
 from operators.segmentation import Segmenter
-from operators.sources.simulator.classes import CLASSES, THINGS
+from operators.simulator.classes import CLASSES, THINGS
 from operators.training.simulated_worlds import HELD_OUT, WorldImage, render
 from operators.weights import read_facts, shipped
 

@@ -1,0 +1,204 @@
+"""Motions by several sensors are compared before anything averages them, as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dataflow.messages import Diagnostics, Imu, Message, Odometry, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import invert
+from dataflow.operator import Batch, Context, Duration, In, Operator, Out, Param, Sampled
+from operators.geometry.extrinsics import transform_between
+from operators.monitoring.motion_agreement import Contradiction, Limits, MotionAgreement, Track, Window
+from operators.status import counted_status
+
+_NEWEST = 350_000_000  # ns: what an older pose says of the speed is not compared with the wheels'
+_SLACK = 300_000_000  # ns that a window waits for the slowest sensor
+_WHEELS = "wheels"
+_HANGS = 500_000_000  # ns for which a sensor gives the same reading of a motion when it counts as hanging
+
+
+class MotionCheck(Operator, merge=True):
+    """Compares the robot's motion by wheels, odometries and gyroscopes, and holds wheels back that are contradicted.
+
+    Window by window each two sensors are compared: their ways, their turns, and the directions of both on the robot.
+    What differs by more than a limit and its noise is said, with the sensor that the others contradict; of two nobody
+    knows which is wrong. A camera whose depths are too long, wheels of another radius, a gyroscope of another scale and
+    a sensor that is turned against its extrinsic show so; so does one that repeats a reading of motion. Wheels are
+    passed on at `checked` unless two others that agree contradict them, over many windows or at once (wheels that slip
+    or say nothing).
+    """
+
+    wheels: In[Odometry] = In(doc="odometry of the wheels, with velocities")
+    motions: In[Odometry] = In(many=True, doc="odometries of cameras and LiDARs, poses of their sensors")
+    imu: Batch[Imu] = Batch(many=True, doc="angular velocities")
+    extrinsics: Sampled[Transforms] = Sampled(doc="where the sensors are on the robot")
+    checked: Out[Odometry] = Out(doc="the wheels' odometry, as long as it is not contradicted")
+    status: Out[Diagnostics] = Out(doc="after every window, and when wheels are first held back")
+
+    base_frame: str = Param("base_link", min_length=1, doc="frame of the robot's base, which the wheels move")
+    window: Duration = Param("600ms", gt=0, doc="time over which motions are compared")
+    way: float = Param(0.03, gt=0, doc="share by which ways may differ")
+    turn: float = Param(0.03, gt=0, doc="share by which turns may differ")
+    coarse_turn: float = Param(0.15, gt=0, doc="the same for the wheels', which depend on radii and slip")
+    angle: float = Param(1.5, gt=0, doc="angle between directions", unit="°")
+    slip: float = Param(0.15, gt=0, doc="speed by which wheels may differ at any moment, beside a third", unit="m/s")
+
+    def setup(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        limits = Limits(self.way, self.turn, self.coarse_turn, float(np.deg2rad(self.angle)))
+        self._tracks: dict[str, Track] = {}
+        self._blind: set[str] = set()
+        """Sensors that tell turns alone."""
+        self._agreement = MotionAgreement(limits)
+        self._found: list[Contradiction] = []
+        self._end = 0
+        self._slipping = self._said = False
+        self._slipped = -1
+        """When the wheels last did: a window with it tells nothing of their radii."""
+        self._readings: dict[str, tuple[int, np.ndarray]] = {}
+        """Since when each of the moving sensors gives the reading that it gives."""
+        self._hanging: set[str] = set()
+        self._counts: Counter[str] = Counter()
+
+    def process(
+        self,
+        context: Context,
+        wheels: Odometry | None,
+        motions: Mapping[str, Odometry],
+        imu: tuple[Imu, ...],
+        extrinsics: Transforms,
+    ) -> Mapping[str, Message]:
+        """Raises ValueError where the extrinsics do not hold a sensor."""
+        turns = {
+            frame: transform_between(extrinsics, frame, self.base_frame)[:3, :3] for frame in {s.frame for s in imu}
+        }
+        for sample in imu:
+            name = f"gyroscope of {sample.frame}"
+            self._blind.add(name)
+            if not np.isfinite(sample.angular_velocity).all():
+                self._counts[f"{name}: not finite"] += 1
+                continue
+            rate = turns[sample.frame] @ sample.angular_velocity
+            self._follow(name, sample.stamp, sample.angular_velocity)
+            self._track(name).twist(sample.stamp, np.concatenate([np.zeros(3), rate]))
+        for stream, odometry in (motions or {}).items():
+            T = transform_between(extrinsics, odometry.child_frame, self.base_frame)
+            if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
+                self._counts[f"{stream.partition('/')[2]}: not finite"] += 1
+                continue
+            self._track(stream.partition("/")[2]).pose(odometry.stamp, T @ odometry.matrix() @ invert(T))
+        messages: dict[str, Message] = {}
+        if wheels is not None:
+            messages |= self._passed(wheels)
+        if self._judge(context.stamp) or self._said != self._slipping:
+            messages["status"] = self._status(context.stamp)
+        return messages
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew, so nothing before it can be compared with."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {
+            "tracks": {name: track.snapshot() for name, track in self._tracks.items()},
+            "blind": sorted(self._blind),
+            "agreement": self._agreement.snapshot(),
+            "end": self._end,
+            "slipping": [self._slipping, self._said, self._slipped],
+            "readings": {name: [since, reading] for name, (since, reading) in self._readings.items()},
+            "hanging": sorted(self._hanging),
+            "counts": dict(self._counts),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        for name, track in state["tracks"].items():
+            self._track(name).restore(track)
+        self._blind = set(state["blind"])
+        self._agreement.restore(state["agreement"])
+        self._found = self._agreement.contradictions()
+        self._end = int(state["end"])
+        self._readings = {n: (int(since), np.array(r, np.float64)) for n, (since, r) in state["readings"].items()}
+        self._hanging = set(state["hanging"])
+        slipping, said, slipped = state["slipping"]
+        self._slipping, self._said, self._slipped = bool(slipping), bool(said), int(slipped)
+        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
+
+    def summary(self) -> Mapping[str, int]:
+        return dict(self._counts)
+
+    def _track(self, name: str) -> Track:
+        return self._tracks.setdefault(name, Track())
+
+    def _passed(self, wheels: Odometry) -> dict[str, Message]:
+        """The wheels' message if nothing contradicts it."""
+        if wheels.linear is None or wheels.angular is None:
+            return {"checked": wheels}
+        if not all(np.isfinite(part).all() for part in (wheels.position, wheels.linear, wheels.angular)):
+            self._counts["wheels: not finite"] += 1
+            self._counts["held back"] += 1
+            return {}
+        self._track(_WHEELS).twist(wheels.stamp, np.concatenate([wheels.linear, wheels.angular]))
+        self._follow(_WHEELS, wheels.stamp, np.concatenate([wheels.linear, wheels.angular]))
+        self._slipping = self._slips(wheels)
+        self._slipped = wheels.stamp if self._slipping else self._slipped
+        held = self._slipping or any(c.alone and c.sensor == _WHEELS for c in self._found)
+        self._counts["held back" if held else "passed on"] += 1
+        return {} if held else {"checked": wheels}
+
+    def _follow(self, name: str, stamp: int, reading: np.ndarray) -> None:
+        """Notices a sensor that gives the same reading over and over, unless it is that of rest."""
+        since, last = self._readings.get(name, (stamp, reading))
+        same = bool(np.array_equal(reading, last))
+        self._readings[name] = (since if same else stamp, reading)
+        hangs = same and stamp - since >= _HANGS and bool(reading.any())
+        (self._hanging.add if hangs else self._hanging.discard)(name)
+
+    def _slips(self, wheels: Odometry) -> bool:
+        """Tells whether two others that agree, or more, say that the robot moves at another speed than the wheels."""
+        assert wheels.linear is not None
+        own = float(wheels.linear[0])
+        others = []
+        for name, track in sorted(self._tracks.items()):
+            if name != _WHEELS and name not in self._blind:
+                velocity = track.newest(wheels.stamp, _NEWEST)
+                if velocity is not None:
+                    others.append(float(velocity[0]))
+        if len(others) < 2:
+            return False
+        allowed = self.slip + max(abs(v) for v in others) / 3
+        return max(others) - min(others) < self.slip and all(abs(v - own) > allowed for v in others)
+
+    def _judge(self, now: int) -> bool:
+        """Takes the next window if it is past; False where it is not."""
+        self._end = self._end or now + self.window
+        if now < self._end + _SLACK:
+            return False
+        windows = {}
+        for name, track in self._tracks.items():
+            motion = track.between(self._end - self.window, self._end)
+            if motion is not None and not (name == _WHEELS and self._slipped >= self._end - self.window):
+                blind = np.where(np.arange(6) < 3, np.nan, motion) if name in self._blind else motion
+                windows[name] = Window(blind, coarse=name == _WHEELS)
+        self._agreement.add(windows)
+        self._found = self._agreement.contradictions()
+        self._counts["windows"] += 1
+        self._counts["windows with a contradiction"] += bool(self._found)
+        self._end = max(self._end + self.window, now - _SLACK)
+        return True
+
+    def _status(self, stamp: int) -> Diagnostics:
+        self._said = self._slipping
+        texts = [contradiction.text() for contradiction in self._found]
+        if self._slipping:
+            texts.insert(0, "the wheels turn otherwise than the robot moves")
+        texts += [f"{name} repeats its last reading" for name in sorted(self._hanging)]
+        text = "; ".join(texts) or "motions agree"
+        return counted_status("motion_check", stamp, text, Level.WARN if texts else Level.OK, self._counts)

@@ -1,0 +1,39 @@
+"""Searches where a scan was taken: poses around a guess, by how well it lies on the planes of a map there."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.geometry.se3 import Matrix
+from operators.odometry.lidar.fit import agreements
+from operators.odometry.lidar.map import PlaneMap
+
+Array = NDArray[np.float64]
+
+STEP = 0.5  # metres between poses
+TURNS = 24  # headings, where none is known
+_SEARCHED = 120  # points that are looked at
+_WIDTH = 6.0  # standard deviations of the kernel
+
+
+def around(
+    points: Array, planes: PlaneMap, T: Matrix, reach: float, turns: int, noise: float
+) -> tuple[Array, Array]:  # fmt: skip
+    """Returns the poses (K, 4, 4) up to `reach` metres to each side of a guess, in `turns` headings, best first.
+
+    With them come their scores (K,): points (of about 120) that lie on planes, a little less far from the guess.
+    """
+    steps = np.arange(-int(reach / STEP), int(reach / STEP) + 1) * STEP
+    headings = np.arange(turns) * (2 * np.pi / turns)
+    x, y, turn = (grid.ravel() for grid in np.meshgrid(steps, steps, headings, indexing="ij"))
+    poses = np.tile(np.eye(4), (len(x), 1, 1))
+    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(turn)
+    poses[:, 1, 0] = np.sin(turn)
+    poses[:, 0, 1] = -poses[:, 1, 0]
+    poses[:, 0, 3], poses[:, 1, 3] = x, y
+    poses = T @ poses
+    chosen = points[:: max(1, len(points) // _SEARCHED)]
+    scores = agreements(chosen, planes, poses, noise, _WIDTH) - 1e-3 * (np.abs(x) + np.abs(y))
+    best = np.argsort(-scores, kind="stable")
+    return poses[best], scores[best]

@@ -1,0 +1,311 @@
+"""Says where a LiDAR is, scan by scan, in a map that it makes; and whether that is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import invert
+from operators.cloud.deskewing import deskewed
+from operators.geometry import se3
+from operators.geometry.se3 import Matrix, Vector
+from operators.odometry.lidar.fit import Fit, Prior, fit
+from operators.odometry.lidar.map import PlaneMap
+from operators.odometry.lidar.motion import LidarMotion, as_left, as_right, corrected
+from operators.odometry.lidar.scan import Scan, prepare
+from operators.odometry.lidar.search import TURNS, around
+
+FEWEST = 50  # points of a scan, and half as many in planes, that a pose may rest on
+_EPOCH = (1.0, 0.35)  # metres, radians: what the sensor moves until the map's new voxels count as younger
+_REACH = 3.0  # metres to each side that a search for the pose covers
+_STARTS, _LOST_STARTS = 3, 4  # of which a pose is fitted
+
+
+class State(StrEnum):
+    """Holds what the pose of a scan rests on."""
+
+    TRACKING = "tracking"  # this scan, or it begins the map
+    RELOCALISED = "relocalised"  # this scan, in the map found again after a loss
+    PREDICTED = "predicted"  # the motion so far
+    LOST = "lost"  # nothing for longer than the patience, or there is no map, or a new one begins
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """Lengths in metres, times in seconds."""
+
+    near: float
+    far: float
+    spacing: float | None
+    voxel: float
+    levels: int
+    noise: float
+    correlation: float
+    acceleration: float
+    angular_acceleration: float
+    start_speed: float
+    min_known: float
+    min_inliers: float
+    patience: float
+    give_up: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """The pose `T` (4, 4) of the sensor, covariance (6, 6) of its right perturbation, velocity (6,) in its axes.
+
+    `blind` (K, 6) are unit twists in the sensor's axes that the scan told nothing of. `velocity_covariance` is None
+    where the velocity was not measured. `points` (N, 3) are the scan's, thinned and deskewed, in the sensor's frame at
+    the stamp; None where the pose or the velocity was not measured.
+    """
+
+    state: State
+    reason: str
+    T: Matrix
+    covariance: Matrix
+    velocity: Vector
+    velocity_covariance: Matrix | None
+    blind: NDArray[np.float64]
+    counts: Mapping[str, int]
+    points: NDArray[np.float64] | None = None
+
+
+class LidarTracker:
+    """Fits every scan to a map of planes, starting from constant velocity, and adds it to the map.
+
+    Bad scans are bridged by the prediction; after `patience` the sensor is lost and looked for around where it was;
+    after `give_up` a new map begins at the last pose, and the covariance says how far that may be wrong.
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self._config = config
+        self._map = PlaneMap(config.voxel, config.levels)
+        self._motion: LidarMotion | None = None
+        self._spacing = config.spacing
+        self._epochs: list[Matrix] = []  # covariances, left perturbations: voxels' births index them
+        self._epoch_T = np.eye(4)
+        self._first: Scan | None = None  # put into the map as it was taken: to be put right when the velocity is known
+        self._pruned_at = np.zeros(3)
+        self._missed = 0  # scans since the last measured pose
+
+    def track(self, points: NDArray[np.float32], offsets: NDArray[np.float32] | None, stamp: int) -> Tracked:
+        """Takes a scan: points (N, 3) in the sensor's frame, when each was measured after the stamp, s, or None.
+
+        Raises ValueError for a stamp that is not later than the last.
+        """
+        if self._motion is not None and stamp <= self._motion.stamp:
+            raise ValueError(f"a scan at {stamp} does not come after the last pose, at {self._motion.stamp}")
+        near, far = self._config.near, self._config.far
+        scan, spacing = prepare(points, offsets, near, far, self._spacing)
+        if scan.count < FEWEST:
+            return self._unmeasured(scan, stamp, f"{scan.count} usable points")
+        self._spacing = spacing
+        if self._motion is None:
+            return self._begin(scan, stamp)
+        if self._motion.seconds(stamp) > self._patience + self._config.give_up:
+            return self._anew(scan, stamp)
+        lost = self._motion.seconds(stamp) > self._patience
+        starts = self._starts(scan, stamp, lost)
+        if self._first is not None and self._first.offsets is not None:
+            found = self._second(scan, stamp, starts)
+        else:
+            found = self._fitted(scan, stamp, starts)
+        reason = self._doubt(found, stamp, lost)
+        if reason:
+            return self._unmeasured(scan, stamp, reason)
+        return self._measured(scan, stamp, found, State.RELOCALISED if lost else State.TRACKING)
+
+    @property
+    def _patience(self) -> float:
+        """Seconds without a measured pose until the sensor is lost: any time where no scan was in vain."""
+        return self._config.patience if self._missed else float("inf")
+
+    def _begin(self, scan: Scan, stamp: int) -> Tracked:
+        self._motion = LidarMotion(stamp, np.eye(4), np.zeros(6), np.zeros((6, 6)))
+        self._first = scan
+        self._epochs = [np.zeros((6, 6))]
+        self._map.add(scan.points, 0)
+        return self._result(State.TRACKING, "the map begins here", scan, self._motion, np.zeros((6, 6)))
+
+    def _anew(self, scan: Scan, stamp: int) -> Tracked:
+        """Begins a new map where the sensor may be."""
+        assert self._motion is not None
+        T, covariance = self._blindly(stamp)
+        gone = self._motion.seconds(stamp)
+        self._motion, self._missed = LidarMotion(stamp, T, np.zeros(6), as_left(covariance, T)), 0
+        self._map = PlaneMap(self._config.voxel, self._config.levels)
+        self._first, self._epochs, self._epoch_T = scan, [self._motion.covariance], T
+        self._map.add(scan.points @ T[:3, :3].T + T[:3, 3], 0)
+        reason = f"nothing was measured for {gone:.1f} s: a new map begins here"
+        return self._result(State.LOST, reason, scan, self._motion, covariance)
+
+    def _starts(self, scan: Scan, stamp: int, lost: bool) -> list[Matrix]:
+        """Returns where to look: at the predicted pose, and around it where the velocity or the place is unknown."""
+        assert self._motion is not None
+        T = self._motion.predicted(stamp, self._patience)
+        if not lost and not self._motion.fresh:
+            return [T]
+        reach = _REACH
+        if not lost:
+            reach = min(reach, self._config.start_speed * self._motion.seconds(stamp))
+        turns = TURNS if lost else 1
+        best, _ = around(scan.points[scan.sample], self._map, T, reach, turns, self._config.noise)
+        return [T, *best[: _LOST_STARTS if lost else _STARTS]]
+
+    def _fitted(self, scan: Scan, stamp: int, starts: list[Matrix]) -> Fit:
+        """Returns the pose from the start that ends in the most agreement."""
+        motion = self._motion
+        assert motion is not None
+        config = self._config
+        spread = motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
+        certain = np.asarray(np.linalg.inv(spread), np.float64)
+
+        def velocity(T: Matrix) -> Vector:
+            return motion.sweep_velocity(T, stamp)
+
+        fits = [fit(scan, self._map, Prior(T, certain), velocity, config.noise) for T in starts]
+        return max(fits, key=lambda found: found.inliers * found.paired)
+
+    def _second(self, scan: Scan, stamp: int, starts: list[Matrix]) -> Fit:
+        """Returns the fit of the second scan, which shows by what velocity both are to be deskewed.
+
+        As they were taken, both are skewed alike, so the motion between them comes out nearly right.
+        """
+        motion, first = self._motion, self._first
+        assert motion is not None
+        assert first is not None
+        found = self._fitted(replace(scan, offsets=None), stamp, starts)
+        points = deskewed(first.points, first.offsets, motion.velocity_to(found.T, stamp))
+        self._map = PlaneMap(self._config.voxel, self._config.levels)
+        self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], 0)
+        return self._fitted(scan, stamp, [found.T])
+
+    def _doubt(self, found: Fit, stamp: int, lost: bool) -> str:
+        """Returns why a fit is not to be believed, or nothing."""
+        assert self._motion is not None
+        config = self._config
+        min_known = max(config.min_known, 0.5) if lost else config.min_known
+        min_inliers = max(config.min_inliers, 0.7) if lost else config.min_inliers
+        if found.known < min_known:
+            return f"{found.known:.0%} of the scan lie in places that the map knows"
+        if found.paired < FEWEST / 2:
+            return f"{found.paired} points lie on planes of the map"
+        if found.inliers < min_inliers:
+            return f"{found.inliers:.0%} of the points on planes agree with them"
+        if not lost:
+            off = se3.log(invert(self._motion.predicted(stamp, self._patience)) @ found.T)
+            spread = self._motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
+            if off @ np.linalg.solve(spread, off) > 50:
+                step, turn = np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:]))
+                return f"it would mean a jump of {step:.2f} m and {turn:.1f} degrees from the motion so far"
+        return ""
+
+    def _measured(self, scan: Scan, stamp: int, found: Fit, state: State) -> Tracked:
+        motion, config = self._motion, self._config
+        assert motion is not None
+        self._first, self._missed = None, 0
+        spread = motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
+        share = np.bincount(found.births, found.weights, len(self._epochs)) / found.weights.sum()
+        of_map = np.tensordot(share, np.array(self._epochs), 1)
+        information = found.information / config.correlation
+        covariance, own = corrected(found.T, information, spread, of_map, motion.covariance)
+        dt = motion.seconds(stamp)
+        if state is State.RELOCALISED:  # what was crossed unseen tells nothing of the velocity
+            self._motion = LidarMotion(stamp, found.T, np.zeros(6), covariance)
+            points = None
+        else:
+            velocity, sweep = motion.velocity_to(found.T, stamp), motion.sweep_velocity(found.T, stamp)
+            self._motion = LidarMotion(stamp, found.T, velocity, covariance, False, motion.stamp, motion.T)
+            points = deskewed(scan.points, scan.offsets, sweep)
+            self._grow(points)
+        reason = "; ".join(_told_nothing(twist) for twist in found.blind)
+        counts = {"points on planes": found.paired, "agreeing, %": round(100 * found.inliers)}
+        own_velocity = None if self._motion.fresh else 2 * own / dt**2
+        measured = self._result(
+            state, reason, scan, self._motion, as_right(covariance, found.T), own_velocity, found.blind, counts
+        )
+        return replace(measured, points=points)
+
+    def _grow(self, points: NDArray[np.float64]) -> None:
+        """Adds a scan's points (N, 3), seen from the pose just measured, to the map."""
+        motion = self._motion
+        assert motion is not None
+        moved = se3.log(invert(self._epoch_T) @ motion.T)
+        if np.linalg.norm(moved[:3]) > _EPOCH[0] or np.linalg.norm(moved[3:]) > _EPOCH[1]:
+            self._epochs.append(motion.covariance)
+            self._epoch_T = motion.T
+        self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], len(self._epochs) - 1)
+        if np.linalg.norm(motion.T[:3, 3] - self._pruned_at) > 0.1 * self._config.far:
+            self._pruned_at = motion.T[:3, 3].copy()
+            self._map.keep(self._pruned_at, 1.2 * self._config.far)
+
+    def _unmeasured(self, scan: Scan, stamp: int, reason: str) -> Tracked:
+        self._missed += 1
+        if self._motion is None:
+            nowhere = LidarMotion(stamp, np.eye(4), np.zeros(6), np.zeros((6, 6)))
+            return self._result(State.LOST, f"{reason}, and there is no map yet", scan, nowhere, np.zeros((6, 6)))
+        T, covariance = self._blindly(stamp)
+        lost = self._motion.seconds(stamp) > self._patience
+        velocity = np.zeros(6) if lost else self._motion.velocity
+        there = replace(self._motion, T=T, velocity=velocity)
+        return self._result(State.LOST if lost else State.PREDICTED, reason, scan, there, covariance)
+
+    def _blindly(self, stamp: int) -> tuple[Matrix, Matrix]:
+        """Returns the predicted pose and the covariance of its right perturbation."""
+        assert self._motion is not None
+        config = self._config
+        T = self._motion.predicted(stamp, self._patience)
+        spread = self._motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
+        return T, as_right(self._motion.covariance, T) + spread
+
+    def _result(
+        self, state: State, reason: str, scan: Scan, motion: LidarMotion, covariance: Matrix,
+        velocity_covariance: Matrix | None = None, blind: NDArray[np.float64] | None = None,
+        counts: Mapping[str, int] | None = None,
+    ) -> Tracked:  # fmt: skip
+        own = {"points": scan.count, "points left out": scan.unusable, "voxels": len(self._map)}
+        none = np.zeros((0, 6))
+        return Tracked(
+            state, reason, motion.T, covariance, motion.velocity, velocity_covariance,
+            none if blind is None else blind, own | dict(counts or {}),
+        )  # fmt: skip
+
+    def snapshot(self) -> dict[str, Any]:
+        """Returns all that the next scan depends on, as numbers, arrays, lists and mappings."""
+        motion, first = self._motion, self._first
+        return {
+            "motion": None if motion is None else {name: getattr(motion, name) for name in _MOTION},
+            "first": None if first is None else {name: getattr(first, name) for name in _SCAN},
+            "map": self._map.snapshot(),
+            "spacing": self._spacing,
+            "epochs": np.array(self._epochs).reshape(-1, 6, 6),
+            "epoch_T": self._epoch_T,
+            "pruned_at": self._pruned_at,
+            "missed": self._missed,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Takes what `snapshot` of a tracker with the same configuration gave."""
+        self._motion = None if state["motion"] is None else LidarMotion(**state["motion"])
+        self._first = None if state["first"] is None else Scan(**state["first"])
+        self._map = PlaneMap(self._config.voxel, self._config.levels)
+        self._map.restore(state["map"])
+        self._spacing = state["spacing"]
+        self._epochs = list(np.array(state["epochs"]))
+        self._missed = state["missed"]
+        self._epoch_T, self._pruned_at = np.array(state["epoch_T"]), np.array(state["pruned_at"])
+
+
+_MOTION = ("stamp", "T", "velocity", "covariance", "fresh", "before_stamp", "before_T")
+_SCAN = ("points", "offsets", "sample", "unusable")
+
+
+def _told_nothing(twist: Vector) -> str:
+    axis = twist[:3] if twist[:3].any() else twist[3:]
+    x, y, z = (0.0 if abs(c) < 5e-3 else c for c in axis * np.sign(axis[np.argmax(np.abs(axis))]))
+    return f"nothing tells of {'motion along' if twist[:3].any() else 'turning about'} ({x:.2f}, {y:.2f}, {z:.2f})"

@@ -1,0 +1,1 @@
+"""Odometry of single cameras, with an unknown or a measured scale."""

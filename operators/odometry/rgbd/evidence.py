@@ -1,0 +1,125 @@
+"""Evidence for a pose: the shape and the brightness of all that the view and the map both see."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import transform_points
+from operators.geometry.pinhole import Points, project
+from operators.geometry.se3 import Matrix
+from operators.odometry.features import Gray
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.frame import Frame
+from operators.odometry.rgbd.keyframe import Keyframe
+from operators.odometry.rgbd.surface import DepthNoise
+
+STRIDE = 2  # patches of the view's surface between points that are compared
+NEAR, NEAR_PER_SQUARE = 0.03, 0.01  # metres by which depths may differ, and so much more by the square of the depth;
+# where depth is noisier than that, by its standard deviation
+FEWEST = 300  # points that a view must have in common with the map
+OVERLAP, AGREEMENT, LIKENESS = 0.3, 0.5, 0.45  # the least of a view that is recognised (see the benchmark)
+TOGETHER = 1.25  # the least of agreement and likeness in sum
+USUAL_NOISE = DepthNoise()
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Likeness of a view and the map where a pose lays the one on the other.
+
+    `overlap` is the share of the view that the map saw, of which `agreement` lies on the map's surfaces, at so many
+    `points`; `likeness` is the correlation of brightness there.
+    """
+
+    points: int
+    overlap: float
+    agreement: float
+    likeness: float
+
+    @property
+    def certain(self) -> bool:
+        """Tells whether the view is that of this place: what only looks like it differs in shape or in pattern."""
+        return (
+            self.points >= FEWEST
+            and self.overlap >= OVERLAP
+            and self.agreement >= AGREEMENT
+            and self.likeness >= LIKENESS
+            and self.agreement + self.likeness >= TOGETHER
+        )
+
+
+def seeing(points: Points, T_world_camera: Matrix, keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
+    """Returns the keyframes that saw most of a view's points (N, 3), the most last."""
+    seen = [int(np.count_nonzero(_compared(points, T_world_camera, k)[2])) for k in keyframes]
+    order = np.argsort(seen, kind="stable")[-count:]
+    return [keyframes[i] for i in order.tolist() if seen[i]]
+
+
+def gathered(
+    frame: Frame,
+    T_world_camera: Matrix,
+    keyframes: Sequence[Keyframe],
+    camera: RgbdCamera,
+    noise: DepthNoise = USUAL_NOISE,
+) -> Evidence:
+    """Compares a frame at a pose with keyframes, by the colour camera of whose images K_color is."""
+    slack = max(NEAR_PER_SQUARE, noise.quadratic)
+    points = frame.surface.points(STRIDE)
+    here = _sampled(_levelled(frame.gray), points, camera)
+    met, same, pairs = 0, 0, [np.zeros((0, 2))]
+    for keyframe in keyframes:
+        moved, on, known = _compared(points, T_world_camera, keyframe, slack)
+        met += int(np.count_nonzero(known))
+        same += int(np.count_nonzero(on))
+        there = _sampled(_levelled(keyframe.gray), moved[on], camera)
+        pairs.append(np.column_stack([here[on], there]))
+    both = np.concatenate(pairs)
+    both = both[np.isfinite(both).all(axis=1)]
+    overlap = met / max(len(points) * len(keyframes), 1)
+    return Evidence(len(both), overlap, same / max(met, 1), _correlation(both))
+
+
+def _correlation(pairs: NDArray[np.float64]) -> float:
+    """Returns the correlation of pairs (N, 2); 0 where there is none."""
+    if len(pairs) < 3 or not (pairs.std(axis=0) > 1e-6).all():
+        return 0.0
+    return float(np.asarray(np.corrcoef(pairs.T))[0, 1])
+
+
+def _compared(
+    points: Points, T_world_camera: Matrix, keyframe: Keyframe, slack: float = NEAR_PER_SQUARE
+) -> tuple[Points, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Returns points (N, 3) in a keyframe's camera, which lie on its surface, and which are where it has one."""
+    moved = transform_points(keyframe.T_camera_world @ T_world_camera, points)
+    h, w = keyframe.surface.inverse_depth.shape
+    z = moved[:, 2]
+    ahead = z > 0.1
+    u, v = np.rint(project(np.where(ahead[:, None], moved, 1.0), keyframe.surface.K)).astype(np.int64).T
+    inside = ahead & (u >= 0) & (v >= 0) & (u < w) & (v < h)
+    inverse = keyframe.surface.inverse_depth[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
+    known = inside & (inverse > 0)
+    off = np.abs(1.0 / np.where(known, inverse, 1.0) - z)
+    return moved, known & (off < NEAR + slack * z * z), known
+
+
+def _levelled(gray: Gray) -> NDArray[np.float32]:
+    """Returns an image without its noise and without its slow changes, whose contrast is 1 wherever there is some."""
+    image = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.5)
+    side = max(gray.shape[1] // 10, 3) | 1
+    mean = cv2.blur(image, (side, side))
+    spread = cv2.sqrt(np.maximum(cv2.blur(image * image, (side, side)) - mean * mean, 0.0))
+    return np.asarray((image - mean) / (spread + np.float32(5.0)), np.float32)
+
+
+def _sampled(image: NDArray[np.float32], points: Points, camera: RgbdCamera) -> NDArray[np.float64]:
+    """Returns what an image has where points (N, 3) of the depth camera are; NaN beside it."""
+    if not len(points):
+        return np.zeros(0)
+    h, w = image.shape
+    uv = project(transform_points(camera.T_color_depth, points), camera.K_color).astype(np.float32)
+    x, y = (np.ascontiguousarray(part)[:, None] for part in uv.T)
+    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR).ravel()
+    inside = (uv >= 0).all(axis=1) & (uv[:, 0] <= w - 1) & (uv[:, 1] <= h - 1)
+    return np.where(inside, sampled, np.nan).astype(np.float64)

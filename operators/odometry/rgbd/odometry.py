@@ -1,0 +1,139 @@
+"""RGB-D visual odometry as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Odometry, Transforms
+from dataflow.messages.geometry import invert
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.geometry.calibration import check_calibration
+from operators.geometry.extrinsics import transform_between
+from operators.odometry.emission import outputs
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.memory import from_plain, to_plain
+from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.surface import DepthNoise
+from operators.odometry.rgbd.tracker import RgbdOdometry, State
+
+Calibration = tuple[CameraInfo, CameraInfo, Transforms | None]
+
+
+def camera_of(image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdCamera:
+    """Returns the camera that calibrations describe. Raises ValueError where they describe none."""
+    T_image_depth = transform_between(extrinsics, depth_info.frame, image_info.frame)
+    return RgbdCamera(image_info.K, depth_info.K, invert(T_image_depth))
+
+
+def same(known: Calibration | None, given: Calibration) -> bool:
+    """Tells whether these are the very messages that are known, so that nothing has to be compared."""
+    return known is not None and all(a is b for a, b in zip(known, given, strict=True))
+
+
+class VisualOdometry(Operator):
+    """Tracks an RGB-D camera by its features and its depth; the first frame's depth camera is the origin.
+
+    The pose is that of the depth camera's optical frame, at every frame, also while nothing can be measured:
+    then it follows the motion so far and its covariance grows. `status` says at every frame what the pose rests on:
+    tracking, relocalised, predicted or lost, and why. A lost camera looks for its view among the keyframes; where it
+    sees something that is not among them for longer than `patience`, it begins a new map at the predicted pose, and
+    joins it to the old one when that is seen again. An image that is black or repeats the last one is not used. The
+    images need not be registered, but must be free of lens distortion. Without `extrinsics` the two cameras are
+    taken to coincide.
+
+    Methods: corners, Shi and Tomasi, "Good features to track", 1994; RANSAC PnP; point-to-plane alignment to the
+    surfaces of keyframes, Newcombe et al., "KinectFusion", 2011; views found again by SIFT, Lowe, 2004.
+    """
+
+    image: In[Image] = In(doc="colour or grey, of the same stamp")
+    depth: In[DepthImage] = In(doc="depth, metres")
+    image_info: Sampled[CameraInfo] = Sampled(doc="calibration of the colour camera")
+    depth_info: Sampled[CameraInfo] = Sampled(doc="calibration of the depth camera")
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the transform between the two cameras' frames, in either direction"
+    )
+    odometry: Out[Odometry] = Out(doc="the depth camera in the odometry frame, with covariance and velocity")
+    status: Out[Diagnostics] = Out(doc="tracking, relocalised, predicted or lost, with the reason; at every frame")
+
+    odometry_frame: str = Param("odom", min_length=1, doc="name of the frame that the first depth camera defines")
+    near: float = Param(0.3, gt=0, doc="smaller depths are no return", unit="m")
+    far: float = Param(6.0, gt=0, doc="larger depths are no return", unit="m")
+    depth_noise_floor: float = Param(0.002, gt=0, doc="standard deviation of a near depth", unit="m")
+    depth_noise_quadratic: float = Param(0.002, ge=0, doc="and what it grows by per depth squared", unit="1/m")
+    corners: int = Param(300, ge=30, doc="most corners tracked from a keyframe")
+    min_inliers: int = Param(15, ge=6, doc="fewest agreeing corners that a pose may rest on")
+    refine: bool = Param(True, doc="refine with the depth image; off leaves the features alone")
+    keyframe_distance: float = Param(
+        0.1, gt=0, doc="change of view that makes a new keyframe: angle plus baseline over depth", unit="rad"
+    )
+    keyframes: int = Param(30, ge=1, doc="keyframes remembered")
+    patience: float = Param(0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s")
+    give_up: float = Param(2.0, ge=0, doc="time in a new map until it counts as tracking although apart", unit="s")
+
+    _tracker: RgbdOdometry | None = None
+    _calibration: Calibration | None = None
+    _restored: State | None = None
+
+    def setup(self) -> None:
+        self._frames: Counter[str] = Counter()
+
+    def process(
+        self,
+        image: Image,
+        depth: DepthImage,
+        image_info: CameraInfo,
+        depth_info: CameraInfo,
+        extrinsics: Transforms | None = None,
+    ) -> dict[str, Any]:
+        """Raises ValueError where an image does not fit its calibration, that changes, or no transform fits."""
+        check_calibration("image", image, image_info)
+        check_calibration("depth", depth, depth_info)
+        result = self._tracking(image_info, depth_info, extrinsics).track(image.data, depth.data, depth.stamp)
+        self._frames[result.status.value] += 1
+        return outputs(result, self.odometry_frame, depth.frame)
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew, so nothing before it can be compared with."""
+        self._tracker = self._calibration = self._restored = None
+
+    def snapshot(self) -> Mapping[str, Any]:
+        """The motion and the keyframes."""
+        state = self._restored if self._tracker is None else self._tracker.snapshot()
+        return {} if state is None else to_plain(state) | {"frames": dict(self._frames)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Taken up with the first frame, which brings the calibration."""
+        self._restored = from_plain(state) if state else None
+        self._frames = Counter({status: int(count) for status, count in state.get("frames", {}).items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        """Returns the number of frames of each status."""
+        return dict(self._frames)
+
+    def _tracking(self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdOdometry:
+        """The tracker, made for the first calibration, which later ones must repeat."""
+        if self._tracker is None:
+            self._tracker = RgbdOdometry(camera_of(image_info, depth_info, extrinsics), self._config())
+            if self._restored is not None:
+                self._tracker.restore(self._restored)
+                self._restored = None
+        elif not same(self._calibration, (image_info, depth_info, extrinsics)):
+            self._tracker.camera.check_same(camera_of(image_info, depth_info, extrinsics))
+        self._calibration = (image_info, depth_info, extrinsics)
+        return self._tracker
+
+    def _config(self) -> RgbdOdometryConfig:
+        return RgbdOdometryConfig(
+            near=self.near,
+            far=self.far,
+            depth_noise=DepthNoise(self.depth_noise_floor, self.depth_noise_quadratic),
+            corners=self.corners,
+            min_inliers=self.min_inliers,
+            refine=self.refine,
+            keyframe_distance=self.keyframe_distance,
+            keyframes=self.keyframes,
+            patience_s=self.patience,
+            give_up_s=self.give_up,
+        )

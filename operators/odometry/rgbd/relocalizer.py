@@ -1,0 +1,191 @@
+"""Finds a lost camera's view among remembered keyframes.
+
+Where depth is seen, points of several keyframes are paired with those of the view, and the motion on which most agree
+is refined and judged by all that both see. Without depth, the pixels of one keyframe's points give the pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import transform_points
+from operators.geometry.pinhole import Pixels, Points, project, unproject
+from operators.geometry.se3 import Matrix
+from operators.odometry.consensus import consensus
+from operators.odometry.features import Gray
+from operators.odometry.motion import Motion
+from operators.odometry.recognition import Description, describe, match, match_of_size
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.evidence import gathered, seeing
+from operators.odometry.rgbd.fitting import Fit, Fitter, Sighting
+from operators.odometry.rgbd.frame import Frame
+from operators.odometry.rgbd.keyframe import Keyframe, view_distance
+from operators.odometry.rgbd.local_map import LocalMap
+from operators.odometry.rgbd.surface import DepthNoise, Surface
+
+PAIRS = 60  # features of one keyframe that are paired
+FEWEST = 8  # different features of a view that must agree on its pose for a look at what else supports it
+VIEWS = 2  # keyframes that a recognised view is compared with
+TYPICAL_DEPTH = 2.0  # metres
+SPARSE = 4  # patches of the view's surface between points by which these are chosen
+FEWEST_PIXELS = 7  # features that a pose may be solved from without depth
+RECALL_PIXELS = 3.0  # working pixels by which such a feature may be off
+RECALL_NEAR, RECALL_OTHERS = 3, 5  # keyframes, near the prediction and elsewhere, that a lost view is compared with
+RECALL_EVERY = 3  # frames, while a new map is tracked for longer than
+RECALL_ALWAYS_S = 1.0  # seconds, for which every frame is tried
+
+
+@dataclass(frozen=True, eq=False)
+class Recall:
+    """World points (N, 3) of a keyframe and where the view sees them (N, 2); wrong pairs are among them."""
+
+    keyframe: Keyframe
+    points_world: Points
+    pixels: Pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Features with depth: pixels (N, 2), points (N, 3) in the depth camera, sizes (N,) in metres, descriptors."""
+
+    pixels: Pixels
+    points: Points
+    sizes: NDArray[np.float64]
+    descriptors: NDArray[np.uint8]
+
+    @staticmethod
+    def of(description: Description, surface: Surface, camera: RgbdCamera) -> Landmarks:
+        points, known = lifted(description.pixels, surface, camera)
+        sizes = description.sizes[known] * points[known, 2]
+        return Landmarks(description.pixels[known], points[known], sizes, description.descriptors[known])
+
+
+def recognised(
+    frame: Frame, chosen: Sequence[Keyframe], fitter: Fitter, motion: Motion, T_predicted: Matrix, known: LocalMap
+) -> Iterator[tuple[Fit, Keyframe]]:
+    """Yields a frame's poses among chosen keyframes, refined and certain, each with the keyframe that shows most."""
+    if frame.depth_flaw is not None:
+        yield from _by_pixels(frame, chosen, fitter, motion, T_predicted, known)
+        return
+    seen = Landmarks.of(describe(frame.gray), frame.surface, fitter.camera)
+    for segment in sorted({k.segment for k in chosen}):
+        keyframes = [k for k in chosen if k.segment == segment]
+        sighting = common(seen, keyframes, fitter.camera)
+        if sighting is None:
+            continue
+        there = [k for k in known.keyframes if k.segment == segment]
+        views = seeing(frame.surface.points(SPARSE), sighting.T_world_camera, there, VIEWS)
+        if not views:
+            continue
+        compared = LocalMap(VIEWS)
+        compared.keyframes = views
+        fit = fitter.refine(frame, sighting, motion, T_predicted, compared, segment)
+        view = believed(frame, fit.T_world_camera, there, fitter.camera, fitter.config.depth_noise)
+        if view is not None:
+            yield fit, view
+
+
+def believed(
+    frame: Frame, T_world_camera: Matrix, keyframes: Sequence[Keyframe], camera: RgbdCamera, noise: DepthNoise
+) -> Keyframe | None:
+    """Returns the keyframe that sees most of a view, if shape and brightness make sure of its pose; else nothing."""
+    views = seeing(frame.surface.points(SPARSE), T_world_camera, keyframes, VIEWS)
+    return views[-1] if views and gathered(frame, T_world_camera, views, camera, noise).certain else None
+
+
+def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> Sighting | None:
+    """Returns the pose in which most of a view's features lie where keyframes of one segment have them."""
+    known, names = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
+    for keyframe in keyframes:
+        landmarks = Landmarks.of(keyframe.description, keyframe.surface, camera)
+        pairs = match_of_size(landmarks.descriptors, seen.descriptors, landmarks.sizes, seen.sizes, PAIRS)
+        known.append(transform_points(keyframe.T_world_camera, landmarks.points[pairs[:, 0]]))
+        names.append(pairs[:, 1])
+    points, which = np.concatenate(known), np.concatenate(names)
+    found = consensus(points, seen.points[which], which)
+    if found is None or found.count < FEWEST:
+        return None
+    pixels, ages = seen.pixels[which[found.agree]], np.zeros(np.count_nonzero(found.agree), np.int64)
+    return Sighting(found.T_a_b, points[found.agree], pixels, ages, len(points), recognised=True)
+
+
+def _by_pixels(
+    frame: Frame, chosen: Sequence[Keyframe], fitter: Fitter, motion: Motion, T_predicted: Matrix, known: LocalMap
+) -> Iterator[tuple[Fit, Keyframe]]:
+    """Does as `recognised` where the view has no depth: by what it has in common with one keyframe."""
+    few, many = FEWEST_PIXELS, fitter.config.min_inliers
+    for recall in recalls(frame.gray, chosen, fitter.camera, few):
+        ages = np.zeros(len(recall.pixels), np.int64)
+        sighting = fitter.solve(recall.points_world, recall.pixels, ages, RECALL_PIXELS, few)
+        if sighting is None:
+            continue
+        sighting = replace(sighting, recognised=True)
+        fit = fitter.refine(frame, sighting, motion, T_predicted, known, recall.keyframe.segment)
+        if fit.inliers >= many:
+            yield fit, recall.keyframe
+
+
+def recalls(gray: Gray, keyframes: Sequence[Keyframe], camera: RgbdCamera, fewest: int) -> list[Recall]:
+    """Returns what keyframes have in common with a view, the most first; only those with enough pairs."""
+    seen = describe(gray)
+    found = []
+    for keyframe in keyframes:
+        pairs = match(keyframe.description, seen)
+        if len(pairs) < fewest:
+            continue
+        points, known = rough_points(keyframe, pairs[:, 0], camera)
+        if np.count_nonzero(known) >= fewest:
+            points_world = transform_points(keyframe.T_world_camera, points[known])
+            found.append(Recall(keyframe, points_world, seen.pixels[pairs[known, 1]]))
+    return sorted(found, key=lambda recall: -len(recall.pixels))
+
+
+def recall_due(stamp: int, apart_since: int | None, recalls: int) -> bool:
+    """Returns whether a new map that is tracked, begun at a stamp and searched for so often, is searched for now."""
+    return apart_since is not None and (stamp - apart_since < RECALL_ALWAYS_S * 1e9 or recalls % RECALL_EVERY == 0)
+
+
+class Posed(Protocol):
+    """Stands for anything with a pose."""
+
+    @property
+    def T_world_camera(self) -> Matrix: ...
+
+
+K = TypeVar("K", bound=Posed)
+
+
+def candidates(
+    keyframes: Sequence[K], T_predicted: Matrix, near: int, others: int, turn: int, depth: float = TYPICAL_DEPTH
+) -> list[K]:
+    """Returns those nearest to a predicted view of a scene at a depth and, in turns, others: all in a few frames."""
+    ranked = sorted(keyframes, key=lambda k: view_distance(k.T_world_camera, T_predicted, depth))
+    rest = ranked[near:]
+    take = min(others, len(rest))
+    return [*ranked[:near], *(rest[(turn * take + i) % len(rest)] for i in range(take))]
+
+
+def rough_points(keyframe: Keyframe, chosen: NDArray[np.int64], camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:
+    """Returns points (N, 3) of described pixels, and which are known: many lie on edges, where either depth may do."""
+    return lifted(keyframe.description.pixels[chosen], keyframe.surface, camera)
+
+
+def lifted(pixels: Pixels, surface: Surface, camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:
+    """Returns the points (N, 3) of a surface that colour pixels (N, 2) see, depth camera, and which are known."""
+    inverse, (h, w) = surface.inverse_depth, surface.inverse_depth.shape
+    rays = unproject(pixels, camera.K_color) @ camera.T_depth_color[:3, :3].T
+    origin = camera.T_depth_color[:3, 3]
+    points, known = origin + 2.0 * rays, np.zeros(len(rays), np.bool_)
+    for _ in range(3):
+        u, v = np.rint(project(points, surface.K)).astype(np.int64).T
+        inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
+        seen = inverse[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
+        known = inside & (seen > 0)
+        z = np.where(known, 1.0 / np.where(known, seen, 1.0), points[:, 2]) - origin[2]
+        points = origin + rays * (z / rays[:, 2])[:, None]
+    return points, known

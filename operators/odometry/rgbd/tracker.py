@@ -1,0 +1,341 @@
+"""RGB-D visual odometry: features of a keyframe give the pose, the depth image refines it.
+
+Corners of a keyframe are tracked into each frame and solved by RANSAC PnP; the pose is then refined over
+reprojections and point-to-plane distances to the surfaces of nearby keyframes, with a motion prior for what
+neither determines. A corner keeps its point from keyframe to keyframe for as long as it agrees, so what moves
+slowly disagrees in the end; what moves fast stands in front of the map, and is left out of the refinement. Where
+corners agree on two motions, the larger surface stands still.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import invert, transform_points
+from operators.geometry.pinhole import project
+from operators.geometry.se3 import Matrix, Vector
+from operators.monitoring.image_flaws import Watch
+from operators.odometry.motion import Motion
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.corners import Corners, Layer, renewed, with_new
+from operators.odometry.rgbd.drift import carried
+from operators.odometry.rgbd.fitting import Fit, Fitter, Sighting
+from operators.odometry.rgbd.following import followed
+from operators.odometry.rgbd.frame import Frame, observe
+from operators.odometry.rgbd.keyframe import Keyframe, view_distance
+from operators.odometry.rgbd.local_map import LocalMap
+from operators.odometry.rgbd.movers import Movers
+from operators.odometry.rgbd.noise import Noise
+from operators.odometry.rgbd.relocalizer import (
+    RECALL_NEAR,
+    RECALL_OTHERS,
+    believed,
+    candidates,
+    recall_due,
+    recognised,
+)
+from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.tracking import Status, TrackResult, moved_covariance
+
+TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Holds what an odometry remembers between frames."""
+
+    motion: Motion | None
+    covariance: Matrix
+    keyframes: tuple[Keyframe, ...]
+    shapes: tuple[tuple[int, ...], tuple[int, ...]] | None
+    noise: Noise = field(default_factory=Noise)
+    watch: Watch = field(default_factory=Watch)
+    recalls: int = 0  # frames that the map was searched for since the last loss
+    apart_since: int | None = None  # stamp at which the newest segment began, while its place is unknown
+
+
+class RgbdOdometry:
+    """Tracks one camera. Deterministic: the same frames give the same bytes, in every process."""
+
+    def __init__(self, camera: RgbdCamera, config: RgbdOdometryConfig | None = None) -> None:
+        self.camera = camera
+        self.config = config or RgbdOdometryConfig()
+        self._working = camera  # with K_color of the reduced image
+        self._map = LocalMap(self.config.keyframes)
+        self._motion: Motion | None = None
+        self._covariance = np.zeros((6, 6))
+        self._shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+        self._noise = Noise()
+        self._watch = Watch()
+        self._recalls = 0
+        self._apart_since: int | None = None
+
+    def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> TrackResult:
+        """Returns the pose of the next frame: (H, W) or (H, W, 3) RGB uint8, (H', W') float32 metres, nanoseconds.
+
+        Raises ValueError for a wrong shape or type, a size that changed, or a stamp that does not increase.
+        """
+        self._check(image, depth, stamp)
+        # 1. Reduce the images to what the rest works on, and see what is wrong with them.
+        frame = observe(image, depth, stamp, self.camera.K_color, self.camera.K_depth, self.config, self._watch)
+        self._watch = frame.watch
+        self._working = replace(self.camera, K_color=frame.K_color)
+        if self._motion is None or self._map.newest.empty:
+            return self._start(frame)
+        # 2. Predict the pose from the motion so far.
+        T_predicted = self._motion.predict(stamp, self.config.decay_s)
+        # 3. Track the keyframe's corners and solve for the pose.
+        sighting = self._follow(frame, T_predicted)
+        # 4. Refine with the depth image, against the surfaces of nearby keyframes.
+        fit = self._refine(frame, sighting, T_predicted, self._map.newest)
+        # 5. Failing that, or in a new map, recognise the view by its descriptors.
+        measured = self._measured(frame, fit)
+        recalled = self._recall(frame, T_predicted, measured=measured)
+        # 6. Decide what the pose rests on, and remember it.
+        if recalled is not None:
+            return self._relocalised(frame, fit if measured else None, *recalled)
+        return self._followed(frame, fit) if measured else self._guessed(frame, fit)
+
+    # -- the steps ---------------------------------------------------------------------------------------
+
+    def _start(self, frame: Frame) -> TrackResult:
+        """Begins the map with a frame, or waits for one that shows anything."""
+        if self._motion is None:
+            self._motion = Motion(frame.stamp, np.eye(4), np.zeros(6))
+        else:
+            spread = self._motion.spread(frame.stamp, self.config.acceleration, self.config.angular_acceleration)
+            self._covariance = self._covariance + spread
+            self._motion = self._motion.guessed(frame.stamp, self._motion.T_world_camera)
+            self._map.keyframes.clear()
+        keyframe = self._keyframe(frame, None)
+        self._map.add(keyframe)
+        if keyframe.empty:
+            return self._result(Status.LOST, f"nothing seen yet: {frame.flaws}", None, keyframe=False)
+        self._motion = Motion(frame.stamp, self._motion.T_world_camera, np.zeros(6))
+        return self._result(Status.TRACKING, "the first view", None, keyframe=True)
+
+    def _follow(self, frame: Frame, T_predicted: Matrix) -> Sighting | None:
+        """Tracks the newest keyframe's corners from where the prediction puts them."""
+        keyframe = self._map.newest
+        if frame.image_flaw is not None or len(keyframe.points) < self.config.min_inliers:
+            return None
+        T_color_world = self.camera.T_color_depth @ invert(T_predicted)
+        guess = project(transform_points(T_color_world, keyframe.points_world), self._working.K_color)
+        return followed(frame.gray, keyframe, guess, self._fitter)
+
+    @property
+    def _fitter(self) -> Fitter:
+        return Fitter(self._working, self.config, self._noise)
+
+    def _refine(self, frame: Frame, sighting: Sighting | None, T_predicted: Matrix, known: Keyframe) -> Fit:
+        """Refines a pose against the surfaces of a keyframe's segment."""
+        assert self._motion is not None
+        return self._fitter.refine(frame, sighting, self._motion, T_predicted, self._map, known.segment)
+
+    def _measured(self, frame: Frame, fit: Fit) -> bool:
+        """Returns whether a fit counts: after a gap, when it may be at a place that looks alike, with more evidence."""
+        assert self._motion is not None
+        gap = self._motion.blind_s + (frame.stamp - self._motion.stamp) * 1e-9 > self.config.patience_s
+        if gap and frame.image_flaw is None and frame.depth_flaw is None:
+            there = [k for k in self._map.keyframes if k.segment == self._map.newest.segment]
+            return believed(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise) is not None
+        return fit.inliers >= self.config.min_inliers or (fit.depth_agrees and fit.weakest_sigma < 0.05)
+
+    def _recall(self, frame: Frame, T_predicted: Matrix, *, measured: bool) -> tuple[Fit, Keyframe] | None:
+        """Looks for the view in the map: always while nothing is measured, now and then in a new map."""
+        assert self._motion is not None
+        if measured and self._apart_since is None:
+            self._recalls = 0
+            return None
+        self._recalls += 1
+        waits = measured and not recall_due(frame.stamp, self._apart_since, self._recalls)
+        if frame.image_flaw is not None or waits:
+            return None
+        others = self._map.elsewhere if measured else self._map.keyframes
+        chosen = candidates(others, T_predicted, RECALL_NEAR, RECALL_OTHERS, self._recalls)
+        for found, known in recognised(frame, chosen, self._fitter, self._motion, T_predicted, self._map):
+            here = known.segment == self._map.newest.segment
+            if not here or self._plausible(frame.stamp, found.T_world_camera, T_predicted):
+                return found, known
+        return None
+
+    def _followed(self, frame: Frame, fit: Fit) -> TrackResult:
+        """Takes up a pose that was measured against the newest keyframes."""
+        assert self._motion is not None
+        T, newest = fit.T_world_camera, self._map.newest
+        status = Status.RELOCALISED if self._motion.blind_s > self.config.patience_s else Status.TRACKING
+        self._motion = self._motion.measured(frame.stamp, T)
+        self._noise = fit.noise
+        covariance, sunk = carried(newest, T)
+        self._covariance = covariance + fit.covariance
+        keyframe = self._new_keyframe(frame, fit, sunk)
+        return self._placed(status, _support(frame, fit), fit, keyframe)
+
+    def _relocalised(self, frame: Frame, tracked: Fit | None, found: Fit, known: Keyframe) -> TrackResult:
+        """Takes up a pose that was found among older keyframes, and a new map that is `tracked` meanwhile with it."""
+        assert self._motion is not None
+        T = found.T_world_camera
+        if known.segment != self._map.newest.segment:
+            if tracked is not None:
+                self._map.join(known, T @ invert(tracked.T_world_camera))
+            else:
+                self._map.drop_newest_segment()
+            self._apart_since = None
+        self._recalls = 0
+        self._motion = Motion(frame.stamp, T, np.zeros(6))
+        covariance, sunk = carried(known, T)
+        self._covariance = covariance + found.covariance
+        keyframe = self._new_keyframe(frame, found, sunk)
+        return self._placed(Status.RELOCALISED, f"the map found again by {found.inliers} features", found, keyframe)
+
+    def _guessed(self, frame: Frame, fit: Fit) -> TrackResult:
+        """Goes on by the motion so far, and begins a new map where the old one stays out of sight."""
+        assert self._motion is not None
+        before, config = self._motion, self.config
+        # Depth that fits still holds the directions that it measures; the prediction fills in the others.
+        T = fit.T_world_camera if fit.depth_agrees else before.predict(frame.stamp, config.decay_s)
+        self._motion = before.guessed(frame.stamp, T)
+        spread = before.spread(frame.stamp, config.acceleration, config.angular_acceleration)
+        self._covariance = moved_covariance(self._covariance, before.T_world_camera, T) + spread
+        reason = frame.flaws or f"{fit.inliers} corners agree, and depth does not determine the pose"
+        if self._motion.blind_s <= config.patience_s:
+            return self._result(Status.PREDICTED, reason, fit, keyframe=False)
+        if frame.image_flaw is None:
+            fresh = self._keyframe(frame, None)
+            if len(fresh.points) >= 2 * config.min_inliers:
+                self._map.add(replace(fresh, segment=self._map.newest.segment + 1))
+                self._apart_since = frame.stamp
+                self._motion = Motion(frame.stamp, T, np.zeros(6))
+                return self._result(Status.LOST, "nothing here is in the map: a new one begins", fit, keyframe=True)
+        return self._result(Status.LOST, reason, fit, keyframe=False)
+
+    # -- keyframes ---------------------------------------------------------------------------------------
+
+    def _new_keyframe(self, frame: Frame, fit: Fit, sunk: Vector) -> bool:
+        """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest."""
+        newest, surface = self._map.newest, fit.movers.left_out_of(frame.surface)
+        baseline = view_distance(newest.T_world_camera, fit.T_world_camera, surface.typical_depth)
+        moved = baseline > self.config.keyframe_distance or (fit.compared > 0 and fit.compared < 0.5 * fit.offered)
+        starved = fit.inliers < max(0.4 * len(newest.points), 3 * self.config.min_inliers) or fit.recognised
+        better = frame.depth_flaw is None and newest.surface.coverage < 0.5 * surface.coverage
+        worse = frame.depth_flaw is None and surface.coverage < 0.5 * newest.surface.coverage
+        if not (moved or starved or better) or (worse and not starved):
+            return False
+        candidate = self._keyframe(frame, fit)
+        richer = len(candidate.points) > 1.5 * fit.inliers + self.config.min_inliers
+        due = richer or ((moved or better) and len(candidate.points) >= fit.inliers)
+        if due:
+            self._map.add(replace(candidate, sunk=sunk))
+        return due
+
+    def _keyframe(self, frame: Frame, fit: Fit | None) -> Keyframe:
+        """Makes a keyframe of a frame: the corners that agree with its fit, and new ones."""
+        assert self._motion is not None
+        T, config = self._motion.T_world_camera, self.config
+        shape = frame.surface.inverse_depth.shape
+        movers = fit.movers if fit else Movers.none(frame.surface.K, (shape[0], shape[1]))
+        layers = self._layers(frame, T)
+        none = Corners(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, np.int64))
+        kept = none if fit is None else self._agreeing(fit, T)
+        kept = renewed(kept, layers, config.near, config.far, config.depth_noise, self._noise.depth)
+        found = kept
+        if frame.image_flaw is None:
+            found = with_new(frame.gray, kept, config.corners, layers, config.near, config.far, movers)
+        segment = self._map.newest.segment if self._map.keyframes else 0
+        return Keyframe(
+            frame.stamp, T, self._covariance, frame.gray, movers.left_out_of(frame.surface),
+            found.pixels, found.points, found.ages, segment,
+        )  # fmt: skip
+
+    def _layers(self, frame: Frame, T_world_camera: Matrix) -> list[Layer]:
+        """Returns where a corner's depth is looked up: the depth image, its patches, and else the map."""
+        patches = replace(self._working, K_depth=frame.surface.K)
+        if frame.depth_flaw is None:
+            return [(self._working, frame.depth), (patches, frame.surface.depth)]
+        if not self._map.keyframes:
+            return []
+        return [(patches, self._map.rendered(T_world_camera, frame.surface).depth)]
+
+    def _agreeing(self, fit: Fit, T_world_camera: Matrix) -> Corners:
+        """Returns the tracked corners that fit the refined pose and do not move."""
+        sighting = fit.sighting
+        if sighting is None or sighting.recognised:
+            return Corners(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, np.int64))
+        points = transform_points(invert(T_world_camera), sighting.points_world)
+        ahead = points[:, 2] > self.config.near
+        color = transform_points(self.camera.T_color_depth, np.where(ahead[:, None], points, 1.0))
+        error = project(color, self._working.K_color) - sighting.pixels
+        agree = ahead & (np.einsum("ij,ij->i", error, error) < 9.0 * self._noise.pixel**2)
+        agree[agree] &= ~fit.movers.hold(points[agree])
+        return Corners(sighting.pixels[agree], points[agree], sighting.ages[agree])
+
+    def _plausible(self, stamp: int, T_world_camera: Matrix, T_predicted: Matrix) -> bool:
+        """Returns whether the camera can have come that far since it was last measured."""
+        assert self._motion is not None
+        reach = 0.3 + TOP_SPEED * (self._motion.blind_s + (stamp - self._motion.stamp) * 1e-9)
+        return bool(np.linalg.norm(T_world_camera[:3, 3] - T_predicted[:3, 3]) < reach)
+
+    # -- results and state -------------------------------------------------------------------------------
+
+    def snapshot(self) -> State:
+        """Returns all that the next result depends on, as immutable values of plain arrays; it pickles."""
+        return State(
+            self._motion, self._covariance, tuple(self._map.keyframes), self._shapes,
+            self._noise, self._watch, self._recalls, self._apart_since,
+        )  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        """Goes on from a snapshot of an odometry with the same camera and configuration."""
+        self._motion, self._covariance, self._shapes = state.motion, state.covariance, state.shapes
+        self._noise, self._watch = state.noise, state.watch
+        self._recalls, self._apart_since = state.recalls, state.apart_since
+        self._map.keyframes = list(state.keyframes)
+
+    def _placed(self, status: Status, reason: str, fit: Fit, keyframe: bool) -> TrackResult:
+        """Returns the result of a measured pose; in a new map it is not known where that is in the old one."""
+        assert self._motion is not None
+        if self._apart_since is None:
+            return self._result(status, reason, fit, keyframe)
+        lost = self._motion.stamp - self._apart_since < self.config.give_up_s * 1e9
+        reason += "; a new map, its place in the old one unknown"
+        return self._result(Status.LOST if lost else status, reason, fit, keyframe)
+
+    def _result(self, status: Status, reason: str, fit: Fit | None, keyframe: bool) -> TrackResult:
+        assert self._motion is not None
+        return TrackResult(
+            stamp=self._motion.stamp,
+            T_world_camera=self._motion.T_world_camera.copy(),
+            covariance=self._covariance.copy(),
+            velocity=self._motion.velocity.copy(),
+            status=status,
+            reason=reason,
+            inliers=fit.inliers if fit else 0,
+            depth_inliers=fit.depth_inliers if fit else 0.0,
+            keyframe=keyframe,
+        )
+
+    def _check(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> None:
+        if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+            raise ValueError(f"image must be (H, W) or (H, W, 3) uint8, got {image.shape} {image.dtype}")
+        if depth.dtype != np.float32 or depth.ndim != 2:
+            raise ValueError(f"depth must be (H, W) float32 metres, got {depth.shape} {depth.dtype}")
+        for name, shape in (("image", image.shape), ("depth", depth.shape)):
+            if min(shape[:2]) < 32:
+                raise ValueError(f"{name} must be at least 32 x 32 pixels, got {shape}")
+        shapes = (image.shape[:2], depth.shape)
+        if self._shapes not in (None, shapes):
+            raise ValueError(f"image and depth sizes changed from {self._shapes} to {shapes}: one camera, one size")
+        if self._motion is not None and stamp <= self._motion.stamp:
+            raise ValueError(f"stamp {stamp} ns does not follow the last frame's {self._motion.stamp} ns")
+        self._shapes = shapes
+
+
+def _support(frame: Frame, fit: Fit) -> str:
+    """Returns what a measured pose rests on."""
+    corners = f"{fit.inliers} corners" if fit.inliers else ""
+    depth = "depth" if fit.compared else ""
+    rests = " and ".join(part for part in (corners, depth) if part)
+    others = len(fit.sighting.contrary) if fit.sighting else 0
+    contest = f"{others} corners move with something else" if others else ""
+    return "; ".join(part for part in (rests, contest, frame.flaws) if part)

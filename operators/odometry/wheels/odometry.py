@@ -1,0 +1,201 @@
+"""Odometry of a robot with two driven sides, from its wheels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Diagnostics, JointState, Odometry, WheelTicks
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import quaternion_from_yaw
+from dataflow.operator import Duration, In, Operator, Out, Param
+from operators.odometry.wheels.differential_drive import DifferentialDrive, DriveNoise
+from operators.odometry.wheels.readings import Reading, reading
+from operators.status import counted_status
+
+Array = NDArray[np.float64]
+
+UNREADABLE = "unreadable"
+_FLAT = 1e-6  # variance of height, roll and pitch: the floor is taken as flat
+
+
+class WheelOdometry(Operator):
+    """Dead-reckons a differential drive from encoder counts, wheel angles or wheel speeds; it starts at the origin.
+
+    Between two readings the wheels are taken to roll evenly, so the robot drives an arc. The covariance holds slip,
+    which is fresh with every metre, and errors of radii and track, which last. Wheels that speed up faster than the
+    robot can slip: what they turned is doubted by the excess. Counts that no robot can have driven (a controller that
+    began anew) are left out, and the motion so far goes on, doubted as far as it went. After a gap the shape of the way
+    is unknown. A reading that is not finite gives no pose. Each is named and counted.
+
+    Method: Siegwart, Nourbakhsh and Scaramuzza, "Introduction to Autonomous Mobile Robots", 2011, section 5.2.4; errors
+    that last as in Borenstein and Feng, "Measurement and correction of systematic odometry errors in mobile robots",
+    1996.
+    """
+
+    wheels: In[WheelTicks | JointState] = In(doc="encoder counts; or joints with positions, else velocities")
+    odometry: Out[Odometry] = Out(
+        doc="the robot in the odometry frame, with velocity and covariances; at every finite reading"
+    )
+    status: Out[Diagnostics] = Out(
+        doc="rolling, standing, slipping, jumped, after a gap or unreadable; at every reading"
+    )
+
+    odometry_frame: str = Param("wheel_odom", min_length=1, doc="name of the frame that the first pose defines")
+    base_frame: str = Param("base_link", min_length=1, doc="frame of the robot: between the wheels, x forward")
+    left: tuple[str, ...] = Param(("left",), min_length=1, doc="wheels on the left; the mean of several counts")
+    right: tuple[str, ...] = Param(("right",), min_length=1, doc="wheels on the right")
+    track: float = Param(gt=0, doc="distance between left and right wheels", unit="m")
+    radius: float | None = Param(None, gt=0, doc="of the wheels, where messages do not tell it", unit="m")
+    ticks_per_turn: float | None = Param(None, gt=0, doc="counts a turn of a wheel, where messages do not tell it")
+    slip: float = Param(
+        0.006, ge=0, doc="standard deviation of a wheel's way after 1 m; grows with its root", unit="m/√m"
+    )
+    scale_error: float = Param(0.01, ge=0, lt=1, doc="standard deviation of the share by which a radius is off")
+    track_error: float = Param(0.01, ge=0, lt=1, doc="and of that by which the track is off")
+    max_speed: float = Param(5.0, gt=0, doc="faster wheels are a jump of the counts", unit="m/s")
+    max_acceleration: float = Param(5.0, gt=0, doc="wheels that speed up faster slip", unit="m/s²")
+    gap: Duration = Param("500ms", gt=0, doc="readings farther apart leave the way between unknown")
+
+    _drive: DifferentialDrive | None = None
+    _restored: Any = None
+    _stamp: int | None = None
+    _last: Reading | None = None
+    _speed: Array | None = None  # of left and right, m/s; None until two readings tell it
+    _step: tuple[Array, float, float]  # rolled, in seconds, doubted by
+
+    def setup(self) -> None:
+        """Raises ValueError where a wheel is on both sides."""
+        both = set(self.left) & set(self.right)
+        if both:
+            raise ValueError(f"wheel {min(both)!r} is on both sides")
+        self._counts: Counter[str] = Counter()
+        self._begin()
+
+    def process(self, wheels: WheelTicks | JointState) -> dict[str, Any]:
+        """Raises ValueError where a wheel is missing, or nothing tells its radius or resolution."""
+        now = reading(wheels, (self.left, self.right), self.radius, self.ticks_per_turn)
+        if self._drive is None:
+            noise = DriveNoise(self.slip, self.scale_error, self.track_error, now.step)
+            self._drive = DifferentialDrive(self.track, noise)
+            if self._restored is not None:
+                self._drive.restore(self._restored)
+        state, level, text = self._move(self._drive, wheels.stamp, now)
+        self._counts[state] += 1
+        status = counted_status("wheel_odometry", wheels.stamp, f"{state}: {text}", level, self._counts)
+        if state == UNREADABLE:
+            return {"status": status}
+        return {"odometry": self._odometry(self._drive, wheels.stamp), "status": status}
+
+    def on_reset(self, input: str) -> None:
+        """The clock began anew: the next reading is a first one, at the pose so far."""
+        self._stamp = self._last = self._speed = None
+        self._step = (np.zeros(2), 1.0, 0.0)
+
+    def snapshot(self) -> Mapping[str, Any]:
+        last = self._last
+        return {
+            "drive": self._restored if self._drive is None else self._drive.snapshot(),
+            "stamp": self._stamp,
+            "last": None if last is None else [last.rolled, last.speed, last.step],
+            "speed": self._speed,
+            "step": list(self._step),
+            "counts": dict(self._counts),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        self._restored = state["drive"]
+        self._stamp = state["stamp"]
+        self._last = None if state["last"] is None else Reading(*state["last"])
+        self._speed = state["speed"]
+        rolled, seconds, doubt = state["step"]
+        self._step = (np.array(rolled), float(seconds), float(doubt))
+        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        return {f"readings {state}": count for state, count in self._counts.items()}
+
+    def _begin(self) -> None:
+        self._drive = self._restored = self._stamp = self._last = self._speed = None
+        self._step = (np.zeros(2), 1.0, 0.0)
+
+    def _move(self, drive: DifferentialDrive, stamp: int, now: Reading) -> tuple[str, Level, str]:
+        """Takes in a reading; returns its state, how bad that is, and a text."""
+        if not now.finite:
+            return UNREADABLE, Level.WARN, "the reading is not finite"
+        if self._stamp is None:
+            self._stamp, self._last = stamp, now
+            self._speed = now.speed
+            return "standing", Level.OK, "the first reading is the origin"
+        seconds = (stamp - self._stamp) * 1e-9
+        rolled, speed = self._rolled(now, seconds)
+        self._stamp, self._last = stamp, now
+        fastest = float(np.abs(rolled).max()) / seconds
+        if fastest > self.max_speed:
+            self._coast(drive, seconds)
+            return "jumped", Level.WARN, f"wheels turned at {fastest:.1f} m/s: left out, the motion so far goes on"
+        excess = self._excess(speed, seconds, now.step)
+        slipping = excess > 0 and seconds <= self.gap * 1e-9
+        doubt = excess * seconds if slipping else 0.0
+        drive.roll(float(rolled[0]), float(rolled[1]), doubt)
+        self._speed, self._step = speed, (rolled, seconds, doubt)
+        if seconds > self.gap * 1e-9:
+            drive.wander(float(np.abs(rolled).mean()) / 2)
+            return "after a gap", Level.WARN, f"nothing was heard for {seconds:.2f} s"
+        if slipping:
+            return "slipping", Level.WARN, f"a wheel's speed changed by {excess:.2f} m/s more than it can"
+        if not rolled.any():
+            return "standing", Level.OK, "no wheel turned"
+        return "rolling", Level.OK, f"{float(speed.mean()):.2f} m/s"
+
+    def _rolled(self, now: Reading, seconds: float) -> tuple[Array, Array]:
+        """Metres that each side rolled since the last reading, and its speed now as far as it is told."""
+        if now.rolled is not None and self._last is not None and self._last.rolled is not None:
+            rolled = now.rolled - self._last.rolled
+            return rolled, rolled / seconds
+        assert now.speed is not None
+        before = now.speed if self._speed is None else self._speed
+        return (before + now.speed) / 2 * seconds, now.speed
+
+    def _excess(self, speed: Array, seconds: float, step: float) -> float:
+        """Returns by how much a wheel's speed changed more than the robot can, in m/s; a count more or less is none."""
+        if self._speed is None:
+            return 0.0
+        return float(np.abs(speed - self._speed).max()) - self.max_acceleration * seconds - 2 * step / seconds
+
+    def _coast(self, drive: DifferentialDrive, seconds: float) -> None:
+        """Goes on as before, in doubt of all of it and of a start from rest."""
+        rolled = np.zeros(2) if self._speed is None else self._speed * seconds
+        doubt = float(np.abs(rolled).max()) + 0.5 * self.max_acceleration * min(seconds, 1.0) ** 2
+        drive.roll(float(rolled[0]), float(rolled[1]), doubt)
+        self._step = (rolled, seconds, doubt)
+
+    def _odometry(self, drive: DifferentialDrive, stamp: int) -> Odometry:
+        rolled, seconds, doubt = self._step
+        x, y, yaw = drive.pose
+        left, right = rolled / seconds
+        return Odometry(
+            stamp=stamp,
+            frame=self.odometry_frame,
+            child_frame=self.base_frame,
+            position=np.array([x, y, 0.0]),
+            orientation=quaternion_from_yaw(yaw),
+            pose_covariance=_spatial(drive.covariance(), (0, 1, 5)),
+            linear=np.array([(left + right) / 2, 0.0, 0.0]),
+            angular=np.array([0.0, 0.0, (right - left) / self.track]),
+            twist_covariance=_spatial(
+                drive.twist_covariance(float(rolled[0]), float(rolled[1]), seconds, doubt), (0, 5)
+            ),
+        )
+
+
+def _spatial(planar: Array, places: tuple[int, ...]) -> Array:
+    """The covariance (6, 6) of one of the named places; the rest is that of a flat floor."""
+    full = np.diag(np.full(6, _FLAT))
+    full[np.ix_(places, places)] = planar
+    return full

@@ -1,0 +1,59 @@
+"""Images that hang or show nothing are held back and named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dataflow import Played, play
+from dataflow.messages import DepthImage, Diagnostics, Image
+from operators.monitoring import DepthWatch, ImageWatch
+
+
+def images(*levels: int, seed: int = 1) -> list[Image]:
+    rng = np.random.default_rng(seed)
+    grain = rng.integers(0, 40, (24, 32, 3))
+    data = [np.clip((grain + level) * (level > 0), 0, 255).astype(np.uint8) for level in levels]
+    return [Image(stamp=k, frame="camera", data=each) for k, each in enumerate(data)]
+
+
+def texts(played: Played) -> list[str]:
+    return [status.messages[0] for status in played["status"] if isinstance(status, Diagnostics)]
+
+
+def test_new_images_pass_as_they_are() -> None:
+    given = images(50, 51, 50)
+    played = play(ImageWatch(), {"image": given})
+    assert [m.digest() for m in played["checked"]] == [m.digest() for m in given]
+
+
+def test_an_image_that_repeats_the_last_one_is_held_back_until_it_changes() -> None:
+    played = play(ImageWatch(), {"image": images(50, 50, 50, 60)})
+    assert [m.stamp for m in played["checked"]] == [0, 3]
+    assert texts(played)[1:3] == [f"the image repeats the last one, {n} in a row" for n in (1, 2)]
+    assert [int(s.levels[0]) for s in played["status"] if isinstance(s, Diagnostics)] == [0, 1, 1, 0]
+
+
+def test_a_black_image_is_held_back() -> None:
+    played = play(ImageWatch(), {"image": images(50, 0, 60)})
+    assert [m.stamp for m in played["checked"]] == [0, 2]
+    assert "is black" in texts(played)[1]
+
+
+@pytest.mark.parametrize("kept", [0.0, 1.0, np.inf], ids=["empty", "frozen", "all infinite"])
+def test_a_depth_image_without_news_is_held_back(kept: float) -> None:
+    rng = np.random.default_rng(2)
+    data = [rng.uniform(1, 3, (24, 32)).astype(np.float32) for _ in range(3)]
+    data[1] = data[0] * np.float32(kept)
+    played = play(DepthWatch(), {"depth": [DepthImage(stamp=k, frame="depth", data=d) for k, d in enumerate(data)]})
+    assert [m.stamp for m in played["checked"]] == [0, 2]
+
+
+def test_a_restored_watch_goes_on_as_the_first_would_have() -> None:
+    first, second = ImageWatch(), ImageWatch()
+    first.setup()
+    second.setup()
+    given = images(50, 50)
+    first.process(given[0])
+    second.restore(first.snapshot())
+    assert first.process(given[1])["status"].digest() == second.process(given[1])["status"].digest()

@@ -1,0 +1,224 @@
+"""Sensors that tell of another motion than the rest are named, and wheels that do are held back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dataflow import Played, play
+from dataflow.messages import Imu, Odometry, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import invert
+from operators.geometry.se3 import exp
+from operators.monitoring import MotionCheck
+
+SECONDS = 12
+SPEED, TURN = 0.5, 0.4
+T_BASE = {
+    "camera": np.array([[0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 1.1], [0, 0, 0, 1.0]]),
+    "lidar": np.array([[1, 0, 0, -0.05], [0, 1, 0, 0], [0, 0, 1, 0.6], [0, 0, 0, 1.0]]),
+    "imu": np.eye(4),
+}
+
+
+POSES = [np.eye(4)]
+"""Where the robot is every 10 ms: it swings from left to right as it drives."""
+for step in range(SECONDS * 100):
+    POSES.append(POSES[-1] @ exp(np.array([SPEED, 0, 0, 0, 0, TURN * np.sin(0.008 * step)]) * 0.01))
+
+
+def odometry(sensor: str, every: int, seed: int, scale: float = 1.0) -> list[Odometry]:
+    rng = np.random.default_rng(seed)
+    out = []
+    for k in range(0, SECONDS * 100, every):
+        noise = exp(np.concatenate([rng.normal(0, 0.002, 3), rng.normal(0, 0.0004, 3)]))
+        T = invert(T_BASE[sensor]) @ POSES[k] @ T_BASE[sensor] @ noise
+        T[:3, 3] *= scale
+        out.append(Odometry.from_matrix(T, stamp=k * 10_000_000, frame="odom", child_frame=sensor))
+    return out
+
+
+def wheels(scale: float = 1.0, still: Sequence[float] = (99, 99)) -> list[Odometry]:
+    out = []
+    for k in range(0, SECONDS * 100, 5):
+        moves = not still[0] <= k / 100 < still[1]
+        linear, angular = np.array([SPEED, 0, 0]), np.array([0, 0, TURN * np.sin(0.008 * (k - 2.5))])
+        out.append(
+            Odometry.from_matrix(
+                np.eye(4),
+                stamp=k * 10_000_000,
+                frame="wheel_odom",
+                child_frame="base_link",
+                linear=linear * scale * moves,
+                angular=angular * scale * moves,
+            )
+        )
+    return out
+
+
+def gyroscope(scale: float = 1.0) -> list[Imu]:
+    rng = np.random.default_rng(5)
+    return [
+        Imu(
+            stamp=k * 10_000_000,
+            frame="imu",
+            angular_velocity=np.array([0, 0, scale * TURN * np.sin(0.008 * k)]) + rng.normal(0, 0.002, 3),
+            linear_acceleration=np.array([0, 0, 9.8]),
+        )
+        for k in range(SECONDS * 100)
+    ]
+
+
+def extrinsics(sensor: str = "", axis: str = "z", angle: float = 0.0) -> Transforms:
+    matrices = []
+    for name, T in T_BASE.items():
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_euler(axis, angle * (name == sensor), degrees=True).as_matrix()
+        matrices.append(T @ turn)
+    return Transforms(
+        stamp=0,
+        frames=("base_link",) * 3,
+        child_frames=tuple(T_BASE),
+        translations=np.array([T[:3, 3] for T in matrices]),
+        rotations=Rotation.from_matrix([T[:3, :3] for T in matrices]).as_quat(),
+    )
+
+
+def checked(known: Transforms | None = None, **changed: Any) -> Played:
+    given: dict[str, Any] = {
+        "wheels": changed.get("wheels", wheels()),
+        "motions": {
+            "camera": changed.get("camera", odometry("camera", 10, 1)),
+            "lidar": changed.get("lidar", odometry("lidar", 20, 2)),
+        },
+        "imu": {"imu": changed.get("imu", gyroscope())},
+        "extrinsics": [known or extrinsics()],
+    }
+    return play(MotionCheck(), given, static=["extrinsics"])
+
+
+def warnings(played: Played) -> list[str]:
+    return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]
+
+
+def test_sensors_that_agree_raise_no_alarm_and_wheels_pass_as_they_are() -> None:
+    played = checked()
+    assert warnings(played) == []
+    assert len(played["status"]) >= 18
+    assert [m.digest() for m in played["checked"]] == [m.digest() for m in wheels()]
+
+
+def test_wheels_of_another_radius_are_named_and_held_back() -> None:
+    played = checked(wheels=wheels(1.05))
+    assert warnings(played)[-1].startswith("wheels: 4.9% more way than")
+    assert len(played["checked"]) < 0.5 * len(wheels())
+
+
+def test_wheels_that_say_they_stand_while_the_robot_drives_are_held_back_at_once_and_only_then() -> None:
+    given = wheels(still=(4.0, 6.0))
+    played = checked(wheels=given)
+    late = [m.stamp * 1e-9 for m in given if 4.3 <= m.stamp * 1e-9 < 6.0]
+    passed = {m.stamp * 1e-9 for m in played["checked"]}
+    assert not passed & set(late)
+    assert {m.stamp * 1e-9 for m in given if not 4.0 <= m.stamp * 1e-9 < 6.3} <= passed
+    assert any("otherwise than the robot moves" in text for text in warnings(played))
+    assert int(played["status"][-1].levels[0]) == Level.OK
+
+
+def test_a_camera_whose_depths_are_too_long_is_named_by_the_others() -> None:
+    said = warnings(checked(camera=odometry("camera", 10, 1, scale=1.05)))
+    assert said[-1].startswith("motions/camera: 4.9% more way than")
+    assert "motions/lidar and wheels" in said[-1]
+
+
+@pytest.mark.parametrize("sensor", ["wheels", "imu"])
+def test_a_sensor_that_repeats_a_reading_of_motion_is_said_and_one_at_rest_is_not(sensor: str) -> None:
+    given: list[Any] = wheels() if sensor == "wheels" else gyroscope()
+    held = next(m for m in given if m.stamp >= 6_000_000_000)
+    hung = [held.replace(stamp=m.stamp) if 6 <= m.stamp * 1e-9 < 7.5 else m for m in given]
+    said = warnings(checked(**{sensor: hung}))
+    assert [text for text in said if "repeats its last reading" in text]
+    assert "repeats" not in said[-1] or len(said) < 4
+    resting = [m.replace(linear=np.zeros(3), angular=np.zeros(3)) for m in wheels()]
+    standing = [
+        m.replace(position=np.zeros(3), orientation=np.array([0, 0, 0, 1.0])) for m in odometry("camera", 10, 1)
+    ]
+    assert not warnings(checked(wheels=resting, camera=standing, lidar=[], imu=[]))
+
+
+def test_a_gyroscope_of_another_scale_is_named() -> None:
+    said = warnings(checked(imu=gyroscope(1.06)))
+    assert said[-1].startswith("gyroscope of imu: 5.8% more turning than")
+
+
+@pytest.mark.parametrize(
+    ("sensor", "axis", "name"),
+    [
+        ("lidar", "z", "motions/lidar"),
+        ("camera", "y", "motions/camera"),
+        ("camera", "x", "motions/camera"),
+        ("imu", "y", "gyroscope of imu"),
+    ],
+)
+def test_a_sensor_that_is_turned_against_its_extrinsic_is_named(sensor: str, axis: str, name: str) -> None:
+    said = warnings(checked(extrinsics(sensor, axis, 3.0)))
+    assert any(text.startswith(f"{name}: direction off by") for text in said[-1].split("; "))
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_readings_that_are_not_finite_are_counted_and_left_out(wrong: float) -> None:
+    driven, turned, carried = wheels(), gyroscope(), odometry("camera", 10, 1)
+    driven[40] = driven[40].replace(linear=[wrong, 0, 0])
+    turned[500] = turned[500].replace(angular_velocity=[wrong, 0, 0])
+    carried[50] = carried[50].replace(position=[wrong, 0, 0])
+    operator = MotionCheck()
+    given: dict[str, Any] = {
+        "wheels": driven,
+        "motions": {"camera": carried, "lidar": odometry("lidar", 20, 2)},
+        "imu": {"imu": turned},
+        "extrinsics": [extrinsics()],
+    }
+    played = play(operator, given, static=["extrinsics"])
+    assert warnings(played) == []
+    assert [m.stamp for m in played["checked"]] == [m.stamp for m in driven if m is not driven[40]]
+    counted = {name: n for name, n in operator.summary().items() if "not finite" in name}
+    assert counted == {"gyroscope of imu: not finite": 1, "motions/camera: not finite": 1, "wheels: not finite": 1}
+
+
+def test_of_two_nobody_knows_which_is_wrong_and_wheels_still_pass() -> None:
+    given = {
+        "wheels": wheels(1.05),
+        "motions": {"lidar": odometry("lidar", 20, 2)},
+        "extrinsics": [extrinsics()],
+    }
+    played = play(MotionCheck(), given, static=["extrinsics"])
+    assert warnings(played)[-1].startswith("motions/lidar: ")
+    assert len(played["checked"]) == len(wheels())
+
+
+def test_a_restored_check_goes_on_as_the_first_would_have() -> None:
+    first, second = MotionCheck(), MotionCheck()
+    first.setup()
+    given = {"wheels": wheels(1.05), "camera": odometry("camera", 10, 1), "lidar": odometry("lidar", 20, 2)}
+    by_stamp: dict[int, dict[str, Odometry]] = {}
+    for name, messages in given.items():
+        for message in messages:
+            by_stamp.setdefault(message.stamp, {})[name] = message
+
+    def fed(check: MotionCheck, stamp: int) -> list[bytes]:
+        now = by_stamp[stamp]
+        motions = {f"robot/motions/{name}": m for name, m in now.items() if name != "wheels"}
+        made = check.process(SimpleNamespace(stamp=stamp), now.get("wheels"), motions, (), extrinsics())  # type: ignore[arg-type]
+        return [made[name].digest() for name in sorted(made)]
+
+    stamps = sorted(by_stamp)
+    for stamp in stamps[:100]:
+        fed(first, stamp)
+    second.setup()
+    second.restore(first.snapshot())
+    assert [fed(first, s) for s in stamps[100:160]] == [fed(second, s) for s in stamps[100:160]]

@@ -1,0 +1,299 @@
+"""LidarOdometry in made rooms, whose walls are known, and on the scans of a car."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dataflow.messages import Diagnostics, Odometry, PointCloud, Transforms
+from dataflow.messages.geometry import invert
+from dataflow.testing import Played, play
+from operators.cloud.deskewing import deskewed
+from operators.geometry import se3
+from operators.odometry import LidarOdometry
+from operators.odometry.lidar.map import PlaneMap, thinned
+from operators.odometry.lidar.sweep import Sweep
+
+Array = NDArray[np.float64]
+STEP = 100_000_000  # ns
+
+ROOM = [  # axis, place, and what the rectangle spans of the other two axes
+    (2, -0.6, (-4, 5), (-3, 4)), (2, 2.0, (-4, 5), (-3, 4)), (0, -4, (-3, 4), (-1, 2)), (0, 5, (-3, 4), (-1, 2)),
+    (1, -3, (-4, 5), (-1, 2)), (1, 4, (-4, 5), (-1, 2)), (0, 2.5, (1.5, 4), (-1, 1.2)), (1, -1.8, (0, 1.5), (-1, 0.9)),
+]  # fmt: skip
+CORRIDOR = [
+    (2, -0.6, (-60, 60), (-1, 1)), (2, 2.0, (-60, 60), (-1, 1)), (1, -1, (-60, 60), (-1, 2)), (1, 1, (-60, 60), (-1, 2))
+]  # fmt: skip
+
+
+def beams(rings: int = 24, columns: int = 240) -> Array:
+    """Directions (N, 3), column after column, as a LiDAR turns."""
+    azimuth, elevation = np.meshgrid(np.arange(columns) * 2 * np.pi / columns, np.linspace(-0.4, 0.4, rings),
+                                     indexing="ij")  # fmt: skip
+    a, e = azimuth.ravel(), elevation.ravel()
+    return np.column_stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+
+
+def cast(world: list[Any], origins: Array, directions: Array, limit: float = 30.0) -> Array:
+    """Distance (N,) of the first rectangle on each ray; infinite where there is none within the limit."""
+    nearest = np.full(len(origins), np.inf)
+    for axis, place, *spans in world:
+        others = [k for k in range(3) if k != axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (place - origins[:, axis]) / directions[:, axis]
+            hit = origins + t[:, None] * directions
+        inside = (t > 1e-6) & (t < limit)
+        for k, (low, high) in zip(others, spans, strict=True):
+            inside &= (hit[:, k] >= low) & (hit[:, k] <= high)
+        nearest = np.where(inside & (t < nearest), t, nearest)
+    return nearest
+
+
+def scan(
+    world: list[Any], pose: Callable[[float], Array], k: int, timed: bool = False, noise: float = 0.01
+) -> PointCloud:
+    """One turn that ends at k tenths of a second; without `timed` the sensor stands still during it."""
+    rays = beams()
+    offsets = np.repeat(np.arange(240) / 240 - 1 + 1 / 240, 24) * 0.1 if timed else np.zeros(len(rays))
+    poses = {float(t): pose(k * 0.1 + float(t)) for t in np.unique(offsets)}
+    T = np.array([poses[float(t)] for t in offsets])
+    distance = cast(world, T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], rays))
+    distance = distance + np.random.default_rng(k).normal(0, noise, len(rays))
+    kept = np.isfinite(distance)
+    return PointCloud(
+        stamp=k * STEP,
+        frame="lidar",
+        points=(rays[kept] * distance[kept, None]).astype(np.float32),
+        time_offsets=offsets[kept].astype(np.float32) if timed else None,
+    )
+
+
+def circling(t: float) -> Array:
+    """A way through the room: 0.8 m/s, turning at 0.8 rad/s."""
+    return se3.exp(np.array([0.8 * t, 0, 0, 0, 0, 0.8 * t]))
+
+
+def along(t: float) -> Array:
+    """A way along the corridor: 1 m/s."""
+    return se3.exp(np.array([t, 0, 0, 0, 0, 0.0]))
+
+
+def texts(played: Played) -> list[str]:
+    return [s.messages[0] for s in played["status"] if isinstance(s, Diagnostics)]
+
+
+def errors(played: Played, pose: Callable[[float], Array], body: Array | None = None) -> Array:
+    """Twists (N, 6) from the true poses to those given."""
+    B = np.eye(4) if body is None else body
+    found = []
+    for odometry in played["odometry"]:
+        assert isinstance(odometry, Odometry)
+        T = B @ invert(pose(0)) @ pose(odometry.stamp * 1e-9) @ invert(B)
+        found.append(se3.log(invert(T) @ odometry.matrix()))
+    return np.array(found)
+
+
+def test_a_way_through_a_room_is_followed_within_its_covariance() -> None:
+    played = play(LidarOdometry(), {"cloud": [scan(ROOM, circling, k) for k in range(25)]})
+    off = errors(played, circling)
+    assert len(off) == 25
+    assert np.linalg.norm(off[:, :3], axis=1).max() < 0.02
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.005
+    last = played["odometry"][-1]
+    assert isinstance(last, Odometry)
+    assert last.pose_covariance is not None
+    assert last.linear == pytest.approx([0.8, 0, 0], abs=0.15)
+    assert 1e-4 < np.sqrt(last.pose_covariance[0, 0]) < 0.05
+    assert texts(played) == ["tracking: the map begins here", *["tracking"] * 24]
+
+
+def test_points_with_times_are_deskewed() -> None:
+    clouds = [scan(ROOM, circling, k, timed=True) for k in range(20)]
+    off = errors(play(LidarOdometry(), {"cloud": clouds}), circling)
+    skewed = errors(play(LidarOdometry(), {"cloud": [c.replace(time_offsets=None) for c in clouds]}), circling)
+    assert np.linalg.norm(off[:, :3], axis=1).max() < 0.03
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.01
+    assert np.linalg.norm(off[-1, :3]) < np.linalg.norm(skewed[-1, :3])
+
+
+def test_points_without_times_are_deskewed_by_their_azimuth_where_it_is_known_how_the_lidar_turns() -> None:
+    clouds = [scan(ROOM, circling, k, timed=True) for k in range(20)]
+    plain = [c.replace(time_offsets=None) for c in clouds]
+    timed = errors(play(LidarOdometry(), {"cloud": clouds}), circling)
+    swept = errors(play(LidarOdometry(sweep={"period": 0.1}), {"cloud": plain}), circling)
+    assert np.linalg.norm(swept - timed, axis=1).max() < 0.005
+    told = play(LidarOdometry(sweep={"period": 5.0, "clockwise": True}), {"cloud": clouds})
+    assert told.digests() == play(LidarOdometry(), {"cloud": clouds}).digests()  # what messages say counts
+
+
+@pytest.mark.parametrize(
+    ("sweep", "expected"),
+    [
+        (Sweep(period=0.1), [-0.1, -0.075, -0.05, -0.025]),
+        (Sweep(period=0.1, clockwise=True), [-0.1, -0.025, -0.05, -0.075]),
+        (Sweep(period=0.2, begins=np.pi, stamped="begin"), [0.1, 0.15, 0.0, 0.05]),
+        (Sweep(period=0.1, stamped="middle"), [-0.05, -0.025, 0.0, 0.025]),
+    ],
+    ids=["ends at the stamp", "clockwise", "begins behind, at the stamp", "stamped in the middle"],
+)
+def test_the_azimuth_of_a_point_tells_when_it_was_measured(sweep: Sweep, expected: list[float]) -> None:
+    around = np.array([[2, 0, 1], [0, 3, 0], [-1, 0, 0], [0, -4, 2]], np.float32)
+    np.testing.assert_allclose(sweep.offsets(around), expected, atol=1e-7)
+    assert np.isnan(sweep.offsets(np.full((1, 3), np.nan, np.float32))).all()
+
+
+def test_deskewing_undoes_a_motion_during_the_scan() -> None:
+    rng = np.random.default_rng(3)
+    points, offsets = rng.uniform(-5, 5, (50, 3)), rng.uniform(-0.1, 0.1, 50)
+    for velocity in (np.array([1.0, -2, 0.5, 0.3, 1.0, -2.0]), np.array([1.0, 0, 0, 0, 0, 0])):
+        T = np.array([se3.exp(velocity * t) for t in offsets])
+        expected = np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+        np.testing.assert_allclose(deskewed(points, offsets, velocity), expected, atol=1e-12)
+
+
+def test_the_pose_of_another_body_is_given_where_it_is_asked_for() -> None:
+    T_base_lidar = se3.exp(np.array([0.3, 0.1, 0.5, 0.1, -0.2, 0.7]))
+    mount = Transforms.from_matrix(T_base_lidar, stamp=0, frame="base", child_frame="lidar")
+    clouds = [scan(ROOM, circling, k) for k in range(8)]
+    played = play(LidarOdometry(body_frame="base"), {"cloud": clouds, "extrinsics": [mount]})
+    off = errors(played, circling, T_base_lidar)
+    assert np.linalg.norm(off[:, :3], axis=1).max() < 0.03
+    assert {o.child_frame for o in played["odometry"] if isinstance(o, Odometry)} == {"base"}
+
+
+def test_a_body_without_extrinsics_is_refused() -> None:
+    with pytest.raises(Exception, match="extrinsics that relate it to 'base' are missing"):
+        play(LidarOdometry(body_frame="base"), {"cloud": [scan(ROOM, circling, 0)]})
+
+
+def test_a_bare_corridor_tells_nothing_of_the_way_along_it_and_the_covariance_says_so() -> None:
+    played = play(LidarOdometry(), {"cloud": [scan(CORRIDOR, along, k) for k in range(12)]})
+    assert all("nothing tells of motion along (1.00, 0.00" in text for text in texts(played)[2:])
+    last = played["odometry"][-1]
+    assert isinstance(last, Odometry)
+    assert last.pose_covariance is not None
+    deviation = np.sqrt(np.diag(last.pose_covariance))
+    assert deviation[0] > 10 * deviation[1]
+    off = errors(played, along)[-1]
+    assert abs(off[0]) < 3 * deviation[0]
+    assert np.abs(off[1:3]).max() < 0.03
+
+
+def test_bad_scans_are_bridged_and_named() -> None:
+    clouds = [scan(ROOM, circling, k) for k in range(12)]
+    clouds[6] = clouds[6].replace(points=np.zeros((0, 3), np.float32))
+    clouds[7] = clouds[7].replace(points=np.full((300, 3), np.nan, np.float32))
+    clouds[8] = clouds[8].replace(points=np.full((300, 3), 1e30, np.float32))
+    played = play(LidarOdometry(), {"cloud": clouds})
+    assert texts(played)[6:10] == [*["predicted: 0 usable points"] * 3, "tracking"]
+    spreads = [
+        o.pose_covariance[0, 0] for o in played["odometry"] if isinstance(o, Odometry) and o.pose_covariance is not None
+    ]
+    assert spreads[8] > spreads[7] > spreads[6] > spreads[5]
+    assert spreads[9] < spreads[8]
+    assert np.linalg.norm(errors(played, circling)[-1, :3]) < 0.03
+
+
+def test_no_pose_is_given_before_the_first_usable_scan() -> None:
+    nothing = PointCloud(stamp=0, frame="lidar", points=np.zeros((0, 3), np.float32))
+    played = play(LidarOdometry(), {"cloud": [nothing, scan(ROOM, circling, 1)]})
+    assert texts(played) == ["lost: 0 usable points, and there is no map yet", "tracking: the map begins here"]
+    assert [o.stamp for o in played["odometry"]] == [STEP]
+
+
+def test_a_lidar_that_was_covered_is_found_again_near_by() -> None:
+    def moved(t: float) -> Array:
+        return circling(t if t < 0.65 else t + 0.8)
+
+    clouds = [scan(ROOM, moved, k) for k in range(20)]
+    for k in range(7, 15):
+        clouds[k] = clouds[k].replace(points=np.zeros((0, 3), np.float32))
+    played = play(LidarOdometry(), {"cloud": clouds})
+    states = [text.split(":")[0] for text in texts(played)]
+    assert states == ["tracking"] * 7 + ["predicted"] * 5 + ["lost"] * 3 + ["relocalised"] + ["tracking"] * 4
+    assert [o.stamp // STEP for o in played["odometry"]] == [*range(12), *range(15, 20)]
+    assert np.linalg.norm(errors(played, moved)[-4:, :3], axis=1).max() < 0.03
+
+
+def test_another_place_is_not_taken_for_the_mapped_one_and_a_new_map_begins() -> None:
+    elsewhere = [(axis, 3 * place, *spans) if axis == 2 else (axis, place, *spans) for axis, place, *spans in CORRIDOR]
+    clouds = [scan(ROOM, circling, k) for k in range(6)] + [scan(elsewhere, along, k) for k in range(6, 18)]
+    played = play(LidarOdometry(patience=0.35, give_up=0.4), {"cloud": clouds})
+    states = [text.split(":")[0] for text in texts(played)]
+    assert states[6:10] == ["predicted"] * 3 + ["lost"]
+    assert "relocalised" not in states
+    assert any("a new map begins here" in text for text in texts(played)[6:])
+    last = played["odometry"][-1]
+    assert isinstance(last, Odometry)
+    assert last.pose_covariance is not None
+    assert np.sqrt(last.pose_covariance[0, 0]) > 1.0  # it may be anywhere by now, and says so
+
+
+def test_repeated_runs_give_equal_bits_and_a_snapshot_goes_on_alike() -> None:
+    clouds = [scan(ROOM, circling, k, timed=True) for k in range(8)]
+    first, second = (play(LidarOdometry(), {"cloud": clouds}) for _ in range(2))
+    assert first.digests() == second.digests()
+    whole, halves = LidarOdometry(), [LidarOdometry(), LidarOdometry()]
+    for operator in (whole, *halves):
+        operator.setup()
+    expected = [whole.process(cloud)["odometry"].digest() for cloud in clouds]
+    found = [halves[0].process(cloud)["odometry"].digest() for cloud in clouds[:5]]
+    halves[1].restore(halves[0].snapshot())
+    found += [halves[1].process(cloud)["odometry"].digest() for cloud in clouds[5:]]
+    assert found == expected
+
+
+def test_near_must_be_less_than_far() -> None:
+    with pytest.raises(ValueError, match="near must be less than far"):
+        LidarOdometry(near=5.0, far=4.0).setup()
+
+
+def test_a_map_knows_the_planes_of_its_points_and_forgets_what_is_far() -> None:
+    rng = np.random.default_rng(1)
+    floor = np.column_stack([rng.uniform(-6, 6, (20000, 2)), rng.normal(0.3, 0.005, 20000)])
+    planes = PlaneMap(2.0, 3)
+    planes.add(floor, birth=4)
+    asked = np.array([[1.0, 1, 0.35], [-5.2, 3.3, 0.25], [50, 0, 0], [1, 1, 40]])
+    pairs = planes.pairs(asked)
+    assert pairs.points.tolist() == [0, 1]
+    assert pairs.known == 0.5
+    assert pairs.births.tolist() == [4, 4]
+    np.testing.assert_allclose(np.abs(pairs.normals[:, 2]), 1, atol=1e-3)
+    np.testing.assert_allclose(pairs.centers[:, 2], 0.3, atol=2e-3)
+    planes.keep(np.array([5.0, 5, 0]), 4.0)
+    assert planes.pairs(asked).points.tolist() == []
+    planes.add(floor, birth=5)
+    assert planes.pairs(asked).births.tolist() == [5, 5]
+
+
+def test_thinning_keeps_the_first_point_of_a_cube() -> None:
+    points = np.array([[0.1, 0, 0], [0.2, 0.1, 0], [1.1, 0, 0], [0.3, 0, 0], [-0.1, 0, 0]])
+    assert thinned(points, 0.5).tolist() == [0, 2, 4]
+    others = np.random.default_rng(0).uniform(-2, 2, (2000, 3))  # written where those before were, in part
+    assert len(thinned(others, 0.5)) <= 8**3
+    assert thinned(points, 0.5).tolist() == [0, 2, 4]
+
+
+@pytest.mark.data
+def test_the_end_of_a_drive_is_that_of_direct_registration(data_dir: Path) -> None:
+    import small_gicp
+
+    files = sorted((data_dir / "kitti_lidar_camera" / "velodyne").glob("*.bin"))[:13]
+    scans = [np.fromfile(file, np.float32).reshape(-1, 4)[:, :3].copy() for file in files]
+    guess = se3.exp(np.array([2.7, 0, 0, 0, 0, 0.0]))
+    direct = small_gicp.align(
+        scans[0].astype(float), scans[-1].astype(float), init_T_target_source=guess, downsampling_resolution=0.25,
+        max_correspondence_distance=1.0, num_threads=1, max_iterations=100,
+    ).T_target_source  # fmt: skip
+    clouds = [PointCloud(stamp=k * STEP, frame="velodyne", points=points) for k, points in enumerate(scans)]
+    played = play(LidarOdometry(near=2.0), {"cloud": clouds})
+    last = played["odometry"][-1]
+    assert isinstance(last, Odometry)
+    off = se3.log(invert(direct) @ last.matrix())
+    assert np.linalg.norm(off[:3]) < 0.1
+    assert np.degrees(np.linalg.norm(off[3:])) < 0.2

@@ -1,0 +1,223 @@
+"""The scale that depth images give a monocular odometry, on images of a made corner of two walls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from made_walls import RATE, SIZE, K, aside, depth_from, rendered
+from numpy.typing import NDArray
+
+from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.messages import CameraInfo, DepthImage, Image, Transforms
+from dataflow.testing import Played, play
+from operators.evaluation.trajectory import align
+from operators.odometry import MonoVisualOdometry
+from operators.odometry.mono.ranging import PERSISTENT, RangingUse
+from operators.odometry.mono.scale import Scale
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+COUNT = 40
+PERIOD = 10**9 // RATE
+STATIC = ("image_info", "depth_info", "extrinsics")
+# A depth camera of its own beside the colour camera, with fewer pixels and a wider view.
+SMALL = (160, 120)
+K_SMALL = np.array([[110.0, 0.0, 79.5], [0.0, 110.0, 59.5], [0.0, 0.0, 1.0]])
+BESIDE = np.array([[1.0, 0, 0, 0.12], [0, 1, 0, 0.02], [0, 0, 1, -0.03], [0, 0, 0, 1]])  # T_camera_depth
+
+
+def stamp(k: float) -> int:
+    return round(PERIOD * (k + 1))
+
+
+def info(frame: str, size: tuple[int, int], K: Array) -> CameraInfo:
+    return CameraInfo(stamp=0, frame=frame, width=size[0], height=size[1], K=K)
+
+
+def streams(depths: dict[int, Depth]) -> dict[str, list[Any]]:
+    """Images, and depth images (H, W) of the camera itself at frames."""
+    given: dict[str, list[Any]] = {
+        "image": [Image(stamp=stamp(k), frame="camera", data=i) for k, i in enumerate(rendered(COUNT))],
+        "image_info": [info("camera", SIZE, K)],
+    }
+    if depths:
+        given["depth_info"] = [info("camera", SIZE, K)]
+        given["depth"] = [DepthImage(stamp=stamp(k), frame="camera", data=d) for k, d in depths.items()]
+    return given
+
+
+def run(given: dict[str, list[Any]], operator: MonoVisualOdometry | None = None) -> Played:
+    return play(operator or MonoVisualOdometry(), given, static=[name for name in STATIC if name in given])
+
+
+def measured(k: int, noise: float = 0.01) -> Depth:
+    """The depth at a frame, with the noise of a depth camera."""
+    true = depth_from(aside(COUNT)[k])
+    return (true + noise * np.random.default_rng(k).normal(size=true.shape)).astype(np.float32)
+
+
+def in_metres(played: Played) -> tuple[Array, Array, list[Any]]:
+    """Returns positions (N, 3) of what is said to be in metres, the true ones, and the messages."""
+    truth = {stamp(k): T[:3, 3] for k, T in enumerate(aside(COUNT))}
+    sent: list[Any] = list(played["odometry"])
+    poses = [p for p in sent if p.frame == "odom"]
+    return np.array([p.position for p in poses]), np.array([truth[p.stamp] for p in poses]), poses
+
+
+def scale_of(played: Played, last: int) -> float:
+    """Returns the factor that brings the last poses to the truth; 1 where they are in metres."""
+    estimate, truth, _ = in_metres(played)
+    return float(align(estimate[-last:], truth[-last:], scaled=True)[2])
+
+
+def said(played: Played) -> list[str]:
+    return [status.messages[0] for status in played["status"]]  # type: ignore[attr-defined]
+
+
+def test_a_depth_image_now_and_then_gives_metres() -> None:
+    played = run(streams({k: measured(k) for k in range(0, COUNT, 8)}))
+    estimate, truth, poses = in_metres(played)
+    R, t, _ = align(estimate, truth, scaled=False)
+    assert len(poses) >= 16
+    assert np.linalg.norm(estimate @ R.T + t - truth, axis=1).max() < 0.02
+    assert scale_of(played, len(poses)) == pytest.approx(1.0, abs=0.02)
+    sure = [np.sqrt(np.trace(p.pose_covariance[:3, :3])) for p in poses]
+    assert max(sure) < 0.3
+    assert poses[-1].linear is not None
+    assert np.linalg.norm(poses[-1].linear) == pytest.approx(0.03 * RATE, rel=0.3)
+
+
+def test_the_position_at_which_metres_are_found_counts_from_where_the_map_began() -> None:
+    found = 30
+    played = run(streams({found: measured(found)}))
+    estimate, _, poses = in_metres(played)
+    unscaled = [p for p in played["odometry"] if p.frame == "odom_unscaled"]  # type: ignore[attr-defined]
+    way = aside(COUNT)
+    assert poses[0].stamp == stamp(found)
+    assert unscaled
+    assert np.linalg.norm(estimate[0]) == pytest.approx(float(np.linalg.norm(way[found][:3, 3])), rel=0.02)
+    assert "gives the scale" in said(played)[found]
+
+
+@pytest.mark.parametrize("between", [0.0, 0.4], ids=["of an image's stamp", "between two images"])
+def test_a_depth_camera_of_another_place_size_and_rate_gives_the_same_metres(between: float) -> None:
+    given = streams({})
+    frames = [k + between for k in range(0, COUNT - 1, 6)]
+    way = aside(2 * COUNT)
+    given["depth_info"] = [info("depth", SMALL, K_SMALL)]
+    given["extrinsics"] = [Transforms.from_matrix(BESIDE, stamp=0, frame="camera", child_frame="depth")]
+    given["depth"] = []
+    for k in frames:
+        before, after = way[int(k)], way[int(k) + 1]
+        T = before.copy()
+        T[:3, 3] += (k - int(k)) * (after[:3, 3] - before[:3, 3])
+        data = depth_from(T @ BESIDE, K_SMALL, SMALL)
+        given["depth"].append(DepthImage(stamp=stamp(k), frame="depth", data=data))
+    assert scale_of(run(given), 20) == pytest.approx(1.0, abs=0.02)
+
+
+def test_depth_in_a_few_pixels_of_a_hundred_is_enough() -> None:
+    rng = np.random.default_rng(5)
+    sparse = {k: np.where(rng.random(SIZE[::-1]) < 0.03, measured(k), 0).astype(np.float32) for k in range(0, COUNT, 4)}
+    assert scale_of(run(streams(sparse)), 15) == pytest.approx(1.0, abs=0.02)
+
+
+USELESS = {
+    "no return": (lambda k: np.zeros(SIZE[::-1], np.float32), RangingUse.FLAWED),
+    "not a number": (lambda k: np.full(SIZE[::-1], np.nan, np.float32), RangingUse.FLAWED),
+    "too far": (lambda k: np.full(SIZE[::-1], 50.0 + k, np.float32), RangingUse.FLAWED),
+    "noise": (
+        lambda k: np.repeat(np.repeat(np.random.default_rng(k).uniform(0.5, 6, (30, 45)), 8, 0), 8, 1).astype("f4"),
+        RangingUse.SCATTERED,
+    ),
+    "a corner of the view": (lambda k: np.pad(measured(k)[:40, :40], ((0, 200), (0, 320))), RangingUse.FEW),
+}
+
+
+@pytest.mark.parametrize(("make", "use"), USELESS.values(), ids=USELESS.keys())
+def test_depth_that_shows_nothing_is_counted_and_changes_no_pose(make: Any, use: RangingUse) -> None:
+    operator = MonoVisualOdometry()
+    alone = run(streams({}))
+    played = run(streams({k: make(k) for k in range(20, COUNT, 2)}), operator)
+    assert [p.digest() for p in played["odometry"]] == [p.digest() for p in alone["odometry"]]
+    words = said(played)
+    assert all("scale unknown, depth " in words[k] for k in range(20, COUNT, 2))
+    assert operator.summary()[f"depth {use}"] == 10
+
+
+def test_a_depth_image_that_comes_again_counts_once() -> None:
+    operator, once = MonoVisualOdometry(), measured(20)
+    alone, again = run(streams({20: once})), run(streams(dict.fromkeys(range(20, 30), once)), operator)
+    assert [p.digest() for p in again["odometry"]] == [p.digest() for p in alone["odometry"]]
+    assert operator.summary()[f"depth {RangingUse.FLAWED}"] == 9
+    assert "depth repeats the last one" in said(again)[21]
+
+
+def test_depth_that_contradicts_a_known_scale_is_left_out() -> None:
+    good = {k: measured(k) for k in range(14, 24)}
+    wrong = {k: (1.4 * measured(k)).astype(np.float32) for k in range(24, 24 + PERSISTENT - 1)}
+    operator = MonoVisualOdometry()
+    kept, both = run(streams(good)), run(streams(good | wrong), operator)
+    assert [p.digest() for p in both["odometry"]] == [p.digest() for p in kept["odometry"]]
+    assert "contradicts the scale (1.4" in said(both)[25]
+    assert operator.summary()[f"depth {RangingUse.CONTRARY}"] == PERSISTENT - 1
+
+
+def test_a_scale_that_was_wrong_is_found_anew_without_a_jump_and_the_way_so_far_is_doubted() -> None:
+    wrong = {k: (1.5 * measured(k)).astype(np.float32) for k in range(14, 20)}
+    played = run(streams(wrong | {k: measured(k) for k in range(20, COUNT)}))
+    words, (estimate, _, poses) = said(played), in_metres(played)
+    turned = [k for k, text in enumerate(words) if "gives another scale" in text]
+    assert turned == [20 + PERSISTENT - 1]
+    steps = np.linalg.norm(np.diff(estimate, axis=0), axis=1)
+    assert steps.max() < 2 * 0.045  # of 0.03 m a frame, half again too long at first
+    assert scale_of(played, 12) == pytest.approx(1.0, abs=0.03)
+    spread = [float(np.sqrt(np.trace(p.pose_covariance[:3, :3]))) for p in poses]
+    at = [p.stamp for p in poses].index(stamp(turned[0]))
+    assert spread[at] > 0.3 * np.linalg.norm(estimate[at])
+    assert spread[at - 1] < 0.2 * np.linalg.norm(estimate[at - 1])
+
+
+def test_an_input_without_messages_changes_nothing() -> None:
+    silent = streams({}) | {"depth": [], "depth_info": []}
+    assert play(MonoVisualOdometry(), silent, static=STATIC[:2]).digests() == run(streams({})).digests()
+
+
+def test_depth_without_a_calibration_is_refused() -> None:
+    given = streams({14: measured(14)})
+    operator = MonoVisualOdometry()
+    operator.setup()
+    with pytest.raises(ValueError, match="not depth_info"):
+        operator.process(given["image"][0], given["image_info"][0], depth=given["depth"][0])
+
+
+def test_a_restored_operator_goes_on_with_the_same_bytes() -> None:
+    given = streams({k: measured(k) for k in range(0, COUNT, 3)})
+    depths = {d.stamp: d for d in given["depth"]}
+    calibrations = given["image_info"][0], None, None
+
+    def step(operator: MonoVisualOdometry, k: int) -> Any:
+        return operator.process(given["image"][k], *calibrations, depths.get(stamp(k)), given["depth_info"][0])
+
+    whole, first, second = MonoVisualOdometry(), MonoVisualOdometry(), MonoVisualOdometry()
+    for operator in (whole, first, second):
+        operator.setup()
+    for k in range(22):
+        step(whole, k)
+        step(first, k)
+    second.restore(unpack_state(pack_state(first.snapshot())))
+    for k in range(22, 32):
+        wanted, got = step(whole, k), step(second, k)
+        assert got["odometry"].digest() == wanted["odometry"].digest()
+        assert got["status"].digest() == wanted["status"].digest()
+    assert second.summary() == whole.summary()
+
+
+def test_two_sources_of_metres_make_a_scale_no_less_sure() -> None:
+    factor, better = Scale(0.01).weighed(1.02, 0.02, 0.02)
+    assert 1.0 < factor < 1.02
+    assert better.sigma <= 0.01
+    assert Scale().weighed(3.0, 0.05, 0.02) == (3.0, Scale(0.05))

@@ -1,0 +1,87 @@
+"""How far a pose of RGB-D odometry can be trusted, by what supports it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from operators.geometry import se3
+from operators.odometry.rgbd.drift import SINKING, TURNING, carried
+from operators.odometry.rgbd.fitting import Fit, Sighting
+from operators.odometry.rgbd.keyframe import Keyframe
+from operators.odometry.rgbd.movers import Movers
+from operators.odometry.rgbd.noise import Noise
+from operators.odometry.rgbd.surface import Surface
+from operators.odometry.tracking import moved_covariance
+
+K = np.array([[260.0, 0.0, 39.5], [0.0, 260.0, 29.5], [0.0, 0.0, 1.0]])
+
+
+def supported(tracks: float, depth: float, noise: Noise, missed: float = 0.3, recognised: bool = False) -> Fit:
+    """A fit to a hundred features and a thousand depths, of which shares agree."""
+    agree = round(100 * tracks)
+    sighting = Sighting(
+        np.eye(4), np.zeros((agree, 3)), np.zeros((agree, 2)), np.zeros(agree, np.int64), 100, recognised
+    )
+    still = Movers.none(K, (60, 80))
+    agreeing = round(1000 * depth)
+    return Fit(np.eye(4), np.eye(6), np.eye(6), agree, 1000, 1000, agreeing, noise, missed, still, sighting)
+
+
+def sigma2(tracks: float, depth: float, noise: float = 0.3, missed: float = 0.3, recognised: bool = False) -> float:
+    return float(np.trace(supported(tracks, depth, Noise(noise, 1.0), missed, recognised).covariance))
+
+
+def test_a_pose_that_tracks_and_depth_contradict_is_less_certain() -> None:
+    certain = sigma2(1.0, 1.0)
+    assert sigma2(0.5, 1.0) == sigma2(1.0, 0.8) == certain
+    assert 1.2 * certain < sigma2(0.8, 0.98) < sigma2(0.5, 0.9) < sigma2(0.3, 0.8)
+    assert sigma2(0.5, 0.9) > 5 * certain
+
+
+def test_what_is_in_dispute_pulls_the_farther_the_wider_the_gate() -> None:
+    assert sigma2(0.5, 0.9, noise=1.0) > 4 * sigma2(0.5, 0.9, noise=0.3)
+    assert sigma2(1.0, 1.0, noise=1.0) == sigma2(1.0, 1.0, noise=0.3)
+
+
+def test_descriptors_that_pair_wrongly_contradict_nothing() -> None:
+    assert sigma2(0.3, 0.98, recognised=True) == sigma2(0.9, 0.98, recognised=True) < sigma2(0.3, 0.98)
+
+
+def test_a_pose_is_less_certain_where_tracks_of_its_own_frame_miss() -> None:
+    """Not where those of earlier frames did, or where none were seen yet."""
+    assert sigma2(1.0, 1.0, noise=0.3, missed=0.8) > 10 * sigma2(1.0, 1.0, noise=0.8, missed=0.3)
+
+
+def first_keyframe() -> Keyframe:
+    """At the origin, 2 m before something."""
+    return Keyframe(
+        0, np.eye(4), 1e-6 * np.eye(6), np.zeros((4, 4), np.uint8), Surface(np.full((2, 2), 0.5, np.float32), K),
+        np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, np.int64),
+    )  # fmt: skip
+
+
+def test_a_turn_adds_doubt_about_itself() -> None:
+    known, T = first_keyframe(), se3.exp(np.array([0, 0, 0, 0, 0.2, 0.0]))
+    covariance, _ = carried(known, T)
+    added = covariance - moved_covariance(known.covariance, np.eye(4), T)
+    np.testing.assert_allclose(added[3:, 3:], np.diag([0, 0.2 * TURNING, 0]), atol=1e-15)
+
+
+def test_standing_still_adds_nothing() -> None:
+    known = first_keyframe()
+    np.testing.assert_allclose(carried(known, np.eye(4))[0], known.covariance, atol=1e-18)
+
+
+def test_what_sinks_goes_on_sinking() -> None:
+    """Over two steps twice as far, so four times the variance, not two times."""
+    known = replace(first_keyframe(), covariance=np.zeros((6, 6)))
+    step = se3.exp(np.array([0, 0, 0.2, 0, 0, 0]))
+    covariance, sunk = carried(known, step)
+    assert sunk[1] == pytest.approx(SINKING * 4.0 * 0.1)
+    then = replace(known, T_world_camera=step, covariance=covariance, sunk=sunk)
+    covariance, sunk = carried(then, step @ step)
+    assert covariance[1, 1] == pytest.approx((2 * SINKING * 0.4) ** 2)
+    assert sunk[1] == pytest.approx(2 * SINKING * 0.4)

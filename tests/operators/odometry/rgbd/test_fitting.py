@@ -1,0 +1,104 @@
+"""Which of two motions the corners of a view stand still in, and what moves there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import invert, transform_points
+from operators.geometry import se3
+from operators.geometry.pinhole import project
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.fitting import Fitter, Sighting
+from operators.odometry.rgbd.movers import TILE, Movers
+from operators.odometry.rgbd.noise import Noise
+from operators.odometry.rgbd.settings import RgbdOdometryConfig
+
+K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
+TURNED = se3.exp(np.array([0.02, 0.0, 0.01, 0.0, 0.01, 0.0]))  # the camera
+PUSHED = se3.exp(np.array([0.06, 0.02, 0.0, 0.0, 0.0, 0.05]))  # and what moves before it
+FITTER = Fitter(RgbdCamera(K, K, np.eye(4)), RgbdOdometryConfig(), Noise(0.3, 1.0))
+
+Points = NDArray[np.float64]
+
+
+def corners(count: int, left: float, right: float, depth: float, seed: int) -> Points:
+    """Points (N, 3) that lie evenly between two columns of the image, at depths that differ by a tenth."""
+    rng = np.random.default_rng(seed)
+    pixels = np.column_stack([rng.uniform(left, right, count), rng.uniform(10, 230, count)])
+    z = depth * rng.uniform(0.95, 1.05, count)
+    return np.column_stack([(pixels - K[:2, 2]) / 260.0 * z[:, None], z])
+
+
+def seen(still: Points, moving: Points, pushed: NDArray[np.float64] = PUSHED) -> tuple[Points, Points]:
+    """The points as the map has them, and their pixels in a camera that has turned while some were pushed."""
+    there = np.concatenate([still, transform_points(pushed, moving)])
+    noise = np.random.default_rng(3).normal(0, 0.1, (len(there), 2))
+    return np.concatenate([still, moving]), project(transform_points(invert(TURNED), there), K) + noise
+
+
+def followed(points: Points, pixels: Points) -> Sighting:
+    found = FITTER.follow(points, pixels, np.zeros(len(points), np.int64), 1.0, 15)
+    assert found is not None
+    return found
+
+
+def off(sighting: Sighting) -> float:
+    """How far the pose is from that of the camera, metres."""
+    return float(np.linalg.norm((invert(TURNED) @ sighting.T_world_camera)[:3, 3]))
+
+
+def test_the_larger_surface_stands_still_though_most_corners_are_on_something_near() -> None:
+    wall, somebody = corners(60, 10, 110, 3.0, 1), corners(110, 130, 310, 0.8, 2)
+    points, pixels = seen(wall, somebody)
+    most = FITTER.solve(points, pixels, np.zeros(len(points), np.int64), 1.0, 15)
+    assert most is not None
+    assert len(most.pixels) >= 100
+
+    found = followed(points, pixels)
+
+    assert off(found) < 0.01 < off(most)
+    assert found.tracked == 170
+    where = project(found.contrary, K)
+    assert len(where) >= 100
+    assert where[:, 0].min() > 115
+
+
+def test_most_corners_stand_still_where_what_moves_is_no_farther() -> None:
+    points, pixels = seen(corners(110, 130, 310, 1.5, 1), corners(60, 10, 110, 1.5, 2))
+    found = followed(points, pixels)
+    assert off(found) < 0.01
+    assert len(found.contrary) >= 50
+    assert project(found.contrary, K)[:, 0].max() < 150
+
+
+def test_far_corners_that_agree_with_both_motions_count_for_both() -> None:
+    """Somebody near sways by 2 cm, by which a wall 12 m away seems not to have moved: it says nothing for him."""
+    table, wall = corners(60, 10, 110, 1.5, 1), corners(30, 10, 310, 12.0, 4)
+    swayed = se3.exp(np.array([0.02, 0.01, 0.0, 0.0, 0.0, 0.0]))
+    found = followed(*seen(np.concatenate([table, wall]), corners(110, 130, 310, 0.8, 2), swayed))
+    assert off(found) < 0.01
+    assert len(found.contrary) >= 100
+    assert found.contrary[:, 2].max() < 1.0
+
+
+@pytest.mark.parametrize("count", [0, 20])
+def test_few_corners_far_away_contest_nothing(count: int) -> None:
+    points, pixels = seen(corners(120, 130, 310, 0.8, 1), corners(count, 10, 110, 5.0, 2))
+    found = followed(points, pixels)
+    assert off(found) < 0.01
+    assert not len(found.contrary)
+
+
+def test_tiles_around_what_moves_are_known_to_move() -> None:
+    still = Movers.none(K, (240, 320))
+    assert still.around(np.zeros((0, 3))) is still
+    point = np.array([[(100 - K[0, 2]) / 260.0, (60 - K[1, 2]) / 260.0, 1.0]])
+
+    moving = still.around(point)
+
+    row, column = 60 // TILE, 100 // TILE
+    assert moving.tiles[row - 1 : row + 2, column - 1 : column + 2].all()
+    assert np.count_nonzero(moving.tiles) == 9
+    assert moving.also(still).tiles.sum() == still.also(moving).tiles.sum() == 9

@@ -1,0 +1,92 @@
+"""The keyframes that an odometry remembers: how much memory they take, and which a view is laid on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from operators.odometry.rgbd.keyframe import Keyframe
+from operators.odometry.rgbd.local_map import DRIFTED, RECENT, LocalMap
+from operators.odometry.rgbd.surface import Surface
+
+K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 59.5], [0.0, 0.0, 1.0]])
+
+
+def keyframe(number: int) -> Keyframe:
+    """A view of a wall 2 m away, a step further along it each time."""
+    T = np.eye(4)
+    T[0, 3] = 0.2 * number
+    depth = np.full((120, 160), 2.0, np.float32) + np.linspace(0.0, 0.1, 160, dtype=np.float32)
+    none = np.zeros(0)
+    return Keyframe(
+        stamp=number,
+        T_world_camera=T,
+        covariance=np.zeros((6, 6)),
+        gray=np.zeros((120, 160), np.uint8),
+        surface=Surface.from_depth(depth, K, 0.1, 10.0, 1),
+        pixels=none.reshape(0, 2),
+        points=none.reshape(0, 3),
+        ages=none.astype(np.int64),
+    )
+
+
+def held(surface: Surface) -> int:
+    """Bytes that a surface keeps, what it has made of its grid included."""
+    values = [each for value in vars(surface).values() for each in (value if isinstance(value, tuple) else (value,))]
+    return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
+
+
+def test_only_the_newest_keyframes_keep_what_frames_are_compared_with() -> None:
+    known, capacity = LocalMap(20), 20
+    grid = held(keyframe(0).surface)
+    for number in range(2 * capacity):
+        known.add(keyframe(number))
+        for reference in known.references(known.newest.T_world_camera, 4, 0):
+            assert len(reference.surface.bordered_planes) == reference.surface.bordered.size
+    whole = held(known.newest.surface)
+
+    assert len(known.keyframes) == capacity
+    assert whole > 5 * grid
+    assert sum(held(k.surface) for k in known.keyframes) < capacity * 1.1 * grid + (RECENT + 4) * whole
+
+
+def test_planes_that_are_made_anew_are_the_same() -> None:
+    surface = keyframe(0).surface
+    planes, bordered = surface.bordered_planes, surface.bordered
+
+    surface.let_go()
+
+    assert surface.bordered_planes is not planes
+    assert surface.bordered_planes.tobytes() == planes.tobytes()
+    assert surface.bordered.tobytes() == bordered.tobytes()
+
+
+def test_a_view_is_not_laid_on_keyframes_from_which_the_odometry_may_have_drifted_far() -> None:
+    """It comes round to the first of them, whose place by the newest is as unsure as the way between them was long."""
+    known = LocalMap(20)
+    for number in range(4):
+        drifted = number * 0.4 * DRIFTED  # a standard deviation
+        known.add(replace(keyframe(number), covariance=np.diag([drifted**2, 0, 0, 0, 0, 0])))
+
+    sure = [k.stamp for k in known.nearby(keyframe(0).T_world_camera, 4, 0, reach=3.0)]
+
+    assert sure == [3, 2]
+
+
+def test_a_camera_that_is_placed_again_is_not_laid_on_what_it_drifted_past_meanwhile() -> None:
+    known = LocalMap(20)
+    known.add(replace(keyframe(1), covariance=np.diag([4 * DRIFTED**2, 0, 0, 0, 0, 0])))
+    known.add(keyframe(0))
+
+    assert [k.stamp for k in known.nearby(keyframe(0).T_world_camera, 4, 0)] == [0]
+
+
+def test_what_moves_is_not_told_by_a_keyframe_that_the_odometry_has_drifted_from() -> None:
+    """Laid on one that is off, what stands still would seem to stand before it."""
+    known = LocalMap(20)
+    known.add(replace(keyframe(0), covariance=np.diag([4 * DRIFTED**2, 0, 0, 0, 0, 0])))
+    for number in range(1, 4):
+        known.add(keyframe(number))
+
+    assert [k.stamp for k in known.earlier(keyframe(0).T_world_camera, 0)] == [1]

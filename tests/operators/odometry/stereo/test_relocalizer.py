@@ -1,0 +1,171 @@
+"""A stereo camera that was blind: its place is found again, or said to be unknown, in a made hallway."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from made_hallway import RIG, SIZE, Matrix, Pair, driving, pairs_at
+
+from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.messages.geometry import invert
+from operators.geometry import se3
+from operators.odometry.stereo.map import StereoMap
+from operators.odometry.stereo.memory import from_plain, to_plain
+from operators.odometry.stereo.relocalizer import StereoKeyframe, StereoRelocalizer, kept_pair
+from operators.odometry.stereo.settings import StereoOdometryConfig
+from operators.odometry.stereo.tracker import StereoOdometry
+from operators.odometry.tracking import MEASURED, Status, TrackResult
+
+PERIOD = 100_000_000
+DARK: Pair = (np.zeros(SIZE[::-1], np.uint8), np.zeros(SIZE[::-1], np.uint8))
+GAP = 10  # frames, a second
+CONFIG = StereoOdometryConfig()
+AROUND = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.pi, 0.0]))
+
+
+def seen(poses: list[Matrix], noise: int = 3, paper: int = 4) -> list[Pair]:
+    """What the rig sees in a hallway no part of which looks like another."""
+    return pairs_at(poses, noise, paper, times=4)
+
+
+@cache
+def sequence(count: int) -> tuple[list[Pair], list[Matrix]]:
+    poses = driving(count)
+    return seen(poses), poses
+
+
+def follow(pairs: list[Pair], config: StereoOdometryConfig | None = None) -> list[TrackResult]:
+    odometry = StereoOdometry(RIG, config)
+    return [odometry.track(left, right, i * PERIOD) for i, (left, right) in enumerate(pairs)]
+
+
+def off(result: TrackResult, T: Matrix) -> float:
+    """Metres between a pose and the true one."""
+    return float(np.linalg.norm((invert(T) @ result.T_world_camera)[:3, 3]))
+
+
+def aside(poses: list[Matrix]) -> list[Matrix]:
+    """The same way, driven a quarter of a metre beside and looking a little to the left: no image comes again."""
+    return [T @ se3.exp(np.array([0.25, 0.05, 0.0, 0.0, -0.04, 0.0])) for T in poses]
+
+
+def test_an_old_view_after_a_gap_is_found_at_its_place() -> None:
+    pairs, poses = sequence(25)
+    back = aside(poses[6::-1])
+    results = follow([*pairs[:18], *[DARK] * GAP, *seen(back)])
+    after = results[18 + GAP :]
+    assert [r.status for r in results[18 + GAP - 3 : 18 + GAP]] == [Status.LOST] * 3
+    assert after[0].status is Status.RELOCALISED
+    assert {r.status for r in after[1:]} == {Status.TRACKING}
+    assert max(off(r, T) for r, T in zip(after, back, strict=True)) < 0.15
+    assert np.sqrt(np.trace(after[0].covariance[:3, :3])) < 0.5 * np.sqrt(np.trace(results[27].covariance[:3, :3]))
+
+
+def test_a_camera_that_stood_still_in_the_dark_goes_on_where_it_was() -> None:
+    pairs, poses = sequence(25)
+    results = follow([*pairs[:18], *[DARK] * GAP, *seen([poses[17]] * 3, noise=9)])
+    after = results[18 + GAP :]
+    assert after[0].status is Status.RELOCALISED
+    assert max(off(r, poses[17]) for r in after) < 0.1
+
+
+@pytest.mark.parametrize("paper", [4, 11], ids=["the other way", "another hallway"])
+def test_a_view_that_nothing_kept_shows_is_lost_and_then_apart_until_an_old_one_comes(paper: int) -> None:
+    pairs, poses = sequence(25)
+    config = replace(CONFIG, give_up_s=0.8)
+    there = [poses[17] @ AROUND @ se3.exp(np.array([0.0, 0.0, 0.1 * k, 0.0, 0.0, 0.0])) for k in range(14)]
+    away = seen(there, noise=5, paper=paper)
+    back = aside(poses[8:2:-1])
+    results = follow([*pairs[:18], *[DARK] * GAP, *away, *seen(back, noise=6)], config)
+    unknown, after = results[18 + GAP : 18 + GAP + 14], results[18 + GAP + 14 :]
+    assert Status.RELOCALISED not in [r.status for r in unknown]
+    assert [r.status for r in unknown[:8]] == [Status.LOST] * 8
+    assert "a new map begins" in unknown[0].reason
+    assert {r.status for r in unknown[9:]} == {Status.TRACKING}
+    assert all(r.reason.endswith("its place in the old one unknown") for r in unknown[9:])
+    found = [k for k, r in enumerate(after) if r.status is Status.RELOCALISED]
+    assert found
+    assert "the map found again by" in after[found[0]].reason
+    measured = [(r, T) for r, T in zip(after[found[0] :], back[found[0] :], strict=True) if r.status in MEASURED]
+    assert max(off(r, T) for r, T in measured) < 0.15
+    assert "unknown" not in after[-1].reason
+
+
+def test_a_new_map_is_moved_to_where_it_belongs_when_the_old_one_is_seen() -> None:
+    """It turns round in the dark, drives on, and turns back in the light: the new map then joins the old one."""
+    pairs, poses = sequence(25)
+    turned = [poses[17] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.pi - 0.12 * k, 0.0])) for k in range(27)]
+    odometry = StereoOdometry(RIG)
+    given = [*pairs[:18], *[DARK] * GAP, *seen(turned, noise=5)]
+    results = [odometry.track(left, right, i * PERIOD) for i, (left, right) in enumerate(given)]
+    assert off(results[-1], turned[-1]) < 0.2
+    known = odometry.snapshot().map
+    assert known.apart_since is None
+    assert {k.segment for k in known.keyframes} == {0}
+    truth = dict(enumerate([*poses[:18], *[poses[17]] * GAP, *turned]))
+    for k in known.keyframes:
+        assert np.linalg.norm((invert(truth[k.stamp // PERIOD]) @ k.T_world_camera)[:3, 3]) < 0.3
+
+
+def test_the_same_pairs_give_the_same_bytes_also_from_a_snapshot_in_a_new_map() -> None:
+    pairs, poses = sequence(25)
+    there = seen([poses[17] @ AROUND] * 3, noise=5)
+    given = [*pairs[:18], *[DARK] * GAP, *there, *seen(aside(poses[8:4:-1]), noise=6)]
+    first = follow(given)
+    odometry, other = StereoOdometry(RIG), StereoOdometry(RIG)
+    for i, (left, right) in enumerate(given[:30]):
+        odometry.track(left, right, i * PERIOD)
+    other.restore(from_plain(unpack_state(pack_state(to_plain(odometry.snapshot())))))
+    for i, (left, right) in enumerate(given[30:], start=30):
+        result = other.track(left, right, i * PERIOD)
+        assert (result.status, result.reason) == (first[i].status, first[i].reason)
+        assert result.T_world_camera.tobytes() == first[i].T_world_camera.tobytes()
+        assert result.covariance.tobytes() == first[i].covariance.tobytes()
+
+
+def test_a_state_of_the_former_version_has_no_map() -> None:
+    state = StereoOdometry(RIG).snapshot()
+    former = {name: value for name, value in to_plain(state).items() if name != "map"}
+    assert from_plain(former).map.keyframes == ()
+
+
+# -- the pairs that are kept ---------------------------------------------------------------------------------------
+
+
+def kept(T: Matrix, stamp: int, pair: Pair = DARK, segment: int = 0) -> StereoKeyframe:
+    return kept_pair(*pair, stamp, T, np.zeros((6, 6)), 0.0, segment)
+
+
+def test_no_more_pairs_are_kept_than_asked_for_and_the_first_and_newest_stay() -> None:
+    known = StereoMap(unit=2.0)
+    for k, T in enumerate(driving(20)):
+        known = known.with_keyframe(kept(T, k), 8)
+    stamps = [k.stamp for k in known.keyframes]
+    assert len(stamps) == 8
+    assert stamps[0] == 0
+    assert stamps[-5:] == [15, 16, 17, 18, 19]
+
+
+def test_a_pose_elsewhere_than_shape_and_brightness_say_is_not_believed() -> None:
+    pairs, poses = sequence(25)
+    known = [kept(poses[k], k, pairs[k]) for k in (4, 8)]
+    relocalizer = StereoRelocalizer(RIG)
+    assert relocalizer.believed(kept(poses[6], 6, pairs[6]), known, 4.0)
+    for step in ([0.0, 0.0, 2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.2, 0.0]):
+        assert not relocalizer.believed(kept(poses[6] @ se3.exp(np.array(step)), 6, pairs[6]), known, 4.0)
+    other = seen([poses[6]], paper=11)[0]
+    assert not relocalizer.believed(kept(poses[6], 6, other), known, 4.0)
+
+
+@pytest.mark.parametrize("unit", [2.0, 4.0, 8.0])
+def test_a_view_is_found_in_any_unit_near_to_that_of_the_scene(unit: float) -> None:
+    pairs, poses = sequence(25)
+    known = [kept(poses[k], k, pairs[k]) for k in (0, 4, 8, 12)]
+    T = aside([poses[6]])[0]
+    view = kept(np.eye(4), 99, seen([T])[0])
+    found = list(StereoRelocalizer(RIG).found(view, known, known, unit))
+    assert len(found) == 1
+    assert np.linalg.norm((invert(T) @ found[0].T_world_camera)[:3, 3]) < 0.15

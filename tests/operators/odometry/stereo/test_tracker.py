@@ -1,0 +1,203 @@
+"""Stereo odometry against a rendered street with known motion, against failures, and against recorded data."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from made_hallway import RIG, SIZE, Gray, K, Matrix, Pair, driving, sequence
+
+from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.messages import CameraInfo, Image
+from dataflow.messages.geometry import invert
+from operators.geometry import se3
+from operators.odometry import StereoVisualOdometry
+from operators.odometry.stereo.adjustment import Sightings, StereoRig, adjust
+from operators.odometry.stereo.odometry import rig_of
+from operators.odometry.stereo.settings import StereoOdometryConfig
+from operators.odometry.stereo.tracker import StereoOdometry
+from operators.odometry.tracking import Status, TrackResult
+from operators.sources import KittiOdometry
+
+
+def follow(pairs: list[Pair]) -> list[TrackResult]:
+    odometry = StereoOdometry(RIG)
+    return [odometry.track(left, right, i * 100_000_000) for i, (left, right) in enumerate(pairs)]
+
+
+def errors(results: list[TrackResult], poses: list[Matrix]) -> tuple[float, float]:
+    """Largest error of position (m) and rotation (rad), no alignment."""
+    x = np.array([se3.log(invert(T) @ r.T_world_camera) for r, T in zip(results, poses, strict=True)])
+    return float(np.linalg.norm(x[:, :3], axis=1).max()), float(np.linalg.norm(x[:, 3:], axis=1).max())
+
+
+# -- accuracy ------------------------------------------------------------------------------------------------
+
+
+def test_pose_follows_known_motion() -> None:
+    pairs, poses = sequence(25)
+    results = follow(pairs)
+    assert {r.status for r in results} == {Status.TRACKING}
+    position, rotation = errors(results, poses)
+    assert position < 0.05  # of ten metres
+    assert rotation < 0.005
+
+
+def test_disparities_that_are_off_by_a_constant_do_not_stretch_the_way() -> None:
+    """The right image is shifted by a third of a pixel, as an imperfect rectification leaves it."""
+    pairs, poses = sequence(25)
+    shift = np.array([[1.0, 0.0, 0.33], [0.0, 1.0, 0.0]])
+    shifted = [(left, cv2.warpAffine(right, shift, SIZE, borderMode=cv2.BORDER_REPLICATE)) for left, right in pairs]
+    odometry = StereoOdometry(RIG)
+    results = [odometry.track(left, right, i * 100_000_000) for i, (left, right) in enumerate(shifted)]
+    assert odometry.snapshot().offset == pytest.approx(0.33, abs=0.15)
+    late = np.linalg.norm(results[-1].T_world_camera[:3, 3] - results[12].T_world_camera[:3, 3])
+    truth = np.linalg.norm(poses[-1][:3, 3] - poses[12][:3, 3])
+    assert late == pytest.approx(truth, rel=0.01)
+
+
+def test_no_part_of_the_window_holds_the_length_that_a_wrong_offset_gave_it() -> None:
+    """Poses and points are 2 % too far, as of an offset of 0.4 px that nobody knew of when they were measured."""
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-5, 5, 60), rng.uniform(-2, 2, 60), rng.uniform(8, 40, 60)])
+    poses = np.array(driving(8))
+    frames, indices = (a.ravel() for a in np.meshgrid(np.arange(8), np.arange(60), indexing="ij"))
+    pixels = np.concatenate([RIG.project((points - T[:3, 3]) @ T[:3, :3]) for T in poses])
+    pixels[:, 2] += 0.4
+    stretched, offset = poses.copy(), 0.0
+    stretched[:, :3, 3] *= 1.02
+    found, far = stretched, points * 1.02
+    for _ in range(30):  # an offset is believed slowly
+        adjusted = adjust(
+            RIG, found, far, Sightings(frames, indices, pixels), offset, 0.3, StereoOdometryConfig().fixed, 4
+        )
+        found, far, offset = adjusted.poses, adjusted.points, adjusted.offset
+    lengths = np.diff(found[:, 2, 3]) / np.diff(poses[:, 2, 3])
+    assert offset > 0.2
+    assert lengths.max() < 1.016  # every step has got shorter, none holds what was believed at first
+    assert np.ptp(lengths) < 0.003
+
+
+def test_adjustment_finds_poses_and_points_again() -> None:
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-5, 5, 60), rng.uniform(-2, 2, 60), rng.uniform(6, 25, 60)])
+    poses = np.array(driving(5))
+    frames, indices = (a.ravel() for a in np.meshgrid(np.arange(5), np.arange(60), indexing="ij"))
+    pixels = np.concatenate([RIG.project((points - T[:3, 3]) @ T[:3, :3]) for T in poses])
+    off = np.array([T @ se3.exp(rng.normal(0, 0.01, 6)) if i else T for i, T in enumerate(poses)])
+    seen = Sightings(frames, indices, pixels)
+    found = adjust(RIG, off, points + rng.normal(0, 0.1, points.shape), seen, 0.0, 0.3, 1, 10)
+    np.testing.assert_allclose(found.poses, poses, atol=1e-3)
+    np.testing.assert_allclose(found.points, points, atol=2e-2)
+    assert found.offset == pytest.approx(0.0, abs=1e-2)
+
+
+# -- failures ------------------------------------------------------------------------------------------------
+
+
+def test_black_and_frozen_images_are_noticed_and_bridged() -> None:
+    pairs, poses = sequence(25)
+    dark = (np.zeros_like(pairs[0][0]), pairs[0][1])
+    results = follow([dark if 10 <= i < 12 else pair for i, pair in enumerate(pairs)])
+    assert [r.status for r in results[10:12]] == [Status.PREDICTED] * 2
+    assert results[10].reason == "left image is black"
+    assert results[12].status is Status.TRACKING
+    assert errors(results[12:], poses[12:])[0] < 0.1
+    frozen = follow([*pairs[:10], pairs[9]])
+    assert frozen[10].reason == "left image repeats the last one; right image repeats the last one"
+
+
+def test_long_darkness_is_a_loss_that_the_covariance_tells_of() -> None:
+    pairs, poses = sequence(25)
+    dark = (np.zeros_like(pairs[0][0]),) * 2
+    results = follow([dark if 5 <= i < 15 else pair for i, pair in enumerate(pairs)])
+    assert results[14].status is Status.LOST
+    sigmas = [np.sqrt(np.trace(r.covariance[:3, :3])) for r in results[4:15]]
+    assert all(b > a for a, b in pairwise(sigmas))
+    last = invert(results[18].T_world_camera) @ results[24].T_world_camera
+    assert np.linalg.norm(se3.log(invert(invert(poses[18]) @ poses[24]) @ last)[:3]) < 0.05
+
+
+def test_blank_images_give_no_pose() -> None:
+    blank = (np.full((200, 480), 90, np.uint8),) * 2
+    assert {r.status for r in follow([blank] * 3)} <= {Status.LOST, Status.PREDICTED}
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "stamp", "message"),
+    [
+        (np.zeros((200, 480), np.float32), np.zeros((200, 480), np.uint8), 5, "left must be"),  # float
+        (np.zeros((200, 480), np.uint8), np.zeros((100, 480), np.uint8), 5, "differ in size"),  # other size
+        (np.zeros((200, 480), np.uint8), np.zeros((200, 480), np.uint8), 0, "does not follow"),  # same stamp
+    ],
+)
+def test_wrong_input_is_refused(left: Gray, right: Gray, stamp: int, message: str) -> None:
+    odometry = StereoOdometry(RIG)
+    odometry.track(*sequence(25)[0][0], 0)
+    with pytest.raises(ValueError, match=message):
+        odometry.track(left, right, stamp)
+
+
+def test_wrong_calibration_is_refused() -> None:
+    with pytest.raises(ValueError, match="baseline"):
+        StereoRig(K, 0.0)
+    with pytest.raises(ValueError, match="fixed"):
+        StereoOdometryConfig(window=2, fixed=2)
+    left, right = infos()
+    with pytest.raises(ValueError, match="P"):
+        rig_of(left, left.replace(P=None))
+    with pytest.raises(ValueError, match="one K"):
+        rig_of(left.replace(P=None, K=K * [[2.0], [2.0], [1.0]]), right)
+
+
+# -- the operator -----------------------------------------------------------------------------------------
+
+
+def infos() -> tuple[CameraInfo, CameraInfo]:
+    P = np.column_stack([K, [-K[0, 0] * RIG.baseline, 0.0, 0.0]])
+    left = CameraInfo(stamp=0, frame="left", width=SIZE[0], height=SIZE[1], K=K, P=np.column_stack([K, np.zeros(3)]))
+    return left, CameraInfo(stamp=0, frame="right", width=SIZE[0], height=SIZE[1], K=K, P=P)
+
+
+def test_operator_goes_on_alike_from_a_recorded_state() -> None:
+    pairs, _ = sequence(25)
+
+    def given(i: int) -> tuple[Image, Image, CameraInfo, CameraInfo]:
+        left, right = (
+            Image(stamp=i * 100_000_000, frame=f, data=d) for f, d in zip(("left", "right"), pairs[i], strict=True)
+        )
+        return left, right, *infos()
+
+    one, other = StereoVisualOdometry(), StereoVisualOdometry()
+    one.setup()
+    other.setup()
+    for i in range(10):
+        sent = one.process(*given(i))
+    assert (sent["odometry"].child_frame, sent["status"].names) == ("left", ("visual_odometry",))
+    other.restore(unpack_state(pack_state(one.snapshot())))
+    for i in range(10, 15):
+        a, b = one.process(*given(i)), other.process(*given(i))
+        assert {port: m.digest() for port, m in a.items()} == {port: m.digest() for port, m in b.items()}
+    assert one.summary() == other.summary() == {"tracking": 15}
+
+
+# -- recorded data -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.data
+def test_recorded_drive_is_followed_within_one_percent(data_dir: Path) -> None:
+    folder = data_dir / "kitti_odometry_06"
+    if not folder.is_dir():
+        pytest.skip(f"no folder {folder}")
+    source = KittiOdometry(path=str(folder), stop=21)
+    source.setup()
+    statics = source.static_outputs()
+    odometry = StereoOdometry(rig_of(statics["left_info"], statics["right_info"]))  # type: ignore[arg-type]
+    for step in source.stream():
+        result = odometry.track(step["left"].data, step["right"].data, step["left"].stamp)  # type: ignore[attr-defined]
+        assert result.status is Status.TRACKING
+        way = step["ground_truth"].matrix()[:3, 3]  # type: ignore[attr-defined]
+    assert np.linalg.norm(result.T_world_camera[:3, 3]) == pytest.approx(np.linalg.norm(way), rel=0.02)
