@@ -228,7 +228,7 @@ def test_ctrl_c_ends_a_run_in_order_with_code_130(small: Path, tmp_path: Path) -
 
     assert running.returncode == 130
     assert "small  interrupted" in stdout
-    assert f"wrote {path}" in stdout
+    assert f"wrote   {path}" in stdout
 
 
 ABSENT = """\
@@ -309,7 +309,7 @@ def test_ctrl_c_while_the_graph_starts_is_a_stop_and_no_failure(tmp_path: Path) 
     assert running.returncode == 130
     assert "slow  interrupted while starting" in stdout
     assert "still starting, and killed: process 'last'" in stdout
-    assert "wrote run.mcap (0 messages" in stdout
+    assert "wrote   run.mcap (0 messages" in stdout
     assert "error" not in stderr
     assert "fail" not in stdout + stderr
     with Recording(tmp_path / "run.mcap") as recording:
@@ -336,7 +336,7 @@ def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
     told = dataflow(*words, "--overwrite")
 
     assert "opening" in told.stderr
-    assert f"wrote {saved}" in told.stdout
+    assert f"wrote   {saved}" in told.stdout
     for _ in range(100):
         if noted.exists():
             break
