@@ -84,7 +84,11 @@ class Mapper:
     """Lifter, planes and map, wired as in the perception graph."""
 
     def __init__(self, **params: Any) -> None:
-        self.lifter, self.planes, self.known = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(**params)
+        self.lifter, self.planes, self.known = (
+            ObjectLifter(labels="simulator"),
+            PlaneSegmenter(**SEARCH),
+            SemanticMap(labels="simulator", **params),
+        )
         for operator in (self.lifter, self.planes, self.known):
             operator.setup()
 
@@ -124,7 +128,7 @@ class Mapped:
 
 def mapped(world: World) -> list[Mapped]:
     """Returns what is mapped after each frame."""
-    mapper, recognizer = Mapper(), PostureRecognizer()
+    mapper, recognizer = Mapper(), PostureRecognizer(labels="simulator")
     recognizer.setup()
     found = []
     for frame in world.frames:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Activity, Boxes3D, Classification, Odometry, Pose, SceneGraph
 from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.labels import LabelSpace, labels_file
 from operators.recognition.activity_model import ActivityModel
 from operators.recognition.activity_samples import STEP
-from operators.recognition.agent_features import AGENTS, AgentWindow, Surroundings
+from operators.recognition.agent_features import AgentWindow, Surroundings
 from operators.recognition.looks import Looks
 from operators.recognition.scene_agents import mattering, seen_times
 from operators.scene.agents import UNKNOWN
@@ -65,6 +66,7 @@ class ActivityRecognizer(Operator):
     activities: Out[Activity] = Out(doc="a row an agent: activity, probabilities, what it is done to, since when")
 
     weights: str | None = Param(None, doc="network file of `dataflow train activity`; none means the shipped one")
+    labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives the roles of classes")
     least: float = Param(0.35, ge=0, lt=1, live=True, doc="probability below which an activity is unknown")
     posture: float = Param(1.0, ge=0, live=True, doc="how much postures count beside the network; 0 for not at all")
     memory: float = Param(1.5, ge=0, doc="time out of sight after which an activity is unknown", unit="s")
@@ -77,6 +79,7 @@ class ActivityRecognizer(Operator):
         """Opens the network. Raises FileNotFoundError or NetworkFileError."""
         file = self.use_file(str(shipped("activity.onnx")) if self.weights is None else self.weights)
         self._model = ActivityModel.open(file)
+        self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._classes = (*self._model.classes, UNKNOWN)
         self._counts: Counter[str] = Counter()
         self._begin()
@@ -96,11 +99,11 @@ class ActivityRecognizer(Operator):
         if robot is not None and robot.frame != nodes.frame:
             raise ValueError(f"the robot is in {robot.frame!r}, the nodes in {nodes.frame!r}")
         same = objects is not None and (objects.stamp, objects.frame) == (nodes.stamp, nodes.frame)
-        bodies, unusable = mattering(nodes, objects if same else None)
+        bodies, unusable = mattering(nodes, self._labels, objects if same else None)
         seen = seen_times(nodes)
         time = nodes.stamp * 1e-9
         self._around.update(time, bodies)
-        agents = sorted((b for b in bodies if b.label in AGENTS), key=lambda b: b.id)
+        agents = sorted((b for b in bodies if b.agent), key=lambda b: b.id)
         self._agents = {b.id: self._agents.get(b.id) or self._fresh(nodes.stamp) for b in agents}
         here = None if robot is None else robot.matrix()[:2, 3]
         looks = self._looks(postures) if postures is not None and postures.stamp == nodes.stamp else {}

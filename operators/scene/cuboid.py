@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.labels import SizePrior
 from operators.scene.box_images import CORNERS, ELLIPSE, images
-from operators.scene.class_sizes import Usual
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,7 +51,7 @@ def fit_cuboid(
     start: Box,
     views: Sequence[ImageView],
     points: Array,
-    usual: Sequence[Usual],
+    usual: Sequence[SizePrior],
     before: tuple[int, Box] | None = None,
     heading: float | None = None,
     noise: float = 0.0,
@@ -159,7 +159,7 @@ def _along(points: Array, yaw: float) -> Box:
 
 
 @lru_cache(maxsize=64)  # as many classes
-def _priors(usual: tuple[Usual, ...]) -> tuple[Array, Array, Mask]:
+def _priors(usual: tuple[SizePrior, ...]) -> tuple[Array, Array, Mask]:
     """Returns the usual log sizes (A, 3), their spreads, with the sides on the ground either way round, and which of
     them (A,) always lie along the room.
     """

@@ -24,9 +24,9 @@ class GoalInference:
     Each step of the path speaks for the candidates to which it leaves less way: its log likelihood is `trust` times the
     way saved, less the way walked, so detours count against a goal. A step fades over `memory` seconds. The nearer one
     is likelier. Candidates are judged by all of the path that is remembered and by where they are now, so it does not
-    matter since when, or where before, the map has had them. The way to one is the straight line to its middle.
-    After Ramirez and Geffner, "Probabilistic plan recognition using off-the-shelf classical planners", 2010, with
-    straight lines for plans.
+    matter since when, or where before, the map has had them. The way to one is the straight line to its middle. After
+    Ramirez and Geffner, "Probabilistic plan recognition using off-the-shelf classical planners", 2010, with straight
+    lines for plans.
     """
 
     def __init__(self, trust: float, memory: float, elsewhere: float) -> None:

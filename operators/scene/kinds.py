@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.class_sizes import Usual
+from operators.labels import LabelSpace, SizePrior
 from operators.scene.map_object import MapObject
 from operators.scene.matching import LARGE
 
@@ -20,10 +20,17 @@ _ODD = 4.0  # spreads above the usual size, from which an object is doubted
 class Kinds:
     """Tells of objects and classes what follows from which classes move and which sizes are usual."""
 
+    @classmethod
+    def of(cls, labels: LabelSpace, classes: Sequence[str]) -> Kinds:
+        """Returns what a label space has about the classes of a map, by their numbers."""
+        movers, carriers, portable = (labels.indices(classes, role) for role in ("agent", "person", "portable"))
+        usual = {k: labels.sizes(name) for k, name in enumerate(classes) if labels.sizes(name)}
+        return cls(movers, usual, carriers, portable)
+
     def __init__(
         self,
         movers: Iterable[int],
-        usual: Mapping[int, Sequence[Usual]],
+        usual: Mapping[int, Sequence[SizePrior]],
         carriers: Iterable[int] = (),
         portable: Iterable[int] = (),
     ) -> None:

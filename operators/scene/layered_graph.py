@@ -24,8 +24,6 @@ class GraphSettings:
     begin: float = 0.5
     end: float = 0.25
     smoothing: float = 0.4
-    agents: tuple[str, ...] = ("person", "robot", "ball")
-    goals: tuple[str, ...] = ("chair", "table", "mug", "bottle", "door", "shelf")
     trust: float = 1.0
     memory: float = 2.0
     elsewhere: float = 2.5
@@ -82,7 +80,7 @@ class LayeredGraph:
     def update(self, stamp: int, things: Sequence[Body], T_world_robot: Array | None) -> Snapshot:
         """Takes the objects of one time, which may have surfaces among them, and the robot's pose."""
         s, time = self._settings, stamp * 1e-9
-        bodies = [b if b.agent == (b.label in s.agents) else replace(b, agent=not b.agent) for b in things]
+        bodies = list(things)
         for k, body in enumerate(bodies):
             if body.agent:
                 motion = self._motions.setdefault(body.id, Motion())
@@ -93,8 +91,8 @@ class LayeredGraph:
         vanished = self._known - ids
         self._forget(vanished)
         now = relations_of(bodies, T_world_robot, s.rules, self._pairs)
-        people = [b for b in bodies if b.agent and b.label == "person"]
-        wanted = [b for b in bodies if b.label in s.goals]
+        people = [b for b in bodies if b.person]
+        wanted = [b for b in bodies if "goal" in b.roles]
         goals = {b.id: self._goals_of(time, b, wanted, now) for b in people}
         held, began, ended = self._hysteresis.update(stamp, now)
         for agent, likely in goals.items():

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.labels import SizePrior
 from operators.scene.cells import Cells, standing_box
-from operators.scene.class_sizes import Usual
 from operators.scene.cuboid import ImageView, fit_cuboid
 
 Array = NDArray[np.float64]
@@ -128,7 +128,7 @@ class MapObject:
 
     def fit(
         self,
-        usual: Mapping[int, Sequence[Usual]],
+        usual: Mapping[int, Sequence[SizePrior]],
         heading: float | None = None,
         noise: float = 0.0,
         floor: float | None = None,
@@ -210,7 +210,7 @@ def _most_alike(ways: Sequence[Array]) -> int:
     return int(np.argmax(near[:-1].max(axis=1)))
 
 
-def completed(box: tuple[Array, Array, float], view: Array, usual: Usual) -> tuple[Array, Array, float]:
+def completed(box: tuple[Array, Array, float], view: Array, usual: SizePrior) -> tuple[Array, Array, float]:
     """Returns a box that is as deep as usual where only its near side was seen.
 
     `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. Of the usual

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from operators.scene.carrying import carried
 from operators.scene.cells import Cells
-from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, WHOLE, MapObject
@@ -45,24 +44,14 @@ class ObjectMap:
     they are seen beside each other. Places that a view looks through lose voxels; an object whose
     place is empty, or that is in plain view and not detected, loses evidence and at last goes. If one of its class and
     size appears elsewhere, that is the same object, moved.
-    `movers` are classes whose place is that of their last view; they are joined by predicted place. Small ones (a ball)
-    are as other things are until a view looks through their place and one of their class is near.
+    The place of what moves by itself is that of its last view; it is joined by predicted place. Small ones (a ball) are
+    as other things are until a view looks through their place and one of their class is near.
 
     After Hughes et al., "Hydra", 2022, and Gu et al., "ConceptGraphs", 2024; existence as in occupancy grids.
     """
 
-    def __init__(
-        self,
-        classes: int,
-        movers: Iterable[int],
-        settings: MapSettings,
-        usual: Mapping[int, Sequence[Usual]] | None = None,
-        carriers: Iterable[int] = (),
-        portable: Iterable[int] = (),
-    ) -> None:
-        """`usual` are the usual sizes by class; what is `portable` may be in the hands of `carriers`."""
-        self._settings, self._classes = settings, classes
-        self._kinds = Kinds(movers, usual or {}, carriers, portable)
+    def __init__(self, classes: int, kinds: Kinds, settings: MapSettings) -> None:
+        self._settings, self._classes, self._kinds = settings, classes, kinds
         self.objects: dict[int, MapObject] = {}
         self.gone: dict[int, tuple[int, MapObject]] = {}
         self.moved = 0

@@ -27,13 +27,14 @@ from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_po
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import in_range
 from operators.geometry.extrinsics import transform_between
-from operators.scene.class_sizes import CLASS_SIZES
+from operators.labels import LabelSpace, labels_file
 from operators.scene.cuboid import ImageView
+from operators.scene.kinds import Kinds
+from operators.scene.known_classes import warn_of_unknown
 from operators.scene.map_file import LearnedFile, SavedMap, learned_files, together
 from operators.scene.map_nodes import nodes_of, seen_surfaces
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings, Observation
-from operators.scene.named_classes import unknown_classes
 from operators.scene.object_map import ObjectMap
 from operators.scene.range_view import RangeView
 from operators.scene.surface_map import SurfaceMap
@@ -98,10 +99,8 @@ class SemanticMap(Operator):
     views: int = Param(3, ge=1, doc="and views from which it was seen; those less than 0.1 s after another count less")
     missed: float = Param(0.12, ge=0, doc="evidence that a view in which it is plain but not detected takes")
     plain: float = Param(0.03, gt=0, doc="angle of view from which an object should be detected", unit="rad")
-    movers: list[str] = Param(["person", "robot", "ball"], doc="classes that move by themselves")
-    carriers: list[str] = Param(["person"], doc="classes that have things in their hands")
-    portable: list[str] = Param(["mug", "bottle"], doc="classes of such things")
-    mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which such objects are forgotten", unit="s")
+    labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives roles and sizes of classes")
+    mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which agents are forgotten", unit="s")
     move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
     surface_views: int = Param(2, ge=1, doc="views of a surface from which it is given")
     max_range: float = Param(6.0, gt=0, doc="farther points are not used", unit="m")
@@ -112,8 +111,9 @@ class SemanticMap(Operator):
     )
 
     def setup(self) -> None:
-        """Raises FileNotFoundError or ValueError for a saved map that is none, or has voxels of another size."""
+        """Raises FileNotFoundError or ValueError for a bad label space or map, or a map with voxels of another size."""
         self._counts: Counter[str] = Counter()
+        self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._known = None if self.map_file is None else SavedMap.read(Path(self.use_file(self.map_file)))
         if self._known is not None and self._known.voxel != self.voxel:
             raise ValueError(f"{self.map_file} has voxels of {self._known.voxel} m, but voxel is {self.voxel}")
@@ -228,7 +228,7 @@ class SemanticMap(Operator):
     def _opened(self, boxes: Boxes3D, pose: Pose | Odometry) -> ObjectMap:
         if self._map is None:
             self._classes, self._frame = boxes.class_names, pose.frame
-            self._counts["unknown classes"] = unknown_classes(self, ("movers", "carriers", "portable"), self._classes)
+            self._counts["unknown classes"] = warn_of_unknown(self, self._labels, self._classes)
             self._map = self._made()
             if self._known is not None and self._known.objects:
                 self._take_up(self._known, boxes.stamp)
@@ -243,7 +243,7 @@ class SemanticMap(Operator):
         if saved.frame != self._frame:
             raise ValueError(f"the pose is in {self._frame!r}, {self.map_file} in {saved.frame!r}")
         assert self._map is not None
-        objects, surfaces = saved.begun(stamp, self._classes, self.movers)
+        objects, surfaces = saved.begun(stamp, self._classes, self._labels)
         self._map.restore(objects)
         self._surfaces.restore(surfaces)
 
@@ -259,12 +259,7 @@ class SemanticMap(Operator):
             mover_memory=self.mover_memory,
             move_memory=self.move_memory,
         )
-        movers = [k for k, name in enumerate(self._classes) if name in self.movers]
-        usual = {k: CLASS_SIZES[name] for k, name in enumerate(self._classes) if name in CLASS_SIZES}
-        carriers, portable = (
-            [k for k, name in enumerate(self._classes) if name in names] for names in (self.carriers, self.portable)
-        )
-        return ObjectMap(max(len(self._classes), 1), movers, settings, usual, carriers, portable)
+        return ObjectMap(max(len(self._classes), 1), Kinds.of(self._labels, self._classes), settings)
 
     def _observation(
         self,

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from operators.labels import LabelSpace, labels_file
 from operators.scene.bodies import Body
 from operators.scene.goals import GoalInference
 from operators.scene.layered_graph import GraphSettings, LayeredGraph
 
 STEP = 250_000_000
+roles = LabelSpace.read(Path(labels_file("simulator"))).roles
 
 
 def thing(id: int, label: str, x: float, y: float, *, size: float = 0.1, z: float = 0.8, yaw: float = 0.0) -> Body:
-    return Body(id, label, np.array([x, y, z]), np.full(3, size), yaw, np.zeros(3))
+    return Body(id, label, np.array([x, y, z]), np.full(3, size), yaw, np.zeros(3), roles(label))
 
 
 def person(x: float, y: float) -> Body:
-    return Body(9, "person", np.array([x, y, 0.85]), np.array([0.6, 0.4, 1.7]), 0.0, np.zeros(3), agent=True)
+    return Body(9, "person", np.array([x, y, 0.85]), np.array([0.6, 0.4, 1.7]), 0.0, np.zeros(3), roles("person"))
 
 
 def after(places: list[tuple[float, float]], goals: list[Body]) -> dict[int, float]:
@@ -69,7 +73,7 @@ def test_the_jitter_of_a_box_that_stands_still_says_nothing_against_any_goal() -
 
 
 def test_a_person_in_a_graph_heads_for_what_it_walks_to() -> None:
-    table = Body(1, "table", np.array([1.0, 0.0, 0.4]), np.array([0.6, 1.6, 0.8]), 0.0, np.zeros(3))
+    table = Body(1, "table", np.array([1.0, 0.0, 0.4]), np.array([0.6, 1.6, 0.8]), 0.0, np.zeros(3), roles("table"))
     door = thing(2, "door", -3.0, 0.0, size=1)
     graph = LayeredGraph(GraphSettings())
     for k in range(10):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from operators.labels import SizePrior
 from operators.scene.cells import Cells
-from operators.scene.class_sizes import Usual
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings
@@ -75,7 +75,7 @@ def test_only_small_things_of_classes_that_move_or_are_taken_may_leave() -> None
 
 
 def test_an_object_is_doubted_whose_size_is_four_spreads_above_every_usual_one() -> None:
-    usual = (Usual((0.1, 0.2, 0.3), (0.1, 0.2, 0.3)), Usual((0.3, 0.4, 0.1), (0.1, 0.1, 0.1)))
+    usual = (SizePrior((0.1, 0.2, 0.3), (0.1, 0.2, 0.3)), SizePrior((0.3, 0.4, 0.1), (0.1, 0.1, 0.1)))
     kinds, crate, rng = Kinds([BALL], {CRATE: usual, BALL: usual}), thing(1.0, CRATE), np.random.default_rng(0)
     fits = []
     for _ in range(300):

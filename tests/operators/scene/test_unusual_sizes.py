@@ -29,7 +29,7 @@ def mapped(solid: Solid, label: str) -> Played:
         for name, message in (lifted | {"cloud": cloud, "pose": pose}).items():
             if name in streams:
                 streams[name].append(message)
-    return play(SemanticMap(), streams | {"image_info": [INFO]}, static=["image_info"])
+    return play(SemanticMap(labels="simulator"), streams | {"image_info": [INFO]}, static=["image_info"])
 
 
 @pytest.mark.parametrize(
