@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.messages.geometry import quaternion_to_matrix
-from operators.chi_square import quantile
+from operators.estimation.chi_square import quantile
 from operators.fusion.error_state import log_rotation
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.operator import Batch, Duration, In, Operator, Param, Sampled
 from operators.association import mutually_nearest
-from operators.chi_square import quantile
+from operators.estimation.chi_square import quantile
 from operators.evaluation.consistency import (
     Innovations,
     band,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Image, Number, Odometry, Pose
 from dataflow.messages.geometry import invert, matrix_to_quaternion
 from dataflow.operator import Batch, Duration, In, Operator, Out, Param, Sampled
-from operators.chi_square import quantile
+from operators.estimation.chi_square import quantile
 from operators.evaluation.charts import Curve, chart, plan, tiled
 from operators.evaluation.consistency import Innovations, covariance_of, innovations, normalised, pose_error
 

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.chi_square import quantile
+from operators.estimation.chi_square import quantile
 from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, VELOCITY, State
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Imu, Odometry
 from dataflow.messages.geometry import yaw_of
+from operators.estimation.particles import wrapped
 from operators.localization.motion import DriveNoise
-from operators.localization.particles import wrapped
 
 Array = NDArray[np.float64]
 _STILL = 1e-4

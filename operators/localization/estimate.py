@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Odometry
 from dataflow.messages.geometry import quaternion_from_yaw, transform_matrix, yaw_of
-from operators.localization.particles import wrapped
+from operators.estimation.particles import wrapped
 
 Array = NDArray[np.float64]
 Word = Literal["waiting", "searching", "ambiguous", "localised", "lost"]

@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.localization.motion import moved
-from operators.localization.observations import Observation
-from operators.localization.particles import (
+from operators.estimation.particles import (
     bins_of,
     effective_size,
     evidence_of,
@@ -24,6 +22,8 @@ from operators.localization.particles import (
     particles_needed,
     systematic,
 )
+from operators.localization.motion import moved
+from operators.localization.observations import Observation
 
 Array = NDArray[np.float64]
 _TOLERATED = 0.75

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.localization.particles import wrapped
+from operators.estimation.particles import wrapped
 
 Array = NDArray[np.float64]
 

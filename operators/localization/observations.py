@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.estimation.particles import normalised, systematic, wrapped
 from operators.localization.likelihood_field import LikelihoodField
-from operators.localization.particles import normalised, systematic, wrapped
 
 Array = NDArray[np.float64]
 _MEDIAN = {1: 0.455, 2: 1.386, 3: 2.366}

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.estimation.particles import effective_size, evidence_of, moments, normalised, systematic, wrapped
 from operators.localization.motion import composed, moved
 from operators.localization.observations import Observation
-from operators.localization.particles import effective_size, evidence_of, moments, normalised, systematic, wrapped
 
 Array = NDArray[np.float64]
 _FAR, _TURNED = 1.0, 0.5

@@ -1,8 +1,7 @@
 """Bundle adjustment of RGB-D views: poses and points that best explain pixels, depths and the motions between views.
 
-Gauss-Newton, reweighted by Cauchy's function, on all views that are free and all points at once; points are eliminated
-by the Schur complement. Triggs et al., "Bundle adjustment, a modern synthesis", 2000; with depths as in Mur-Artal and
-Tardós, "ORB-SLAM2", 2017.
+Gauss-Newton, reweighted by Cauchy's function, on all views that are free and all points at once. Triggs et al.,
+"Bundle adjustment, a modern synthesis", 2000; with depths as in Mur-Artal and Tardós, "ORB-SLAM2", 2017.
 """
 
 from __future__ import annotations
@@ -13,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.estimation.bundle import PosesAndPoints, pose_jacobian
+from operators.estimation.kernels import cauchy
 from operators.geometry.pinhole import Points
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.slam import motions
@@ -77,7 +78,6 @@ class _Solver:
     ) -> None:
         self.camera, self.seen, self.fixed, self.strength = camera, seen, fixed, strength
         self.count, self.size = poses - fixed, points
-        self.free = np.flatnonzero(seen.views >= fixed)
         self.known = np.isfinite(seen.depths)
         self.depths = np.where(self.known, seen.depths, 1.0)
 
@@ -101,37 +101,16 @@ class _Solver:
         """Returns the free poses and the points after a step, and the largest part of the poses' step."""
         seen, fixed, count, size = self.seen, self.fixed, self.count, self.size
         p, r, squared, R = self.residuals(poses, points)
-        w = self.strength / (1.0 + squared / CAUCHY**2)
+        w = self.strength * cauchy(squared / CAUCHY**2)
+        weights = np.column_stack([w[:, 0], w[:, 0], np.where(self.known, w[:, 1], 0.0)])
         J = self._derivatives(p)
-        root = np.sqrt(np.column_stack([w[:, 0], w[:, 0], np.where(self.known, w[:, 1], 0.0)]))
-        J *= root[:, :, None]
-        r = np.where(root > 0, r * root, 0.0)
-        Jl = J @ R
-        # d p / d x of the pose's right perturbation is [-I, [p]x]; of the point, R.
-        f = self.free
-        Jp = np.empty((len(f), 3, 6))
-        Jp[:, :, :3] = -J[f]
-        Jp[:, :, 3:] = np.cross(J[f], p[f][:, None, :])
-        V, c = np.zeros((size, 3, 3)), np.zeros((size, 3))
-        np.add.at(V, seen.points, Jl.transpose(0, 2, 1) @ Jl)
-        np.add.at(c, seen.points, np.einsum("sij,si->sj", Jl, r))
-        V[:, np.arange(3), np.arange(3)] += 1e-6
-        V_inverse = np.linalg.inv(V)
-        own = seen.views[f] - fixed
-        H, b = np.zeros((count, 6, 6)), np.zeros((count, 6))
-        np.add.at(H, own, Jp.transpose(0, 2, 1) @ Jp)
-        np.add.at(b, own, np.einsum("sij,si->sj", Jp, r[f]))
-        E = np.zeros((count, 6, size, 3))
-        E[own, :, seen.points[f]] = Jp.transpose(0, 2, 1) @ Jl[f]
-        A = E.reshape(6 * count, 3 * size)
-        B = np.einsum("camj,mjk->camk", E, V_inverse).reshape(6 * count, 3 * size)
-        S, g = graph.normal(poses)
-        S = S - B @ A.T
-        for i in range(count):
-            S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += H[i]
-        x = -np.linalg.solve(S, g + b.ravel() - B @ c.ravel())
-        moved = np.einsum("mij,mj->mi", V_inverse, -c - (x @ A).reshape(size, 3))
-        return poses[fixed:] @ motions.exps(x.reshape(count, 6)), points + moved, float(np.abs(x).max(initial=0.0))
+        system = PosesAndPoints(seen.views - fixed, seen.points, (count, size), pose_jacobian(J, p), J @ R, r, weights)
+        system.damp_points(0.0, 1e-6)
+        S, g = system.reduced()
+        of_edges, pull = graph.normal(poses)
+        x = -np.linalg.solve(S + of_edges, g + pull)
+        points = points + system.points_step(x)
+        return poses[fixed:] @ motions.exps(x.reshape(count, 6)), points, float(np.abs(x).max(initial=0.0))
 
     def _derivatives(self, p: Array) -> Array:
         """Returns d residuals / d p (S, 3, 3), of points in the depth cameras."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import linear_sum_assignment
 
-from operators.chi_square import quantile
+from operators.estimation.chi_square import quantile
 
 Array = NDArray[np.float64]
 _FIRST = 3

@@ -10,6 +10,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
+from operators.estimation.kernels import geman_mcclure
 from operators.geometry.se3 import Matrix
 from operators.slam import motions
 
@@ -58,7 +59,7 @@ def optimised(poses: Sequence[Matrix], edges: Sequence[Edge], fixed: int = 1, wi
     square = graph.squares(errors)
     kernel = max(width, float(np.sqrt(square[graph.loop].max(initial=0.0))))
     for _ in range(ITERATIONS):
-        weights = np.where(graph.loop, (kernel**2 / (kernel**2 + square)) ** 2, 1.0)
+        weights = np.where(graph.loop, geman_mcclure(square / kernel**2), 1.0)
         step = graph.step(T, errors, weights).reshape(-1, 6)
         T[fixed:] = T[fixed:] @ motions.exps(step)
         errors = graph.errors(T)
@@ -66,7 +67,7 @@ def optimised(poses: Sequence[Matrix], edges: Sequence[Edge], fixed: int = 1, wi
         if kernel == width and np.abs(step).max() < _STILL:
             break
         kernel = max(width, kernel * _NARROWS)
-    weights = np.where(graph.loop, (width**2 / (width**2 + square)) ** 2, 1.0)
+    weights = np.where(graph.loop, geman_mcclure(square / width**2), 1.0)
     T[fixed:] = motions.orthonormalised(T[fixed:])
     return Optimum(list(T), weights)
 
@@ -137,6 +138,6 @@ class DenseEdges:
         if graph is None:
             return 1e-6 * np.eye(self._size), np.zeros(self._size)
         errors = graph.errors(T)
-        weights = np.where(graph.loop, (width**2 / (width**2 + graph.squares(errors))) ** 2, 1.0)
+        weights = np.where(graph.loop, geman_mcclure(graph.squares(errors) / width**2), 1.0)
         H, gradient = graph.normal(T, errors, weights)
         return H.toarray(), gradient

@@ -22,7 +22,6 @@ LONG = {
     "dataflow.process.operator_process:OperatorProcess.__init__": 84,
     "dataflow.supervision.plan:process_plans": 67,
     "dataflow.verification.verify:verify": 68,
-    "operators.odometry.stereo.adjustment:adjust": 68,
     "operators.scene.commands:show": 69,
     "operators.scene.cuboid:fit_cuboid": 95,
     "operators.scene.lifting:lift": 61,

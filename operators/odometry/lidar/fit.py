@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.cloud.deskewing import deskewed
+from operators.estimation.kernels import geman_mcclure
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.lidar.map import Array, Pairs, PlaneMap
@@ -114,7 +115,7 @@ def agreements(points: Array, planes: PlaneMap, T: Array, noise: float, width: f
     world = (points @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]).reshape(-1, 3)
     pairs = planes.pairs(world)
     distance = np.einsum("ij,ij->i", world[pairs.points] - pairs.centers, pairs.normals)
-    weights = 1 / (1 + np.square(distance) / (noise**2 + pairs.thickness) / width**2) ** 2
+    weights = geman_mcclure(np.square(distance) / (noise**2 + pairs.thickness) / width**2)
     return np.bincount(pairs.points // len(points), weights, len(T)).astype(np.float64)
 
 
@@ -126,7 +127,7 @@ def _equations(points: Array, planes: PlaneMap, T: Matrix, width: float, noise: 
     off = world[pairs.points] - pairs.centers
     deviation = np.sqrt(noise**2 + pairs.thickness + pairs.slopes * np.einsum("ij,ij->i", off, off))
     residuals = np.einsum("ij,ij->i", off, pairs.normals) / deviation
-    weights = 1 / (1 + np.square(residuals / width)) ** 2
+    weights = geman_mcclure(np.square(residuals / width))
     normals = pairs.normals @ R
     own = points[pairs.points]
     J = np.empty((len(own), 6))

@@ -1,7 +1,7 @@
 """Bundle adjustment of a window of keyframes of one camera: poses and points that best explain where points were seen.
 
-Levenberg and Marquardt over reprojections, reweighted by Cauchy's function; points are eliminated by the Schur
-complement. Triggs et al., "Bundle adjustment, a modern synthesis", 2000.
+Levenberg and Marquardt over reprojections, reweighted by Cauchy's function. Triggs et al., "Bundle adjustment, a
+modern synthesis", 2000.
 """
 
 from dataclasses import dataclass
@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from operators.estimation.bundle import PosesAndPoints, pose_jacobian
+from operators.estimation.kernels import cauchy
 from operators.geometry import se3
 from operators.geometry.pinhole import Pixels, Points
 from operators.geometry.se3 import Matrix
@@ -88,40 +90,21 @@ def _step(
     damping: float,
 ) -> tuple[NDArray[np.float64], Points]:  # fmt: skip
     """Returns poses and points after a damped step of Gauss and Newton."""
-    count, size, free = len(poses), len(points), len(poses) - fixed
+    free = len(poses) - fixed
     p, R, r = at.points, at.rotations, at.residuals
     z = np.maximum(p[:, 2], NEAR)
     D = np.zeros((len(p), 2, 3))
     D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z / sigma, -K[0, 0] * p[:, 0] / z**2 / sigma
     D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z / sigma, -K[1, 1] * p[:, 1] / z**2 / sigma
-    weight = np.where(p[:, 2] > NEAR, 1.0 / (1.0 + (r * r).sum(axis=1) / CAUCHY**2), 0.0)
-    # d p / d x of the pose's right perturbation is [-I, [p]x]; of the point, R.
-    Jp = np.empty((len(p), 2, 6))
-    Jp[:, :, :3] = -D
-    Jp[:, :, 3:] = np.cross(D, p[:, None, :])
-    Jl = D @ R
-    WJp, WJl = weight[:, None, None] * Jp, weight[:, None, None] * Jl
-    H, b = np.zeros((count, 6, 6)), np.zeros((count, 6))
-    np.add.at(H, seen.frames, WJp.transpose(0, 2, 1) @ Jp)
-    np.add.at(b, seen.frames, np.einsum("sij,si->sj", WJp, r))
-    V, c = np.zeros((size, 3, 3)), np.zeros((size, 3))
-    np.add.at(V, seen.points, WJl.transpose(0, 2, 1) @ Jl)
-    np.add.at(c, seen.points, np.einsum("sij,si->sj", WJl, r))
-    index = np.arange(3)
-    V[:, index, index] += damping * V[:, index, index] + 1e-9
-    V_inverse = np.linalg.inv(V)
-    E = np.zeros((count, size, 6, 3))
-    E[seen.frames, seen.points] = WJp.transpose(0, 2, 1) @ Jl
-    A = E[fixed:].transpose(0, 2, 1, 3).reshape(6 * free, size, 3)
-    B = np.einsum("amj,mjk->amk", A, V_inverse).reshape(6 * free, 3 * size)
-    S = np.zeros((6 * free, 6 * free))
-    for i in range(free):
-        block = slice(6 * i, 6 * i + 6)
-        S[block, block] = H[fixed + i] + np.diag(damping * np.diag(H[fixed + i]) + 1e-9)
-    S -= B @ A.reshape(6 * free, 3 * size).T
-    x = -np.linalg.solve(S, b[fixed:].ravel() - B @ c.ravel())
+    weight = np.where(p[:, 2] > NEAR, cauchy((r * r).sum(axis=1) / CAUCHY**2), 0.0)
+    system = PosesAndPoints(
+        seen.frames - fixed, seen.points, (free, len(points)), pose_jacobian(D, p), D @ R, r, weight[:, None]
+    )
+    system.damp_points(damping, 1e-9)
+    system.damp_poses(damping, 1e-9)
+    S, g = system.reduced()
+    x = -np.linalg.solve(S, g)
     moved = poses.copy()
     for i, twist in enumerate(x.reshape(free, 6)):
         moved[fixed + i] = poses[fixed + i] @ se3.exp(twist)
-    steps = np.einsum("mij,mj->mi", V_inverse, -c - np.einsum("amj,a->mj", A, x))
-    return moved, points + steps
+    return moved, points + system.points_step(x)

@@ -1,7 +1,7 @@
 """Bundle adjustment of a window of stereo frames: poses and points that best explain where points were seen.
 
-Gauss-Newton over left column, row and right column of every sighting, reweighted by Cauchy's function; points are
-eliminated by the Schur complement. Triggs et al., "Bundle adjustment, a modern synthesis", 2000.
+Gauss-Newton over left column, row and right column of every sighting, reweighted by Cauchy's function.
+Triggs et al., "Bundle adjustment, a modern synthesis", 2000.
 
 A pair that is rectified imperfectly has disparities that are off by a constant, which scales all depths and, with
 them, the way. Near and far points then disagree on how far the camera came, so the constant is estimated as well.
@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from operators.estimation.bundle import PosesAndPoints, pose_jacobian
+from operators.estimation.kernels import cauchy
 from operators.geometry import se3
 from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
@@ -132,59 +134,33 @@ def adjust(
 ) -> Adjusted:
     """Improves poses T_world_camera (W, 4, 4) after the first `fixed` ones, and points (M, 3) in the world."""
     poses, points, believed = poses.copy(), points.copy(), offset
-    count, size = len(poses), len(points)
+    free = len(poses) - fixed
+    by_offset = np.broadcast_to(np.array([[0.0], [0.0], [1.0 / sigma]]), (len(seen.frames), 3, 1))
     for iteration in range(iterations + 1):
         inverse = np.array([invert(T) for T in poses])
         R = inverse[seen.frames, :3, :3]
         p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.frames, :3, 3]
         r = (rig.project(p) - seen.pixels + np.array([0.0, 0.0, offset])) / sigma
         squared = np.einsum("si,si->s", r, r)
-        weight = np.where(p[:, 2] > NEAR, 1.0 / (1.0 + squared / (3.0 * CAUCHY**2)), 0.0)
+        weight = np.where(p[:, 2] > NEAR, cauchy(squared / (3.0 * CAUCHY**2)), 0.0)
         D = rig.jacobian(p) / sigma
-        # d p / d x of the pose's right perturbation is [-I, [p]x]; of the point, R.
-        Jp = np.empty((len(p), 3, 6))
-        Jp[:, :, :3] = -D
-        Jp[:, :, 3:] = np.cross(D, p[:, None, :])
-        Jl = D @ R
-        WJp, WJl = weight[:, None, None] * Jp, weight[:, None, None] * Jl
-        H = np.zeros((count, 6, 6))
-        np.add.at(H, seen.frames, WJp.transpose(0, 2, 1) @ Jp)
+        system = PosesAndPoints(
+            seen.frames - fixed, seen.points, (free, len(points)), pose_jacobian(D, p), D @ R, r, weight[:, None],
+            by_offset,
+        )  # fmt: skip
         if iteration == iterations:
             break
-        b = np.zeros((count, 6))
-        np.add.at(b, seen.frames, np.einsum("sij,si->sj", WJp, r))
-        V, c = np.zeros((size, 3, 3)), np.zeros((size, 3))
-        np.add.at(V, seen.points, WJl.transpose(0, 2, 1) @ Jl)
-        np.add.at(c, seen.points, np.einsum("sij,si->sj", WJl, r))
-        V += 1e-6 * np.eye(3)
-        V_inverse = np.linalg.inv(V)
-        E = np.zeros((count, size, 6, 3))
-        E[seen.frames, seen.points] = WJp.transpose(0, 2, 1) @ Jl
-        # The offset is one more unknown, after the free poses; only right columns tell of it.
-        free = count - fixed
-        last = 6 * free
-        A = np.zeros((last + 1, size, 3))
-        A[:last] = E[fixed:].transpose(0, 2, 1, 3).reshape(last, size, 3)
-        np.add.at(A[last], seen.points, WJl[:, 2] / sigma)
-        B = np.einsum("amj,mjk->amk", A, V_inverse).reshape(last + 1, 3 * size)
-        S, g = np.zeros((last + 1, last + 1)), np.zeros(last + 1)
-        for i in range(free):
-            S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = H[fixed + i]
-        cross = np.zeros((count, 6))
-        np.add.at(cross, seen.frames, WJp[:, 2] / sigma)
-        S[last, :last] = S[:last, last] = cross[fixed:].ravel()
-        S[last, last] = weight.sum() / sigma**2
-        g[:last], g[last] = b[fixed:].ravel(), (weight * r[:, 2]).sum() / sigma
-        S -= B @ A.reshape(last + 1, 3 * size).T
-        g -= B @ c.ravel()
-        told = SLOWNESS * max(float(S[last, last]), 0.0) + 1.0 / OFFSET_SIGMA**2
-        S[last, last] += told
-        g[last] += told * (offset - believed)
-        x_all = -np.linalg.solve(S + 1e-9 * np.eye(last + 1), g)
-        x = np.asarray(x_all[:last], np.float64).reshape(free, 6)
-        poses[fixed:] = np.array([T @ se3.exp(d) for T, d in zip(poses[fixed:], x, strict=True)])
-        points += np.einsum("mij,mj->mi", V_inverse, -c - np.einsum("amj,a->mj", A, x_all))
-        offset += float(x_all[last])
-        if np.abs(x).max() < 1e-5:
+        system.damp_points(0.0, 1e-6)
+        S, g = system.reduced()
+        told = SLOWNESS * max(float(S[-1, -1]), 0.0) + 1.0 / OFFSET_SIGMA**2
+        S[-1, -1] += told
+        g[-1] += told * (offset - believed)
+        x = -np.linalg.solve(S + 1e-9 * np.eye(len(S)), g)
+        moves = x[:-1].reshape(free, 6)
+        poses[fixed:] = np.array([T @ se3.exp(d) for T, d in zip(poses[fixed:], moves, strict=True)])
+        points += system.points_step(x)
+        offset += float(x[-1])
+        if np.abs(moves).max() < 1e-5:
             break
-    return Adjusted(np.array([se3.orthonormalised(T) for T in poses]), points, squared, H[-1], offset)
+    information = system.H[-1]
+    return Adjusted(np.array([se3.orthonormalised(T) for T in poses]), points, squared, information, offset)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
-from operators.localization.particles import (
+from operators.estimation.particles import (
     bins_of,
     effective_size,
     mode,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from operators.chi_square import quantile
+from operators.estimation.chi_square import quantile
 
 
 def test_quantiles_are_those_of_scipy_bit_by_bit() -> None:

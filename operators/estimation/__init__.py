@@ -1,0 +1,1 @@
+"""Estimation: least squares, particles and the distributions that judge them."""
