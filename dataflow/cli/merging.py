@@ -126,7 +126,7 @@ def recover(
         existing(recording, "a recording")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
         if is_ros_bag(recording):
-            from dataflow.interop.salvaged import recover_bag
+            from dataflow.editing.recover_bag import recover_bag
 
             done = recover_bag(recording, output)
         else:

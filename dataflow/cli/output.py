@@ -63,7 +63,7 @@ err = _console(stderr=True)
 
 
 _notes: dict[str, Path] = {}
-"""What the files that the command has opened have brought to light, and where."""
+"""Notes of the files that the command has opened, and the file of each."""
 _said: list[str] = []
 
 

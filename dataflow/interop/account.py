@@ -14,7 +14,7 @@ WORDS = {
     "merged": "joined with others of their stamp",
     "before_epoch": "before 1970, left out",
 }
-"""What was done to messages, by the names of `Repair.facts`."""
+"""Repairs in words, by the names of `Repair.facts`."""
 
 
 @dataclass(slots=True)
@@ -27,7 +27,7 @@ class Unread:
 
 @dataclass(slots=True)
 class Account:
-    """What there is to say of a source; complete when all its messages have been read.
+    """Facts about a source and its messages; complete when all of them have been read.
 
     - `notes`: damage and oddities of the file; `short`: topics with fewer messages than are promised.
     - By topic: `repaired`, messages by what was done; `unread`; `lost`, messages by what of them is not carried over;

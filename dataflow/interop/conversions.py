@@ -135,7 +135,7 @@ CONVERSIONS: dict[tuple[type[Message], type[Message]], Callable[[Any], Message]]
 TOLD = {(CompressedImage, Image16), (CompressedImage, DepthImage), (Image16, DepthImage)}
 """Conversions that are right for what some devices send only: done where somebody asks for them by name."""
 NARROWING = {(Image16, Image): "16 bits become 8", (Odometry, Pose): "velocities", (RangeReading, Number): "limits"}
-"""What a conversion does not carry over."""
+"""By conversion, the content that it does not carry over."""
 
 
 def proposed(read_as: type[Message]) -> tuple[type[Message], ...]:

@@ -99,7 +99,7 @@ def play(
 
 @dataclass(frozen=True, slots=True)
 class Wishes:
-    """How the topics of a bag are read: `depth`, those that are depth although their messages do not say so; `lossy`,
+    """Wishes for the reading of a bag: `depth`, topics that are depth although their messages do not say so; `lossy`,
     whether 16-bit images become 8-bit ones; `strict`, whether a message that cannot be read is an error."""
 
     depth: tuple[str, ...] = ()

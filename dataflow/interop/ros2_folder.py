@@ -17,7 +17,7 @@ COMPRESSED = ".zstd"
 
 @dataclass(slots=True)
 class Folder:
-    """What a metadata.yaml says of a bag. `promised`: messages by topic; `notes`: what does not fit the folder."""
+    """The content of a metadata.yaml. `promised`: messages by topic; `notes`: what does not fit the folder."""
 
     promised: dict[str, int] = field(default_factory=dict)
     message_compression: bool = False

@@ -34,7 +34,7 @@ class Saved(NamedTuple):
 
 @dataclass(slots=True)
 class Salvage:
-    """What was found in a broken bag. `lost`: messages of which a part is missing; `notes`: for people."""
+    """The content that is left of a broken bag. `lost`: messages of which a part is missing; `notes`: for people."""
 
     encoding: str
     schemas: dict[str, SchemaText] = field(default_factory=dict)

@@ -19,6 +19,7 @@ from dataflow.interop.found import Found
 from dataflow.interop.opening import open_bag
 from dataflow.interop.ranking import Ranking, within
 from dataflow.interop.topics import Reading
+from dataflow.interop.transform_sets import joined, places_of
 from dataflow.messages import Message, MessageError, Transforms, message_type
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
 
@@ -97,7 +98,7 @@ class BagStreams:
         return (*self.account.notes, *self.account.short)
 
     def losses(self, topic: str) -> tuple[str, ...]:
-        """What the first message of a topic holds that has no place here."""
+        """Names the content of a topic's first message that has no place here."""
         return self._readings[topic].losses
 
     def look_for_unread(self, topics: Collection[str]) -> None:
@@ -343,23 +344,3 @@ def recorded_streams(path: Path, opening: Mapping[str, Any] | None) -> Recording
         return Recording(path)
     played = {stream: Played(*values) for stream, values in opening["played"].items()}
     return BagStreams(path, played, opening["clock"], strict=opening["strict"])
-
-
-def places_of(message: Transforms) -> Iterator[tuple[str, bytes]]:
-    """(child frame, its parent and place as bytes) of each transform."""
-    for i, child in enumerate(message.child_frames):
-        place = message.translations[i].tobytes() + message.rotations[i].tobytes()
-        yield child, message.frames[i].encode() + b"\0" + place
-
-
-def joined(a: Transforms, b: Transforms) -> Transforms:
-    """The transforms of two sets, stamped like the first; of those that place one frame the later counts."""
-    rows = {child: (a, i) for i, child in enumerate(a.child_frames)}
-    rows |= {child: (b, i) for i, child in enumerate(b.child_frames)}
-    return Transforms(
-        stamp=a.stamp,
-        frames=tuple(m.frames[i] for m, i in rows.values()),
-        child_frames=tuple(rows),
-        translations=np.array([m.translations[i] for m, i in rows.values()]).reshape(-1, 3),
-        rotations=np.array([m.rotations[i] for m, i in rows.values()]).reshape(-1, 4),
-    )

@@ -8,8 +8,8 @@ import numpy as np
 
 from dataflow.interop.bag import Bag, is_static, shortfalls
 from dataflow.interop.playing import readings_of
-from dataflow.interop.streams import places_of
 from dataflow.interop.topics import Reading, is_known
+from dataflow.interop.transform_sets import places_of
 from dataflow.lint.finding import Finding
 from dataflow.lint.material import Stamps, StreamFacts
 from dataflow.messages import Message, MessageError, Transforms

@@ -1,5 +1,4 @@
-"""What the opening of a file brings to light, for whoever shows it: a command prints it whatever it does with the
-file."""
+"""Notes of files that are opened, for commands, which print them whatever they do with the file."""
 
 from __future__ import annotations
 

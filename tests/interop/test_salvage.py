@@ -9,10 +9,10 @@ import pytest
 from made_bags import ROS1, SECOND, header, imus, ros, write_ros1, write_ros2
 from rosbags.rosbag1 import Writer as Writer1
 
+from dataflow.editing.recover_bag import recover_bag
 from dataflow.interop.bag import BagError
 from dataflow.interop.opening import open_bag
 from dataflow.interop.salvage import salvage
-from dataflow.interop.salvaged import recover_bag
 from dataflow.recording import RecordingError
 
 STAMPS = [1_700_000_000 * SECOND + i * SECOND // 100 for i in range(300)]

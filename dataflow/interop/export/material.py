@@ -76,11 +76,11 @@ class Material:
 
     @property
     def shift(self) -> int:
-        """What is added to the log times of a bag so that they are of the clock of its streams, ns."""
+        """Nanoseconds that are added to the log times of a bag so that they are of the clock of its streams."""
         return self._source.clock.shift if isinstance(self._source, BagStreams) else 0
 
     def facts(self) -> dict[str, str]:
-        """What a recording made of a bag says of it, when all messages have been read."""
+        """Metadata of a recording that was made of a bag; complete when all messages have been read."""
         assert isinstance(self._source, BagStreams)
         told = {name: text for name, text in self._source.facts().items() if name != "topics"}
         account = self.account.as_json()
