@@ -138,7 +138,7 @@ class Scenario:
     @property
     def limit(self) -> float:
         """Simulated seconds after which the run hangs: ticks that came due during a freeze are all made up for."""
-        spans = sum(min(h.fields["span"], TIMEOUT) for h in self.happenings if h.kind == "freeze")
+        spans: float = sum(min(h.fields["span"], TIMEOUT) for h in self.happenings if h.kind == "freeze")
         pauses: float = sum(h.fields["span"] for h in self.happenings if h.kind == "pause")
         return LIMIT + pauses + (spans / TICK * self.work if self.graph == TICKING else 0.0)
 
