@@ -57,6 +57,7 @@ TICKING = "ticks"
 DRAWN = "drawn"
 """A graph that its seed wires (`drawn`)."""
 MOST_TRIES = 30
+PLACEMENTS: tuple[Placement, ...] = ("graph", "graph", "process_each", "one_process")
 TICK = 250e-6
 """Its timer's period, s."""
 _RESTART = "restart: {max: 5, backoff: 10ms}"
@@ -137,8 +138,8 @@ class Scenario:
     @property
     def limit(self) -> float:
         """Simulated seconds after which the run hangs: ticks that came due during a freeze are all made up for."""
-        spans = sum(min(h.fields["span"], TIMEOUT) for h in self.happenings if h.kind == "freeze")
-        pauses = sum(h.fields["span"] for h in self.happenings if h.kind == "pause")
+        spans: float = sum(min(h.fields["span"], TIMEOUT) for h in self.happenings if h.kind == "freeze")
+        pauses: float = sum(h.fields["span"] for h in self.happenings if h.kind == "pause")
         return LIMIT + pauses + (spans / TICK * self.work if self.graph == TICKING else 0.0)
 
     def describe(self) -> str:
@@ -236,7 +237,7 @@ def _drawn(plain: Scenario, r: random.Random) -> Scenario:
     """The same with a graph that is wired at random; some of what is not live keeps the pace of a clock."""
     rate = r.choice((0.5, 1.0, 4.0)) if not plain.live and r.random() < 0.2 else None
     for _ in range(MOST_TRIES):
-        placement = r.choice(("graph", "graph", "process_each", "one_process"))
+        placement = r.choice(PLACEMENTS)
         found = replace(plain, graph=DRAWN, parts=drawn(r, live=plain.live), rate=rate, placement=placement)
         with contextlib.suppress(GraphError):  # its feedback would wait for itself
             found.load()

@@ -72,8 +72,8 @@ def _smaller(scenario: Scenario) -> Iterator[Scenario]:
                 yield replace(scenario, policy=", ".join(parts[:k] + parts[k + 1 :]))
     if scenario.snapshots:
         yield replace(scenario, snapshots=False)
-    for parts in without(scenario.parts):
-        yield replace(scenario, parts=parts)
+    for fewer in without(scenario.parts):
+        yield replace(scenario, parts=fewer)
     for name, value in (("rate", None), ("work", 0.0), ("reading", 0.0), ("window", 256)):
         if getattr(scenario, name) != value:
             yield replace(scenario, **{name: value})  # type: ignore[arg-type]
