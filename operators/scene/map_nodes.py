@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from dataflow.messages import Boxes3D, PointCloud, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw, quaternion_to_matrix, transform_points
 from operators.scene.map_object import MapObject
-from operators.scene.map_surface import CEILING, FLOOR, SURFACES, TABLETOP, WALL, MapSurface
+from operators.scene.map_surface import CEILING, FLOOR, SURFACES, WALL, MapSurface
 from operators.scene.relations import FLOOR as FLOOR_ID
-from operators.scene.relations import SURFACE
+from operators.scene.relations import SURFACE, TABLETOP
 from operators.scene.surface_map import SeenSurface
 
 Array = NDArray[np.float64]

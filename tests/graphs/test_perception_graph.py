@@ -68,6 +68,14 @@ def test_boxes_of_any_detector_reach_the_map_and_the_tracks_unchanged(name: str)
         assert nodes[f"perception/{consumer}"].inputs["detections"] == (detector,)
 
 
+@pytest.mark.parametrize("name", ["perception", "perception_given", "perception_rgbd", "perception_kitti"])
+def test_one_setting_gives_every_operator_the_label_space(name: str) -> None:
+    nodes = load_graph(REPOSITORY / "graphs" / f"{name}.yaml", settings=["labels=own.yaml"]).nodes
+    spaces = {each: node.params["labels"] for each, node in nodes.items() if "labels" in node.params}
+    assert {"perception/lifter", "perception/objects", "perception/scene"} <= spaces.keys()
+    assert set(spaces.values()) == {"own.yaml"}
+
+
 def test_postures_reach_the_activities_wherever_there_is_depth() -> None:
     nodes = load_graph(REPOSITORY / "graphs" / "perception.yaml").nodes
     assert nodes["perception/postures"].inputs["clusters"] == ("robot1/perception/lifter/clusters",)
