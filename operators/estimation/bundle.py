@@ -82,7 +82,8 @@ class PosesAndPoints:
 
     def points_step(self, step: Array) -> Array:
         """Returns the points' step (M, 3) that goes with a step (6P + C,) of the rest; after `reduced`."""
-        return np.einsum("mij,mj->mi", self._inverse, -self._c - (step @ self._E).reshape(self._c.shape))
+        pull = self._c + (step @ self._E).reshape(self._c.shape)
+        return np.asarray(-np.einsum("mij,mj->mi", self._inverse, pull))
 
 
 class _Sums:

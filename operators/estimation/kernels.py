@@ -19,3 +19,8 @@ def cauchy(squared: Array) -> Array:
 def geman_mcclure(squared: Array) -> Array:
     """Returns weights of squared residuals in units of the squared width, at which the weight is a quarter."""
     return np.asarray(1.0 / (1.0 + squared) ** 2)
+
+
+def huber(residuals: Array, width: float) -> Array:
+    """Returns weights of residuals that count linearly beyond a width in their unit."""
+    return np.asarray(np.minimum(1.0, width / np.maximum(np.abs(residuals), 1e-9)))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.estimation.least_squares import gauss_newton_step
 from operators.fusion.error_state import exp_rotation, log_rotation
 from operators.fusion.gate import threshold
 
@@ -79,7 +80,7 @@ def placed(seen: Sequence[Place | Bearing], largest: float = 5.0) -> tuple[Array
         information = sum((J for _, J in pulls), np.zeros((3, 3)))
         if float(np.linalg.eigvalsh(information)[0]) < 1.0 / largest**2:
             raise Unknown("bearings that are all but parallel")
-        step = np.linalg.solve(information, sum((J @ r for r, J in pulls), np.zeros(3)))
+        step = gauss_newton_step(information, sum((-J @ r for r, J in pulls), np.zeros(3)))
         point = point + step
         if float(np.linalg.norm(step)) < _CONVERGED:
             break

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.estimation.kernels import huber
+from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
 
 Array = NDArray[np.float64]
@@ -75,11 +77,11 @@ class DepthScanAgreement:
         if found is None:
             return False
         residuals, J = found
-        weights = np.minimum(1.0, _KNEE / np.maximum(np.abs(residuals), 1e-9)) / (_NOISE**2 * _ALIKE)
+        weights = huber(residuals, _KNEE) / (_NOISE**2 * _ALIKE)
         weighted = J * weights[:, None]
         self._information += np.einsum("ni,nj->ij", weighted, J)
         gradient = weighted.T @ residuals + self._x / _PRIOR**2
-        self._x = self._x - np.linalg.solve(self._posterior(), gradient)
+        self._x = self._x + gauss_newton_step(self._posterior(), gradient)
         self.pairs += 1
         return True
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from operators.estimation.bundle import PosesAndPoints, pose_jacobian
 from operators.estimation.kernels import cauchy
+from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry.pinhole import Points
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.slam import motions
@@ -108,7 +109,7 @@ class _Solver:
         system.damp_points(0.0, 1e-6)
         S, g = system.reduced()
         of_edges, pull = graph.normal(poses)
-        x = -np.linalg.solve(S + of_edges, g + pull)
+        x = gauss_newton_step(S + of_edges, g + pull)
         points = points + system.points_step(x)
         return poses[fixed:] @ motions.exps(x.reshape(count, 6)), points, float(np.abs(x).max(initial=0.0))
 

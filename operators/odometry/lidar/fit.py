@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert
 from operators.cloud.deskewing import deskewed
 from operators.estimation.kernels import geman_mcclure
+from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.lidar.map import Array, Pairs, PlaneMap
@@ -88,7 +89,7 @@ def fit(scan: Scan, planes: PlaneMap, prior: Prior, motion: Motion, noise: float
         off = se3.log(invert(prior.T) @ T)
         seeing = _seeing(blind)
         gradient = seeing @ seeing @ system.b + prior.information @ off
-        step = np.asarray(-np.linalg.solve(H + prior.information, gradient), np.float64)
+        step = gauss_newton_step(H + prior.information, gradient)
         T = np.asarray(T @ se3.exp(step), np.float64)
         if np.linalg.norm(step[:3]) < _STILL[0] and np.linalg.norm(step[3:]) < _STILL[1]:
             break

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert
 from operators.estimation.bundle import PosesAndPoints, pose_jacobian
 from operators.estimation.kernels import cauchy
+from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
 from operators.geometry.pinhole import Pixels, Points
 from operators.geometry.se3 import Matrix
@@ -102,8 +103,7 @@ def _step(
     )
     system.damp_points(damping, 1e-9)
     system.damp_poses(damping, 1e-9)
-    S, g = system.reduced()
-    x = -np.linalg.solve(S, g)
+    x = gauss_newton_step(*system.reduced())
     moved = poses.copy()
     for i, twist in enumerate(x.reshape(free, 6)):
         moved[fixed + i] = poses[fixed + i] @ se3.exp(twist)

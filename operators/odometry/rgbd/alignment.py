@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
 from operators.geometry.pinhole import Pixels, Points
 from operators.geometry.se3 import Matrix, Vector
@@ -261,7 +262,7 @@ def align(T_world_camera: Matrix, terms: Sequence[Term], prior: Term, iterations
         for normal in normals:
             H += normal.H
             b += normal.b
-        step = -np.asarray(np.linalg.solve(H, b), np.float64)
+        step = gauss_newton_step(H, b)
         T = T @ se3.exp(step)
         if np.abs(step).max() < 1e-4:
             return Alignment(se3.orthonormalised(T), tuple(terms), normals)

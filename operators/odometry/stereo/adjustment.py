@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert
 from operators.estimation.bundle import PosesAndPoints, pose_jacobian
 from operators.estimation.kernels import cauchy
+from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
 from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
@@ -155,7 +156,7 @@ def adjust(
         told = SLOWNESS * max(float(S[-1, -1]), 0.0) + 1.0 / OFFSET_SIGMA**2
         S[-1, -1] += told
         g[-1] += told * (offset - believed)
-        x = -np.linalg.solve(S + 1e-9 * np.eye(len(S)), g)
+        x = gauss_newton_step(S + 1e-9 * np.eye(len(S)), g)
         moves = x[:-1].reshape(free, 6)
         poses[fixed:] = np.array([T @ se3.exp(d) for T, d in zip(poses[fixed:], moves, strict=True)])
         points += system.points_step(x)
