@@ -144,7 +144,7 @@ def friendly_errors() -> Iterator[None]:
     from dataflow.recording.notices import listening
 
     try:
-        with listening(lambda file, note: _notes.setdefault(note, file) and None):
+        with listening(_take):
             yield
         _say_notes()
     except typer.Exit:
@@ -163,6 +163,10 @@ def friendly_errors() -> Iterator[None]:
             err.print(escape(message[1:]), soft_wrap=True)
             raise typer.Exit(code) from None
         raise fail(message, details=details, code=code) from None
+
+
+def _take(file: Path, note: str) -> None:
+    _notes.setdefault(note, file)
 
 
 def _say_notes() -> None:

@@ -261,9 +261,9 @@ def _unpacked(compression: bytes, content: bytes, found: Salvage) -> bytes:
         if compression == b"bz2":
             return bz2.BZ2Decompressor().decompress(content)
         if compression == b"lz4":
-            import lz4.frame
+            from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(content))
+            return bytes(LZ4FrameDecompressor().decompress(content))
     except (OSError, RuntimeError, EOFError) as error:
         found.notes.append(f"a {compression.decode()} chunk cannot be unpacked: {error}")
         return b""

@@ -91,7 +91,7 @@ def same_layout(encoding: str, a: SchemaText, b: SchemaText) -> bool:
     """Tells whether two definitions, whatever their comments and constants, say the same of the bytes."""
     try:
         one, other = (_stores(ros_type(s.name), encoding, s)[0] for s in (a, b))
-        return _layout(one, ros_type(a.name)) == _layout(other, ros_type(b.name))
+        return bool(_layout(one, ros_type(a.name)) == _layout(other, ros_type(b.name)))
     except (RecordingError, KeyError):
         return False
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -65,7 +66,7 @@ def read_map(path: Path, frame: str, stamp: int = 0) -> OccupancyGrid:
 
 
 def _cells(
-    pixels: NDArray[np.uint8], clear: NDArray[np.bool_], mode: str, negate: bool, taken: float, free: float
+    pixels: NDArray[Any], clear: NDArray[np.bool_], mode: str, negate: bool, taken: float, free: float
 ) -> NDArray[np.int8]:
     """Occupancy of pixels in per cent, -1 unknown; `clear`: those that are transparent."""
     if mode == "raw":

@@ -175,7 +175,7 @@ def _since_epoch(values: npt.NDArray[Any], unit: str, stamp: int) -> npt.NDArray
         return (values.astype(np.int64) - stamp) * 1e-9
     each = round(1e9 * _UNITS[unit])
     base = stamp // each
-    return ((values.astype(np.float64) - base) - (stamp - base * each) / each) * _UNITS[unit]
+    return np.asarray(((values.astype(np.float64) - base) - (stamp - base * each) / each) * _UNITS[unit])
 
 
 def _likeliest(span: float, farthest: float, whole: bool, period: float) -> str | None:

@@ -147,7 +147,7 @@ def _is_flat(annotation: Mapping[str, Any]) -> bool:
     box = annotation.get("bbox")
     if not isinstance(box, list) or len(box) != 4 or not all(map(_is_number, box)):
         return False
-    return min(box[2:]) == 0
+    return bool(min(box[2:]) == 0)
 
 
 def _is_number(value: Any) -> bool:
