@@ -5,6 +5,7 @@ Layout: https://mcap.dev/spec (chunk index, op=0x08).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,8 @@ _HEAD = np.dtype(
 _PLACE = np.dtype([("channel", "<u2"), ("offset", "<i8")])
 _MIDDLE = np.dtype([("index_length", "<i8"), ("name", "<u4")])
 _SIZES = np.dtype([("packed", "<i8"), ("size", "<i8")])
+SEGMENT = 2**20
+"""Chunks that are looked at together, so that little more than the columns is in memory."""
 _LEAST = _HEAD.itemsize + _MIDDLE.itemsize + _SIZES.itemsize
 _UNBOUNDED = np.iinfo(np.int64)
 
@@ -34,8 +37,8 @@ class ChunkIndexes:
     """
 
     starts: Column
-    lengths: Column
-    sizes: Column
+    lengths: npt.NDArray[np.uint32]
+    sizes: npt.NDArray[np.uint32]
     index_lengths: npt.NDArray[np.uint32]
     firsts: Column
     lasts: Column
@@ -50,17 +53,26 @@ class ChunkIndexes:
         found: list[int] = self.channels[self.rows[number] : self.rows[number + 1]].tolist()
         return found
 
-    def holding(self, channels: npt.ArrayLike, start: int | None = None, end: int | None = None) -> Column:
-        """The numbers of the chunks with messages of some channels, in a span of log times that may have any."""
+    @property
+    def ordered(self) -> bool:
+        """Tells whether no chunk begins before the one in front of it."""
+        return all((np.diff(self.firsts[k : k + SEGMENT + 1]) >= 0).all() for k in range(0, len(self), SEGMENT))
+
+    def holding(self, channels: npt.ArrayLike, start: int | None = None, end: int | None = None) -> Iterator[Column]:
+        """The numbers of the chunks with messages of some channels, in a span of log times that may have any, some of
+        them at a time."""
         wanted = np.zeros(2**16, bool)
         wanted[np.asarray(channels, np.int64)] = True
-        if start is None and end is None:
-            return np.flatnonzero(np.logical_or.reduceat(wanted[self.channels], self.rows[:-1]))
-        within = self.lasts >= (_UNBOUNDED.min if start is None else start)
-        within &= self.firsts <= (_UNBOUNDED.max if end is None else end)
-        numbers = np.flatnonzero(within)
-        places, rows = _spread(self.rows, numbers)
-        return numbers[np.logical_or.reduceat(wanted[self.channels[places]], rows[:-1])] if len(numbers) else numbers
+        for low in range(0, len(self), SEGMENT):
+            high = min(low + SEGMENT, len(self))
+            within = self.lasts[low:high] >= (_UNBOUNDED.min if start is None else start)
+            within &= self.firsts[low:high] <= (_UNBOUNDED.max if end is None else end)
+            if not within.any():
+                continue
+            rows = self.rows[low : high + 1]
+            held = wanted[self.channels[rows[0] : rows[-1]]]
+            within &= np.logical_or.reduceat(held, rows[:-1] - rows[0])
+            yield low + np.flatnonzero(within)
 
 
 def _spread(rows: Column, numbers: Column) -> tuple[Column, Column]:
@@ -71,11 +83,15 @@ def _spread(rows: Column, numbers: Column) -> tuple[Column, Column]:
 
 
 class ChunkIndexReader:
-    """Gathers chunk indexes block by block."""
+    """Gathers chunk indexes block by block, of a summary of `size` bytes: as many as it can hold have room, and what is
+    not used of it takes no memory."""
 
-    def __init__(self, file: RawFile) -> None:
+    def __init__(self, file: RawFile, size: int) -> None:
         self._file = file
-        self._parts: list[tuple[npt.NDArray[Any], ...]] = []
+        most, kinds = size // _LEAST + 1, (np.int64, np.uint32, np.uint32, np.uint32, np.int64, np.int64, np.uint32)
+        self._columns: list[npt.NDArray[Any]] = [np.empty(most, kind) for kind in kinds]
+        self._channels = np.empty(size // _PLACE.itemsize + 1, np.uint16)
+        self._count = self._entries = 0
 
     def add(self, block: bytes, records: Column, offset: int) -> None:
         """Takes the records at the places `records` of a block that lies at `offset`. Raises `DamagedError`."""
@@ -95,39 +111,36 @@ class ChunkIndexReader:
         counts = table // _PLACE.itemsize
         ordinals = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
         places = np.repeat(records + _HEAD.itemsize, counts) + _PLACE.itemsize * ordinals
-        self._parts.append(
-            (
-                head["start"].copy(),
-                head["length"].copy(),
-                _gathered(data, after, _SIZES)["size"].copy(),
-                np.clip(middle["index_length"], -1, 2**32 - 2).astype(np.uint32),
-                head["first"].copy(),
-                head["last"].copy(),
-                _gathered(data, places, _PLACE)["channel"].copy(),
-                counts,
-            )
+        values = (
+            head["start"],
+            _clipped(head["length"]),
+            _clipped(_gathered(data, after, _SIZES)["size"]),
+            _clipped(middle["index_length"]),
+            head["first"],
+            head["last"],
+            counts,
         )
+        for column, value in zip(self._columns, values, strict=True):
+            column[self._count : self._count + len(records)] = value
+        self._count += len(records)
+        self._channels[self._entries : self._entries + len(places)] = _gathered(data, places, _PLACE)["channel"]
+        self._entries += len(places)
 
     def done(self) -> ChunkIndexes:
         """All of them. Raises `DamagedError` where chunks overlap each other or the file's end: what is read is bounded
         by the size of the file."""
-        columns: list[npt.NDArray[Any]] = []
-        parts = [list(part) for part in self._parts]
-        self._parts.clear()
-        kinds = (np.int64, np.int64, np.int64, np.uint32, np.int64, np.int64, np.uint16, np.int64)
-        for k, kind in enumerate(kinds):
-            columns.append(np.concatenate([np.empty(0, kind), *(part[k] for part in parts)]))
-            for part in parts:
-                part[k] = columns[0][:0]
-        counts = columns.pop()
+        columns = [column[: self._count] for column in self._columns]
+        counts, channels = columns.pop(), self._channels[: self._entries]
         rows = np.zeros(len(counts) + 1, np.int64)
         np.cumsum(counts, out=rows[1:])
-        starts, lengths, sizes, index_lengths, firsts, lasts, channels = columns
+        del counts
+        self._columns.clear()
+        starts, lengths, sizes, index_lengths, firsts, lasts = columns
         found = ChunkIndexes(starts, lengths, sizes, index_lengths, firsts, lasts, channels, rows)
-        if (np.diff(found.starts) < 0).any():
+        if any((np.diff(starts[k : k + SEGMENT + 1]) < 0).any() for k in range(0, len(starts), SEGMENT)):
             order = np.argsort(found.starts, kind="stable")
             places, rows = _spread(found.rows, order)
-            starts, lengths, sizes, index_lengths, firsts, lasts = (column[order] for column in columns[:6])
+            starts, lengths, sizes, index_lengths, firsts, lasts = (column[order] for column in columns)
             found = ChunkIndexes(starts, lengths, sizes, index_lengths, firsts, lasts, channels[places], rows)
         self._check(found)
         wrong = found.lasts < found.firsts  # times before the epoch, which are large as the unsigned numbers of a file
@@ -135,22 +148,30 @@ class ChunkIndexReader:
         return found
 
     def _check(self, found: ChunkIndexes) -> None:
-        file, size = self._file, self._file.size
-        ends = found.starts + np.clip(found.lengths, 0, size) + found.index_lengths
-        low = np.concatenate([[RECORD.size - 1], ends[:-1]])[: len(ends)]
-        beside = (found.starts < low) | (found.lengths < RECORD.size) | (found.starts > size)
-        if beside.any():
-            at = int(found.starts[np.argmax(beside)])
-            raise file.damaged(f"its index puts a chunk at byte {at}, among other records")
-        beyond = (found.lengths > size) | (ends > size)
-        if beyond.any():
-            at = int(found.starts[np.argmax(beyond)])
-            raise file.damaged(f"its index puts a chunk at byte {at} that ends beyond the file's {size} bytes")
+        file, size, free = self._file, self._file.size, RECORD.size - 1
+        for k in range(0, len(found), SEGMENT):
+            part = slice(k, k + SEGMENT)
+            starts, lengths = found.starts[part], found.lengths[part].astype(np.int64)
+            ends = np.clip(starts, 0, size) + lengths + found.index_lengths[part]
+            low = np.concatenate([[free], ends[:-1]])
+            beside = (starts < low) | (lengths < RECORD.size) | (starts > size)
+            if beside.any():
+                at = int(starts[np.argmax(beside)])
+                raise file.damaged(f"its index puts a chunk at byte {at}, among other records")
+            if (ends > size).any():
+                at = int(starts[np.argmax(ends > size)])
+                raise file.damaged(f"its index puts a chunk at byte {at} that ends beyond the file's {size} bytes")
+            free = int(ends[-1])
 
     def _require(self, sound: npt.NDArray[np.bool_], records: Column, offset: int) -> None:
         if not sound.all():
             at = offset + int(records[np.argmin(sound)])
             raise self._file.damaged(f"the ChunkIndex record at byte {at} cannot be read: it is too short")
+
+
+def _clipped(values: Column) -> npt.NDArray[np.uint32]:
+    """Sizes, which are below 4 GiB; larger ones are refused when they are read."""
+    return np.where((values < 0) | (values >= 2**32), 2**32 - 1, values).astype(np.uint32)
 
 
 def _gathered(data: npt.NDArray[np.uint8], places: Column, kind: np.dtype[Any]) -> npt.NDArray[Any]:

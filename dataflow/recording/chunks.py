@@ -7,6 +7,7 @@ import struct
 import zlib
 from array import array
 from collections import OrderedDict
+from collections.abc import MutableSequence
 from dataclasses import dataclass
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -19,6 +20,7 @@ from dataflow.recording.limits import MAX_CHUNK_BYTES, MAX_RATIO, UNINDEXED_BYTE
 from dataflow.recording.rawfile import RECORD, RawFile
 
 Column = npt.NDArray[np.int64]
+Sizes = npt.NDArray[np.uint32]
 CACHE_BYTES = 256 * 2**20
 LZ4_AT_ONCE = 2**26
 """Bytes that are asked of the LZ4 library at once: it takes twice as many."""
@@ -46,10 +48,12 @@ def size_in_head(head: bytes) -> int:
 
 
 class Chunks:
-    """The chunks of one file by number; 24 bytes of memory a chunk."""
+    """The chunks of one file by number."""
 
     def __init__(self, file: RawFile) -> None:
-        self._offsets, self._lengths, self._sizes = array("q"), array("q"), array("q")
+        self._starts: MutableSequence[int] | Column = array("q")
+        self._lengths: MutableSequence[int] | Sizes = array("q")
+        self._sizes: MutableSequence[int] | Sizes = array("q")
         self._torn = -1
         self._file = file
         self._cache: OrderedDict[int, bytes] = OrderedDict()
@@ -58,26 +62,30 @@ class Chunks:
         self._decompressor = zstandard.ZstdDecompressor()
 
     def __len__(self) -> int:
-        return len(self._offsets)
+        return len(self._starts)
 
     def add(self, ref: ChunkRef) -> int:
         """The number of a chunk."""
+        assert isinstance(self._starts, array)
+        assert isinstance(self._lengths, array)
+        assert isinstance(self._sizes, array)
         number = len(self)
-        self._offsets.append(ref.offset)
-        self._lengths.append(ref.length)
+        self._starts.append(ref.offset - RECORD.size)
+        self._lengths.append(ref.length + RECORD.size)
         self._sizes.append(min(ref.uncompressed_size, 2**63 - 1))
         if ref.torn:
             self._torn = number
         return number
 
-    def extend(self, offsets: Column, lengths: Column, sizes: Column) -> None:
-        """Adds many chunks."""
-        for column, values in ((self._offsets, offsets), (self._lengths, lengths), (self._sizes, sizes)):
-            column.frombytes(values.tobytes())
+    def adopt(self, starts: Column, lengths: Sizes, sizes: Sizes) -> None:
+        """Takes all chunks as columns, which are not copied: where their records start, the bytes of these, and of what
+        is in them."""
+        self._starts, self._lengths, self._sizes = starts, lengths, sizes
 
     def ref(self, number: int) -> ChunkRef:
         """A chunk's place and sizes."""
-        return ChunkRef(self._offsets[number], self._lengths[number], self._sizes[number], number == self._torn)
+        start, length = int(self._starts[number]) + RECORD.size, int(self._lengths[number]) - RECORD.size
+        return ChunkRef(start, length, int(self._sizes[number]), number == self._torn)
 
     @property
     def lengths(self) -> Column:
@@ -99,7 +107,7 @@ class Chunks:
         if cached is not None:
             self._cache.move_to_end(number)
             return cached
-        self._make_room(self._sizes[number])
+        self._make_room(self.ref(number).uncompressed_size)
         data = self._decompress(number)
         self._cache[number] = data
         self._cached_bytes += len(data)
@@ -117,7 +125,7 @@ class Chunks:
             )
 
     def where(self, number: int) -> str:
-        return f"chunk {number} at byte {self._offsets[number]}"
+        return f"chunk {number} at byte {self.ref(number).offset}"
 
     def _make_room(self, size: int) -> None:
         """Lets the oldest chunks go before the next one is there."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from typing import Protocol
 
@@ -106,25 +106,23 @@ class LongIndex:
         return self._spans[channel]
 
     def _found_span(self, channel: int) -> tuple[int, int] | None:
-        numbers = self._indexes.holding([channel])
-        if not len(numbers):
-            return None
-        firsts, lasts = self._indexes.firsts[numbers], self._indexes.lasts[numbers]
-        first = self._least(channel, numbers, firsts, lambda times: times)
-        last = self._least(channel, numbers, -lasts, lambda times: -times)
+        first = self._least(channel, self._indexes.firsts, 1)
+        last = self._least(channel, self._indexes.lasts, -1)
         return None if first is None or last is None else (first, -last)
 
-    def _least(self, channel: int, numbers: Column, bounds: Column, key: Callable[[Column], Column]) -> int | None:
-        """The least key of a channel's log times; `bounds`: by chunk of `numbers` the least that it can have."""
+    def _least(self, channel: int, bounds: Column, sign: int) -> int | None:
+        """The least log time of a channel, times `sign`; `bounds`: by chunk the least that it can have."""
         least: int | None = None
-        at, step = 0, 1
-        order = np.argsort(bounds, kind="stable")
-        while at < len(order) and (least is None or bounds[order[at]] < least):
-            times = self._load(numbers[order[at : at + step]], [channel])[channel].times
-            if len(times):
-                found = int(key(times).min())
-                least = found if least is None else min(least, found)
-            at, step = at + step, min(4 * step, STEP)
+        for numbers in self._indexes.holding([channel]):
+            can = sign * bounds[numbers]
+            order = np.argsort(can, kind="stable")
+            at, step = 0, 1
+            while at < len(order) and (least is None or can[order[at]] < least):
+                times = self._load(numbers[order[at : at + step]], [channel])[channel].times
+                if len(times):
+                    found = int((sign * times).min())
+                    least = found if least is None else min(least, found)
+                at, step = at + step, min(4 * step, STEP)
         return least
 
     def entries(self, channel: int) -> Entries:
@@ -135,25 +133,35 @@ class LongIndex:
         return self._load(np.arange(len(self._indexes)), np.unique(self._indexes.channels).tolist())
 
     def blocks(self, channel: int, start: int | None, end: int | None) -> Iterator[Entries]:
-        numbers = self._indexes.holding([channel], start, end)
-        firsts = self._indexes.firsts[numbers]
-        order = np.argsort(firsts, kind="stable")
-        numbers, firsts = numbers[order], firsts[order]
-        held = _NONE
-        for at in range(0, len(numbers), STEP):
-            held = _joined(held, self._load(numbers[at : at + STEP], [channel])[channel])
-            if at + STEP < len(numbers):
-                before = held.times < firsts[at + STEP]
+        firsts, held = self._indexes.firsts, _NONE
+        for numbers in self._by_time(channel, start, end):
+            before = held.times < firsts[numbers[0]]
+            if before.any():
                 yield held.where(before)
                 held = held.where(~before)
+            held = _joined(held, self._load(numbers, [channel])[channel])
         yield held
+
+    def _by_time(self, channel: int, start: int | None, end: int | None) -> Iterator[Column]:
+        """The numbers of a channel's chunks in the order of their first times, `STEP` at a time."""
+        found = self._indexes.holding([channel], start, end)
+        if not self._ordered:
+            numbers = np.concatenate([np.empty(0, np.int64), *found])
+            found = iter([numbers[np.argsort(self._indexes.firsts[numbers], kind="stable")]])
+        for numbers in found:
+            for at in range(0, len(numbers), STEP):
+                yield numbers[at : at + STEP]
+
+    @cached_property
+    def _ordered(self) -> bool:
+        return self._indexes.ordered
 
     def in_file_order(
         self, channels: Collection[int], start: int | None = None, end: int | None = None
     ) -> Iterator[Mapping[int, Entries]]:
-        numbers = self._indexes.holding(list(channels), start, end)
-        for at in range(0, len(numbers), STEP):
-            yield self._load(numbers[at : at + STEP], channels)
+        for numbers in self._indexes.holding(list(channels), start, end):
+            for at in range(0, len(numbers), STEP):
+                yield self._load(numbers[at : at + STEP], channels)
 
     def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
         numbers = np.unique(np.linspace(0, len(self._indexes) - 1, SAMPLED).astype(np.int64))

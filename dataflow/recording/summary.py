@@ -69,7 +69,7 @@ def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Summary | No
             raise file.damaged(f"its footer at byte {file.size - TAIL_BYTES} fails its checksum")
         return None
     contents = Contents(file)
-    chunks = ChunkIndexReader(file)
+    chunks = ChunkIndexReader(file, max(0, file.size - footer.summary_start))
     metadata: list[MetadataIndex] = []
     statistics: Statistics | None = None
     for block, at, records, others in _blocks(file, footer):
@@ -94,7 +94,7 @@ def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Summary | No
         len(indexes) or (statistics is not None and statistics.message_count == 0)
     ):
         return None
-    contents.chunks.extend(indexes.starts + RECORD.size, indexes.lengths - RECORD.size, indexes.sizes)
+    contents.chunks.adopt(indexes.starts, indexes.lengths, indexes.sizes)
     found = _long(contents, indexes, statistics, sealed) if len(indexes) > LONG else _loaded(contents, indexes, sealed)
     if found is None or contents.undeclared():
         return None

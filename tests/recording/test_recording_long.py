@@ -11,7 +11,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from dataflow.messages import Image, Pose
-from dataflow.recording import Recording, RecordingWriter, contents, message_index, summary
+from dataflow.recording import Recording, RecordingWriter, chunk_indexes, contents, message_index, summary
 
 
 def write(path: Path, pose: Callable[..., Pose]) -> None:
@@ -73,6 +73,7 @@ def long(monkeypatch: pytest.MonkeyPatch, step: int = 4) -> None:
     """Has every recording be one of many chunks."""
     monkeypatch.setattr(summary, "LONG", 0)
     monkeypatch.setattr(message_index, "STEP", step)
+    monkeypatch.setattr(chunk_indexes, "SEGMENT", 7 * step)
 
 
 @pytest.mark.parametrize("step", [1, 4, 1000])
