@@ -15,8 +15,7 @@ from dataflow.messages.base import Message
 from dataflow.names import diagnostics_key
 from dataflow.recording import LogLine, RecordingWriter
 from dataflow.recording.layout import ENDS, OUTCOME, PARAMETERS, TOLD
-from dataflow.recording.limits import MAX_STATE_BYTES
-from dataflow.records.firing import decode_batch, encode_batch
+from dataflow.records.firing import MAX_STATE_BYTES, decode_batch, encode_batch
 
 PARAMETER_MARK = msgpack.packb("value")
 """Stands in every batch with a parameter that was changed, as a key of its detail, and in few others."""
