@@ -22,8 +22,7 @@ from dataflow.firing.protocol import Runner
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import Operator
-from dataflow.recording.limits import MAX_STATE_BYTES
-from dataflow.records.firing import Emission, Kind
+from dataflow.records.firing import MAX_STATE_BYTES, Emission, Kind
 from dataflow.sync import FOREVER, NEVER, Drop, Entry, Firing, format_duration, format_stamp
 from dataflow.sync.single import make_aligner
 

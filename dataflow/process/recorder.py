@@ -15,9 +15,8 @@ from dataflow.messages.base import Message
 from dataflow.names import diagnostics_key
 from dataflow.recording import LogLine, RecordingWriter
 from dataflow.recording.layout import ENDS, OUTCOME, PARAMETERS, TOLD, firings_topic
-from dataflow.recording.limits import MAX_STATE_BYTES
 from dataflow.recording.parts import OWNER_ONLY
-from dataflow.records.firing import decode_batch, encode_batch
+from dataflow.records.firing import MAX_STATE_BYTES, decode_batch, encode_batch
 
 GOES_ON = "goes on"
 """The outcome that a file names which is not the last one of its run."""

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 MAX_CHUNK_BYTES = 2**29
 """A message with what is derived from it, a firing record, an event, a chunk (uncompressed), an attachment."""
-MAX_STATE_BYTES = MAX_CHUNK_BYTES - 2**16
-"""A state in a firing record: a larger one is left out of it, and the run goes on."""
 MAX_RECORD_BYTES = 2**28
 """A schema, a channel, a metadata record, a message index: more than any graph or schema takes."""
 MAX_CHUNK_MESSAGES = 2**20

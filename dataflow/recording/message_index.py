@@ -1,4 +1,4 @@
-"""Where the messages of an MCAP file lie, by channel: all in memory, or of a long file read as they are asked for."""
+"""Places of the messages of an MCAP file, by channel: all in memory, or of a long file read as they are asked for."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NONE = Entries(*(np.empty(0, np.int64) for _ in range(3)))
 
 
 class MessageIndex(Protocol):
-    """Where the messages of each channel lie."""
+    """The places of the messages of each channel."""
 
     def count(self, channel: int) -> int:
         """Messages of a channel."""

@@ -16,6 +16,9 @@ import msgpack
 from dataflow.sync import Drop, FiringInputs, InputRef, MessageRef, RunRef
 
 FORMAT = 1
+MAX_STATE_BYTES = 2**29 - 2**16
+"""Of a state in a record: with the record it fits into a chunk (`dataflow.recording.limits`). A larger one is left out,
+and the run goes on."""
 Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot", "cut"]
 Outcome = Literal["ok", "error"]
 KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot", "cut")

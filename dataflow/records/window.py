@@ -15,7 +15,7 @@ from dataflow.records.firing import CALLS, FiringRecord, FiringRecordError, deco
 from dataflow.records.reading import FiringLog, Maker, needed_from
 
 FIRST_REACH = 60 * 10**9
-"""How far (ns) before the stamp records are looked for at first: states are recorded about that often."""
+"""Span (ns) before the stamp in which records are looked for at first: states are recorded about that often."""
 HEAD = 4096
 """Batches at the beginning of a recording among which each operator's first one is looked for."""
 NEVER_MADE = (2**62, 0)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from dataflow.messages import FeatureVector, Image
-from dataflow.recording import Recording, RecordingError, RecordingWriter
+from dataflow.recording import Recording, RecordingError, RecordingWriter, limits
 from dataflow.recording.attachments import Attachment
 from dataflow.recording.container import ContainerWriter
 from dataflow.recording.index import McapFile
+from dataflow.records.firing import MAX_STATE_BYTES, FiringRecord, encode_batch
 
 LIMITS = {"MAX_CHUNK_BYTES": 20_000, "MAX_RECORD_BYTES": 10_000, "MAX_CHUNK_MESSAGES": 50, "MAX_PARSED": 60}
 HEAD = 31
@@ -153,3 +154,10 @@ def test_a_stream_in_a_damaged_recording_may_expand_as_it_may(tmp_path: Path, mo
     with Recording(path) as recording:
         assert recording.damage
         assert sum(1 for _ in recording.messages()) == 6
+
+
+def test_a_state_of_the_largest_size_fits_into_a_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    beside = len(encode_batch([FiringRecord("o" * 200, 0, 2**40, "snapshot", 2**62, detail={"state": b""})]))
+    assert MAX_STATE_BYTES + beside + HEAD <= limits.MAX_CHUNK_BYTES
+    assert limits.MAX_CHUNK_BYTES - MAX_STATE_BYTES <= 2**16
