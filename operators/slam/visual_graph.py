@@ -9,8 +9,9 @@ import numpy as np
 
 from dataflow.messages.geometry import invert
 from operators.geometry.se3 import Matrix
+from operators.odometry.keyframes import view_distance
 from operators.odometry.rgbd.fitting import Fitter
-from operators.odometry.rgbd.keyframe import Keyframe, view_distance
+from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import Node
 from operators.slam.local_bundle import adjust_newest

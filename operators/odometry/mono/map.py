@@ -10,9 +10,9 @@ from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import Pixels, Points, project
 from operators.geometry.se3 import Matrix
 from operators.odometry.features import Gray, Mask
+from operators.odometry.keyframes import view_distance
 from operators.odometry.mono.adjustment import Views, adjust
 from operators.odometry.mono.two_view import triangulate
-from operators.odometry.rgbd.keyframe import view_distance
 from operators.odometry.tracking import scaled_covariance
 
 Numbers = NDArray[np.int64]

@@ -15,6 +15,7 @@ from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, Vector
 from operators.monitoring.image_flaws import Watch
 from operators.odometry.features import detect_corners
+from operators.odometry.keyframes import view_distance
 from operators.odometry.mono.initialisation import first_map
 from operators.odometry.mono.map import MonoMap, View
 from operators.odometry.mono.pose import PosedView, refined, solved
@@ -25,7 +26,6 @@ from operators.odometry.mono.settings import MonoOdometryConfig
 from operators.odometry.mono.tracks import MonoFrame, Tracks, from_view, observe
 from operators.odometry.mono.two_view import Unsolved
 from operators.odometry.motion import Motion
-from operators.odometry.rgbd.keyframe import view_distance
 from operators.odometry.tracking import Status, TrackResult, moved_covariance, scaled_covariance
 
 # Variances are this much larger than residuals say: neighbouring tracks err together (calibrated against truth).

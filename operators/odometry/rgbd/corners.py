@@ -1,4 +1,4 @@
-"""The corners of a new keyframe: those that it keeps from the last one, and new ones."""
+"""The corners of keyframes: followed into a frame, kept for the next keyframe, and new ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,11 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.geometry.pinhole import Pixels, Points
-from operators.odometry.features import Gray, detect_corners
+from operators.odometry.features import LK_LEVELS, Gray, detect_corners, track_corners, with_exposure_of
 from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.fitting import Fitter, Sighting
+from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.surface import DepthNoise
 
+MAJORITY = 0.5  # of a keyframe's corners: where fewer agree on a pose, they are looked for once more
 OLDEST = 10  # keyframes after which a corner's point is as sure as it gets
 
 Layer = tuple[RgbdCamera, NDArray[np.float32]]  # a camera and the depth image, metres, that it sees through K_depth
@@ -63,3 +66,24 @@ def with_new(
         np.concatenate([kept.points, points[known]]),
         np.concatenate([kept.ages, np.zeros(np.count_nonzero(known), np.int64)]),
     )
+
+
+def followed(gray: Gray, keyframe: Keyframe, guess: Pixels, fitter: Fitter) -> Sighting | None:
+    """Returns the pose in which most of a keyframe's corners lie where a frame shows them, near guessed pixels (N, 2).
+
+    Smaller images find what has moved far, and lead astray where there is little to tell corners apart: when few agree
+    on a pose, they are looked for again in the whole image alone, within a window around the guess. Bouguet, 2000.
+    """
+    leveled = with_exposure_of(keyframe.gray, gray)
+
+    def sighted(levels: int) -> Sighting | None:
+        pixels, found = track_corners(keyframe.gray, leveled, keyframe.pixels, guess, levels)
+        tracks = keyframe.points_world[found], pixels[found], keyframe.ages[found]
+        return fitter.follow(*tracks, 3.0 * fitter.noise.pixel, fitter.config.min_inliers)
+
+    first = sighted(LK_LEVELS)
+    agree = 0 if first is None else len(first.pixels)
+    if agree >= MAJORITY * len(keyframe.points):
+        return first
+    second = sighted(0)
+    return second if second is not None and len(second.pixels) > agree else first

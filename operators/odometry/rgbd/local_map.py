@@ -7,7 +7,8 @@ import numpy as np
 
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, orthonormalised
-from operators.odometry.rgbd.keyframe import Keyframe, redundant, view_distance
+from operators.odometry.keyframes import redundant, view_distance
+from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.surface import Surface
 
 RECENT = 5  # newest keyframes, never forgotten

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,20 +23,16 @@ from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.evidence import gathered, seeing
 from operators.odometry.rgbd.fitting import Fit, Fitter, Sighting
 from operators.odometry.rgbd.frame import Frame
-from operators.odometry.rgbd.keyframe import Keyframe, view_distance
+from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.surface import DepthNoise, Surface
 
 PAIRS = 60  # features of one keyframe that are paired
 FEWEST = 8  # different features of a view that must agree on its pose for a look at what else supports it
 VIEWS = 2  # keyframes that a recognised view is compared with
-TYPICAL_DEPTH = 2.0  # metres
 SPARSE = 4  # patches of the view's surface between points by which these are chosen
 FEWEST_PIXELS = 7  # features that a pose may be solved from without depth
 RECALL_PIXELS = 3.0  # working pixels by which such a feature may be off
-RECALL_NEAR, RECALL_OTHERS = 3, 5  # keyframes, near the prediction and elsewhere, that a lost view is compared with
-RECALL_EVERY = 3  # frames, while a new map is tracked for longer than
-RECALL_ALWAYS_S = 1.0  # seconds, for which every frame is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,31 +138,6 @@ def recalls(gray: Gray, keyframes: Sequence[Keyframe], camera: RgbdCamera, fewes
             points_world = transform_points(keyframe.T_world_camera, points[known])
             found.append(Recall(keyframe, points_world, seen.pixels[pairs[known, 1]]))
     return sorted(found, key=lambda recall: -len(recall.pixels))
-
-
-def recall_due(stamp: int, apart_since: int | None, recalls: int) -> bool:
-    """Returns whether a new map that is tracked, begun at a stamp and searched for so often, is searched for now."""
-    return apart_since is not None and (stamp - apart_since < RECALL_ALWAYS_S * 1e9 or recalls % RECALL_EVERY == 0)
-
-
-class Posed(Protocol):
-    """Stands for anything with a pose."""
-
-    @property
-    def T_world_camera(self) -> Matrix: ...
-
-
-K = TypeVar("K", bound=Posed)
-
-
-def candidates(
-    keyframes: Sequence[K], T_predicted: Matrix, near: int, others: int, turn: int, depth: float = TYPICAL_DEPTH
-) -> list[K]:
-    """Returns those nearest to a predicted view of a scene at a depth and, in turns, others: all in a few frames."""
-    ranked = sorted(keyframes, key=lambda k: view_distance(k.T_world_camera, T_predicted, depth))
-    rest = ranked[near:]
-    take = min(others, len(rest))
-    return [*ranked[:near], *(rest[(turn * take + i) % len(rest)] for i in range(take))]
 
 
 def rough_points(keyframe: Keyframe, chosen: NDArray[np.int64], camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:

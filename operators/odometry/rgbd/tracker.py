@@ -16,25 +16,17 @@ from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, Vector
 from operators.monitoring.image_flaws import Watch
+from operators.odometry.keyframes import RECALL_NEAR, RECALL_OTHERS, candidates, recall_due, view_distance
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
-from operators.odometry.rgbd.corners import Corners, Layer, renewed, with_new
-from operators.odometry.rgbd.drift import carried
+from operators.odometry.rgbd.corners import Corners, Layer, followed, renewed, with_new
 from operators.odometry.rgbd.fitting import Fit, Fitter, Sighting
-from operators.odometry.rgbd.following import followed
 from operators.odometry.rgbd.frame import Frame, observe
-from operators.odometry.rgbd.keyframe import Keyframe, view_distance
+from operators.odometry.rgbd.keyframe import Keyframe, carried
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.noise import Noise
-from operators.odometry.rgbd.relocalizer import (
-    RECALL_NEAR,
-    RECALL_OTHERS,
-    believed,
-    candidates,
-    recall_due,
-    recognised,
-)
+from operators.odometry.rgbd.relocalizer import believed, recognised
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 

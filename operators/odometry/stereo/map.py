@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from operators.geometry.se3 import Matrix, orthonormalised
-from operators.odometry.rgbd.keyframe import redundant, view_distance
+from operators.odometry.keyframes import redundant, view_distance
 from operators.odometry.stereo.relocalizer import TYPICAL, StereoKeyframe
 
 RECENT = 5  # newest keyframes, never forgotten

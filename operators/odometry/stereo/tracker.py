@@ -15,9 +15,9 @@ from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
 from operators.monitoring.image_flaws import Watch
 from operators.odometry.features import Gray, Mask, Pixels, detect_corners, track_both_ways
+from operators.odometry.keyframes import RECALL_NEAR, RECALL_OTHERS, candidates, recall_due
 from operators.odometry.mono.pose import solved
 from operators.odometry.motion import Motion
-from operators.odometry.rgbd.relocalizer import RECALL_NEAR, RECALL_OTHERS, candidates, recall_due
 from operators.odometry.stereo.adjustment import Sightings, StereoRig, adjust
 from operators.odometry.stereo.map import StereoMap
 from operators.odometry.stereo.pair import StereoPair, Watches, observe

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from operators.geometry import se3
-from operators.odometry.rgbd.drift import SINKING, TURNING, carried
 from operators.odometry.rgbd.fitting import Fit, Sighting
-from operators.odometry.rgbd.keyframe import Keyframe
+from operators.odometry.rgbd.keyframe import SINKING, TURNING, Keyframe, carried
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.surface import Surface

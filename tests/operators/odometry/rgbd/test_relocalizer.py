@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.monitoring.image_flaws import Watch
+from operators.odometry.keyframes import candidates
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.evidence import gathered, seeing
@@ -18,7 +19,7 @@ from operators.odometry.rgbd.frame import Frame, observe
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.noise import Noise
-from operators.odometry.rgbd.relocalizer import candidates, recognised
+from operators.odometry.rgbd.relocalizer import recognised
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 
 FOCAL, WIDTH, HEIGHT = 260.0, 320, 240

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from operators.geometry.pinhole import Pixels, project
 from operators.odometry.features import LK_LEVELS
-from operators.odometry.rgbd import following
+from operators.odometry.rgbd import corners
 from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.corners import followed
 from operators.odometry.rgbd.fitting import Fitter
-from operators.odometry.rgbd.following import followed
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
@@ -48,7 +48,7 @@ def test_corners_that_were_led_astray_are_looked_for_near_the_guess(
             ends[:astray] += np.random.default_rng(2).uniform(-60, 60, (astray, 2))
         return ends, np.ones(len(ends), bool)
 
-    monkeypatch.setattr(following, "track_corners", track)
+    monkeypatch.setattr(corners, "track_corners", track)
     fitter = Fitter(RgbdCamera(K, K), RgbdOdometryConfig(), Noise())
 
     found = followed(GRAY, known, there, fitter)
@@ -62,6 +62,6 @@ def test_corners_that_were_led_astray_are_looked_for_near_the_guess(
 def test_a_frame_in_which_nothing_is_found_has_no_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     known, there = keyframe()
     nothing = np.zeros(len(there), bool)
-    monkeypatch.setattr(following, "track_corners", lambda *given: (there, nothing))
+    monkeypatch.setattr(corners, "track_corners", lambda *given: (there, nothing))
 
     assert followed(GRAY, known, there, Fitter(RgbdCamera(K, K), RgbdOdometryConfig(), Noise())) is None
