@@ -97,8 +97,8 @@ def few_matched(matches: Matches, estimate: Trajectory, truth: Trajectory, toler
         return None
     spans = [f"{t.stamps[0] * 1e-9:.3f} to {t.stamps[-1] * 1e-9:.3f} s" for t in (estimate, truth)]
     return (
-        f"only {len(matches.estimate):,} of {possible:,} poses have a partner within {tolerance * 1e-6:g} ms: stamps of "
-        f"the estimate run from {spans[0]}, of the truth from {spans[1]}"
+        f"only {len(matches.estimate):,} of {possible:,} poses have a partner within {tolerance * 1e-6:g} ms: stamps "
+        f"of the estimate run from {spans[0]}, of the truth from {spans[1]}"
     )
 
 
