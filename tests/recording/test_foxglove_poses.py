@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from dataflow.messages import Image16, Transforms
+from dataflow.messages import Image, Image16, Transforms
 from dataflow.messages import LaserScan as ScanMessage
 from dataflow.messages import PointCloud as CloudMessage
 from dataflow.recording import RecordingError
@@ -77,6 +77,26 @@ def test_one_transform_is_a_set_of_one_as_protobuf_and_as_json() -> None:
         assert isinstance(found, Transforms)
         assert (found.stamp, found.frames, found.child_frames) == (5, ("map",), ("base",))
         assert found.translations.tolist() == [[2, 0, 0]]
+
+
+def test_points_of_64_bits_keep_them() -> None:
+    far = np.array([[500_000.01, 5_000_000.02, 3.0]])
+    proto = PointCloud(frame_id="utm", point_stride=24, data=far.tobytes())
+    for k, axis in enumerate("xyz"):
+        proto.fields.add(name=axis, offset=8 * k, type=PackedElementField.FLOAT64)
+
+    found = decoded(proto)
+
+    assert isinstance(found, CloudMessage)
+    assert found.precise is not None
+    assert found.precise.tolist() == far.tolist()
+
+
+def test_images_of_other_encodings_become_rgb() -> None:
+    found = decoded(RawImage(encoding="bgr8", width=1, height=1, step=3, data=bytes([1, 2, 3])))
+
+    assert isinstance(found, Image)
+    assert found.data.tolist() == [[[3, 2, 1]]]
 
 
 def test_16_bit_images_keep_their_bits() -> None:

@@ -84,12 +84,21 @@ def decode_cloud(proto: PointCloudProto) -> Fields:
             found[field] = _columns(proto.data, count, stride, present, dtype)
     if "points" not in found:
         raise RecordingError(f"PointCloud needs the fields x, y and z, got {', '.join(offsets) or 'none'}")
+    wide = [offsets[axis] for axis in "xyz"]
+    if any(kind == NUMERIC.FLOAT64 for _, kind in wide):
+        exact = _columns(proto.data, count, stride, wide, "<f8")
+        if not np.array_equal(exact, found["points"], equal_nan=True):
+            found["precise"] = exact
     place = placed_by(proto.pose)
     if place is not None:
-        for field, shift in (("points", place[:3, 3]), ("normals", np.zeros(3))):
+        for field, shift, dtype in (
+            ("points", place[:3, 3], "<f4"),
+            ("precise", place[:3, 3], "<f8"),
+            ("normals", np.zeros(3), "<f4"),
+        ):
             if field in found:
                 moved = found[field].astype(np.float64) @ place[:3, :3].T + shift
-                found[field] = frozen(moved, "<f4", moved.shape)
+                found[field] = frozen(moved, dtype, moved.shape)
     return found
 
 
