@@ -28,13 +28,13 @@ from long_recording_operators import EPOCH, PERIOD, numbered
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
-from dataflow.firing.snapshots import pack_state
+from dataflow.execution.snapshots import pack_state
 from dataflow.messages import FeatureVector
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.recording.codecs import codec_for
-from dataflow.recording.ending import record_bytes
 from dataflow.recording.layout import RESERVED_METADATA
-from dataflow.recording.seals import sealed
+from dataflow.recording.mcap.ending import record_bytes
+from dataflow.recording.mcap.seals import sealed
+from dataflow.recording.streams.codecs import codec_for
 from dataflow.records.firing import Emission, FiringRecord, decode_batch, encode_batch, encode_single
 from dataflow.sync import FOREVER, MessageRef
 from dataflow.verification.verify import verify

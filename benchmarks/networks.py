@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 
 from dataflow.messages import CompressedImage, Detections2D, Image, Message, SegmentationMap
-from dataflow.recording.reader import Recording
+from dataflow.recording.streams.reader import Recording
 from operators.codec import ImageDecoder
 from operators.detection import CustomDetector
 from operators.detection.custom.evaluation import ScoredImage, score_detections

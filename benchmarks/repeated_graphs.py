@@ -28,7 +28,7 @@ import xxhash
 from repeated_made import MADE, maps, perceived
 
 import dataflow
-from dataflow.firing.threads import environment
+from dataflow.execution.threads import environment
 from dataflow.graph import load_graph
 from dataflow.operator import Operator, Source
 

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from dataflow.firing.threads import environment
+from dataflow.execution.threads import environment
 
 Floats = npt.NDArray[np.float64]
 SECONDS = 120.0

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 import dataflow
 from dataflow.messages import Detections2D, Message, Odometry, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.supervision.report import RunFailed
+from dataflow.supervision.core.report import RunFailed
 from operators.codec import DepthDecoder, ImageDecoder
 from operators.evaluation import DetectionMetrics, SceneGraphMetrics
 from operators.perception import PerceptionResult, PerceptionSystem

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dataflow.arguments import checked
-from dataflow.firing.runner import OperatorRunner
-from dataflow.firing.source import SourceRunner
+from dataflow.execution.runner import OperatorRunner
+from dataflow.execution.source import SourceRunner
 from dataflow.graph.model import Live, Node
 from dataflow.messages.base import Message
 from dataflow.operator import Operator, Source

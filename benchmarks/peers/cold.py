@@ -94,10 +94,10 @@ class Pair:
     def _processes(self, size: int) -> tuple[Any, Any]:
         from dataflow.graph import load_graph
         from dataflow.process.config import ProcessConfig
-        from dataflow.process.handed import take_handed
-        from dataflow.process.inbox import Inbox
+        from dataflow.process.descriptors import take_descriptors
         from dataflow.process.operator_process import OperatorProcess
-        from dataflow.process.outlet import Network
+        from dataflow.process.streams.inbox import Inbox
+        from dataflow.process.streams.outlet import Network
         from dataflow.records.black_box import make_black_box
         from dataflow.supervision.configs import configurations
         from dataflow.supervision.plan import RunPlan, process_plans
@@ -111,7 +111,7 @@ class Pair:
         self.rings = Rings(list(plans), pairs_of(graph, plans))
         made = []
         for label, (_, config) in configs.items():
-            handed = take_handed([*self.rings.handed(label), make_black_box()], config)
+            handed = take_descriptors([*self.rings.handed(label), make_black_box()], config)
             inbox = Inbox(handed.wake, handed.incoming)
             channel: Any = SimpleNamespace(send=lambda kind, **fields: None)
             one = OperatorProcess(ProcessConfig(**config), channel, inbox, handed.outgoing, box=handed.box)

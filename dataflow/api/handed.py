@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 
-from dataflow.firing.log import FiringLog
-from dataflow.firing.ports import Emitter
+from dataflow.execution.log import FiringLog
+from dataflow.execution.ports import Emitter
 from dataflow.graph.model import Graph
 from dataflow.graph.problems import did_you_mean
 from dataflow.messages.base import Message

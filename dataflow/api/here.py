@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from contextlib import closing
 from typing import Any
 
-from dataflow.firing.threads import limited_threads
-from dataflow.supervision.report import RunFailed
-from dataflow.verification.board import Board
-from dataflow.verification.letters import read_letter, write_letter
-from dataflow.verification.processes import Call
+from dataflow.execution.threads import limited_threads
+from dataflow.supervision.core.report import RunFailed
+from dataflow.verification.workers.board import Board
+from dataflow.verification.workers.mail import read_letter, write_letter
+from dataflow.verification.workers.processes import Call
 
 
 def call_here(calls: Sequence[Call], *, threads: int, **watching: Any) -> list[Any]:

@@ -12,7 +12,7 @@ from dataflow.sync import format_stamp
 
 if TYPE_CHECKING:
     from dataflow.graph.model import Graph
-    from dataflow.supervision.report import RunReport
+    from dataflow.supervision.core.report import RunReport
     from dataflow.verification.report import VerifyReport
 
 _LEFT = ' style="text-align:left"'

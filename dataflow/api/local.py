@@ -16,20 +16,20 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from dataflow.chaos.faults import OperatorFaults
-from dataflow.feeds.window import Window
-from dataflow.firing.calls import summary_of
-from dataflow.firing.failure import OperatorFailure
-from dataflow.firing.protocol import Runner
-from dataflow.firing.threads import limited_threads
+from dataflow.execution.calls import summary_of
+from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.feeds.window import Window
+from dataflow.execution.protocol import Runner
+from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
-from dataflow.process.pace import Pace
-from dataflow.process.recorder import RecorderSink
 from dataflow.process.runners import Runners, make_log, make_runner, make_source
+from dataflow.process.streams.pace import Pace
 from dataflow.records.firing import FiringRecord, encode_batch
+from dataflow.sinks.recorder import RecorderSink
+from dataflow.supervision.core.report import OperatorCounts, RunFailed, RunReport, Status
 from dataflow.supervision.plan import LogPlan
-from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
 from dataflow.sync import FOREVER, NEVER, Entry
 
 BATCH_RECORDS = 64

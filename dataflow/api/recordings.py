@@ -16,7 +16,7 @@ from dataflow.arguments import checked
 from dataflow.graph.model import Graph
 from dataflow.recording import Event, Recorded, Recording
 from dataflow.recording.layout import RECORDING
-from dataflow.recording.part_folder import parts_in
+from dataflow.recording.streams.part_folder import parts_in
 from dataflow.reexecution.recorded_run import resolved_graph
 
 

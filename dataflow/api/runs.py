@@ -15,19 +15,19 @@ from dataflow.api.local import LocalRun, Watch
 from dataflow.api.recordings import RecordedStreams, open
 from dataflow.arguments import checked, evaluated, require
 from dataflow.editing.untouched import keep_untouched
-from dataflow.firing import seeding
+from dataflow.execution.generators import seeding
 from dataflow.graph import Graph as ResolvedGraph
 from dataflow.graph.problems import did_you_mean
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign
 from dataflow.recording import Recording
-from dataflow.recording.facts import machine_facts
 from dataflow.recording.layout import BAG, RUN
+from dataflow.recording.streams.facts import machine_facts
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
 from dataflow.supervision import plan
+from dataflow.supervision.core.report import RunReport
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
-from dataflow.supervision.report import RunReport
 from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.verification.report import VerifyReport
 
@@ -219,8 +219,8 @@ def verify(
     `RunFailed`.
     """
     from dataflow.api.here import call_here
-    from dataflow.verification.processes import call_workers
     from dataflow.verification.verify import verify as verify_recording
+    from dataflow.verification.workers.processes import call_workers
 
     path = Path(recording)
     with Recording(path) as opened:

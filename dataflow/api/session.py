@@ -12,12 +12,12 @@ from dataflow.api.handed import HandedFeed
 from dataflow.api.local import Emitting, Recorder, config_of, make_here, step_each
 from dataflow.api.runs import metadata_of
 from dataflow.arguments import checked, require
-from dataflow.firing.calls import summary_of
-from dataflow.firing.failure import OperatorFailure
-from dataflow.firing.threads import limited_threads
+from dataflow.execution.calls import summary_of
+from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.threads import limited_threads
 from dataflow.messages.base import Message
 from dataflow.process.runners import Runners
-from dataflow.supervision.report import RunFailed
+from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.sync import Entry
 

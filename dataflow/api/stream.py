@@ -16,8 +16,8 @@ from dataflow.arguments import checked
 from dataflow.graph.problems import did_you_mean
 from dataflow.messages.base import Field, Message
 from dataflow.recording import Recorded, Recording, StreamInfo
-from dataflow.recording.access import StreamIndex
-from dataflow.recording.json_columns import Values
+from dataflow.recording.streams.access import StreamIndex
+from dataflow.recording.streams.json_columns import Values
 
 if TYPE_CHECKING:
     import pandas as pd

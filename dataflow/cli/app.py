@@ -10,11 +10,19 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from dataflow.cli import completion
-from dataflow.cli.arguments import FLAG
-from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, forget_notes, interrupted_by_user, wants_traceback
-from dataflow.cli.plugins import CommandGroup, renamed
-from dataflow.cli.standard_output import OutputFailed
+from dataflow.cli.commands import completion
+from dataflow.cli.support.arguments import FLAG
+from dataflow.cli.support.output import (
+    COULD_NOT_RUN,
+    TRACEBACK,
+    err,
+    fail,
+    forget_notes,
+    interrupted_by_user,
+    wants_traceback,
+)
+from dataflow.cli.support.plugins import CommandGroup, renamed
+from dataflow.cli.support.standard_output import OutputFailed
 from dataflow.extras import missing_extra
 
 app = typer.Typer(

@@ -11,7 +11,7 @@ import signal
 import sys
 from types import FrameType
 
-from dataflow.cli.standard_output import Output, OutputFailed
+from dataflow.cli.support.standard_output import Output, OutputFailed
 
 COULD_NOT_RUN = 2
 INTERRUPTED = 130

@@ -23,7 +23,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages.base import Message, MessageError
 from dataflow.recording import RecordingWriter
 from dataflow.recording.layout import ENDS
-from dataflow.recording.packing import Compression
+from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.parts import OWNER_ONLY, WHOLE, Splitting, part_path, parts_of
 from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
 from dataflow.transport.codec import TypeOf, decode

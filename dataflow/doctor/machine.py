@@ -18,7 +18,7 @@ from pathlib import Path
 import psutil
 
 from dataflow.doctor.finding import Finding, State
-from dataflow.recording.facts import machine_facts
+from dataflow.recording.streams.facts import machine_facts
 from dataflow.transport.registry import RegistryError, registry_folder, running
 
 SHARED = 64 << 20

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 
 from dataflow.editing.report import Edited
-from dataflow.recording.attachments import names_once, tells_of_run
-from dataflow.recording.copying import Copy, Origin
+from dataflow.recording.mcap.attachments import names_once, tells_of_run
+from dataflow.recording.streams.copying import Copy, Origin
 
 Items = list[tuple[str, Hashable]]
 

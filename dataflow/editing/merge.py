@@ -16,11 +16,11 @@ from dataflow.editing.part import copy_messages, graph_of, kept_stamps, outputs_
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.editing.rolling import once
 from dataflow.recording import Recorded, Recording
-from dataflow.recording.copying import Copy, Mask, Origin, framing
-from dataflow.recording.cutting import Cut, cut_of
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, GRAPH, RECORDING, RUN, Kind
-from dataflow.recording.packing import Compression
+from dataflow.recording.mcap.packing import Compression
+from dataflow.recording.streams.copying import Copy, Mask, Origin, framing
+from dataflow.recording.streams.cutting import Cut, cut_of
 from dataflow.records.cuts import taken_by
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog

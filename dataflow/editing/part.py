@@ -15,11 +15,11 @@ from dataflow.graph import GraphError
 from dataflow.graph.model import Graph, Node, OperatorImportError
 from dataflow.interop.bag import is_latched
 from dataflow.recording import Recording
-from dataflow.recording.copying import RUN_KINDS, Copy, Mask, Origin, framing, places
-from dataflow.recording.cutting import Cut, cut_of
-from dataflow.recording.index import NO_END
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, Kind
-from dataflow.recording.packing import Compression
+from dataflow.recording.mcap.index import NO_END
+from dataflow.recording.mcap.packing import Compression
+from dataflow.recording.streams.copying import RUN_KINDS, Copy, Mask, Origin, framing, places
+from dataflow.recording.streams.cutting import Cut, cut_of
 from dataflow.records.firing import CALLS, FiringRecord, consecutive, encode_batch
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph, resolved_graph

@@ -12,11 +12,11 @@ import numpy as np
 from dataflow.editing.part import copy_messages, graph_of, outputs_of
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.recording import Recording
-from dataflow.recording.copying import Copy, Mask, Origin, places
-from dataflow.recording.cutting import cut_of
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import DIGESTS, RECOVERED, Kind
-from dataflow.recording.packing import Compression
+from dataflow.recording.mcap.packing import Compression
+from dataflow.recording.streams.copying import Copy, Mask, Origin, places
+from dataflow.recording.streams.cutting import cut_of
 from dataflow.records.firing import WITHHELD
 from dataflow.records.reading import FiringLog
 

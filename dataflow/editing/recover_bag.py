@@ -11,8 +11,8 @@ from dataflow.editing.recover import Loss, Recovered
 from dataflow.editing.report import Edited
 from dataflow.interop.salvage import salvage
 from dataflow.interop.typestores import RosType
-from dataflow.recording.codecs import SchemaText
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.streams.codecs import SchemaText
 
 
 def recover_bag(path: Path, out: Path) -> Recovered:

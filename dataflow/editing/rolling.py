@@ -13,10 +13,10 @@ from dataflow.editing.part import Part, copy_messages, kept_stamps, masks_of, ou
 from dataflow.editing.report import Edited
 from dataflow.editing.spans import records_of_span
 from dataflow.graph.model import Graph
-from dataflow.recording.copying import Copy, Mask, Origin, framing
-from dataflow.recording.cutting import Cut
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, OUTCOME, Kind
 from dataflow.recording.parts import OWNER_ONLY
+from dataflow.recording.streams.copying import Copy, Mask, Origin, framing
+from dataflow.recording.streams.cutting import Cut
 from dataflow.records.cuts import held_by
 from dataflow.records.firing import CALLS, FiringRecord
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from dataflow.editing.part import Part, write_part
 from dataflow.editing.report import Edited, Watch, unwatched
-from dataflow.recording.copying import Origin
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.packing import Compression
+from dataflow.recording.mcap.packing import Compression
+from dataflow.recording.streams.copying import Origin
 
 MOST_PARTS = 10_000
 

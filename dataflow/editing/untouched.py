@@ -9,7 +9,7 @@ import numpy as np
 
 from dataflow.editing.part import copy_messages
 from dataflow.interop.opening import open_bag
-from dataflow.recording.copying import Copy, Origin
+from dataflow.recording.streams.copying import Copy, Origin
 
 
 def keep_untouched(

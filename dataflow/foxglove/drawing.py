@@ -36,9 +36,9 @@ from dataflow.messages import (
     SegmentationMap,
     Tracks,
 )
-from dataflow.recording.codecs import SchemaText, codec_for
-from dataflow.recording.foxglove import file_descriptor_set
-from dataflow.recording.foxglove.values import pose_of, timestamp_of
+from dataflow.recording.streams.codecs import SchemaText, codec_for
+from dataflow.recording.streams.foxglove import file_descriptor_set
+from dataflow.recording.streams.foxglove.values import pose_of, timestamp_of
 
 _WHITE, _GREEN = Color(r=1, g=1, b=1, a=1), Color(r=0.2, g=0.9, b=0.4, a=1)
 _FAINT = Color(r=0.2, g=0.9, b=0.4, a=0.3)

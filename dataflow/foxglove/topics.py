@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dataflow.messages import Message
-from dataflow.recording.frames import FrameTree
+from dataflow.recording.streams.frames import FrameTree
 
 FRAMES = "/frames"
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from dataflow.recording.codecs import SchemaText
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.streams.codecs import SchemaText
 
 
 class BagError(RecordingError):

@@ -21,7 +21,7 @@ from dataflow.messages import (
     RangeReading,
 )
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.pixels import as_depth
+from dataflow.recording.streams.pixels import as_depth
 
 
 def image_of(message: CompressedImage) -> Image:

@@ -14,7 +14,7 @@ import zstandard
 
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
 from dataflow.interop.channels import join
-from dataflow.recording.codecs import SchemaText
+from dataflow.recording.streams.codecs import SchemaText
 
 NO_SCHEMA = SchemaText("", "", b"")
 

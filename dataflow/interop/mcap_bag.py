@@ -12,10 +12,10 @@ from mcap.records import Channel
 
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
 from dataflow.interop.channels import join
-from dataflow.recording.codecs import SchemaText
-from dataflow.recording.index import NO_END, McapFile
 from dataflow.recording.layout import Kind
-from dataflow.recording.ordering import in_file_order
+from dataflow.recording.mcap.index import NO_END, McapFile
+from dataflow.recording.streams.codecs import SchemaText
+from dataflow.recording.streams.ordering import in_file_order
 
 _OWN = (Kind.COMPANION, Kind.FIRINGS, Kind.EVENTS, Kind.FRAMES)
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from dataflow.interop.bag import Bag, BagError, shortfalls
 from dataflow.interop.mcap_bag import McapBag
 from dataflow.interop.unpacking import Unpacked, unpack
-from dataflow.recording.ending import MAGIC
-from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RECORDING
+from dataflow.recording.mcap.ending import MAGIC
+from dataflow.recording.mcap.index import McapFile
 from dataflow.recording.notices import notice
-from dataflow.recording.part_folder import parts_in
+from dataflow.recording.streams.part_folder import parts_in
 
 ROS1_MAGIC = b"#ROSBAG V"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -12,7 +12,7 @@ from rosbags.rosbag1 import Reader, ReaderError
 
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
 from dataflow.interop.channels import join
-from dataflow.recording.codecs import SchemaText
+from dataflow.recording.streams.codecs import SchemaText
 
 
 class RosBag:

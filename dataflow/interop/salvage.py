@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dataflow.recording.codecs import SchemaText
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.streams.codecs import SchemaText
 
 LEAF = 0x0D
 """First byte of a page that holds rows of a table."""

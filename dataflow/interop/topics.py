@@ -19,7 +19,7 @@ from dataflow.interop.seen import Seen
 from dataflow.interop.typestores import RosType, ros_type
 from dataflow.messages import Message, MessageError, Transforms
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.foreign import foreign_decoder
+from dataflow.recording.streams.foreign import foreign_decoder
 
 Data = bytes | memoryview
 

@@ -9,8 +9,8 @@ from typing import Any
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from dataflow.recording.codecs import SchemaText
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.streams.codecs import SchemaText
 
 HEADER = "std_msgs/msg/Header"
 _IDL_SEPARATOR = "=" * 80 + "\n"

@@ -10,7 +10,7 @@ import zstandard
 
 from dataflow.interop.bag import Bag, BagError, Stored, Topic
 from dataflow.interop.mcap_bag import McapBag
-from dataflow.recording.index import McapFile
+from dataflow.recording.mcap.index import McapFile
 
 
 class Unpacked:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from dataflow.lint.finding import Finding
 from dataflow.messages import Message
 from dataflow.recording import Recording
-from dataflow.recording.index import NO_END
 from dataflow.recording.layout import RECORDING, Kind
+from dataflow.recording.mcap.index import NO_END
 
 Stamps = npt.NDArray[np.int64]
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataflow.feeds.log import LogFeed
-from dataflow.feeds.playback import Action, Playback
-from dataflow.feeds.window import Feed, Window
-from dataflow.process.pace import Pace
+from dataflow.execution.feeds.log import LogFeed
+from dataflow.execution.feeds.playback import Action, Playback
+from dataflow.execution.feeds.window import Feed, Window
+from dataflow.process.streams.pace import Pace
 from dataflow.sync import NEVER
 
 PROMISE_EVERY = 8

@@ -15,17 +15,17 @@ from typing import Any
 
 from dataflow.chaos.faults import SourceFaults
 from dataflow.chaos.kinds import TO_SOURCES
-from dataflow.feeds.window import Handover, Window
-from dataflow.firing.failure import OperatorFailure
-from dataflow.firing.restarts import Restarts
-from dataflow.firing.source import SourceRunner, step_size, step_stamp
+from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.feeds.window import Handover, Window
+from dataflow.execution.restarts import Restarts
+from dataflow.execution.source import SourceRunner, step_size, step_stamp
 from dataflow.messages.base import Message
 from dataflow.process.awake import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
-from dataflow.process.inbox import Inbox
+from dataflow.process.log_pipe import SOURCE_THREAD
 from dataflow.process.outlived import tell_outlived
-from dataflow.process.pace import Pace
-from dataflow.process.speech import SOURCE_THREAD
+from dataflow.process.streams.inbox import Inbox
+from dataflow.process.streams.pace import Pace
 
 MISSED_AFTER = 0.2
 """Seconds after which a step of a restarted source counts as missed."""

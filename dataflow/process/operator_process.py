@@ -14,27 +14,27 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from dataflow.feeds.window import Window
-from dataflow.firing.threads import limit_threads
+from dataflow.execution.feeds.window import Window
+from dataflow.execution.threads import limit_threads
 from dataflow.graph.model import Graph
 from dataflow.process.awake import AwakeClock
+from dataflow.process.build import Builder
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
+from dataflow.process.control import Control
+from dataflow.process.descriptors import BACKLOG
 from dataflow.process.feeding import Feeding
-from dataflow.process.handed import BACKLOG
-from dataflow.process.inbox import Inbox
-from dataflow.process.inlet import Inlet
+from dataflow.process.idle_report import IdleReport
 from dataflow.process.live_sources import LiveSources, Step
-from dataflow.process.losses import StreamDamaged, losses_of
-from dataflow.process.making import Making
 from dataflow.process.network import leave_network, network_config
-from dataflow.process.orders import Orders
-from dataflow.process.outlet import Network, Outlet, incarnations_of, left_by
-from dataflow.process.pace import Pace
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, open_box, statics_of
-from dataflow.process.standing import Standing
+from dataflow.process.streams.inbox import Inbox
+from dataflow.process.streams.inlet import Inlet
+from dataflow.process.streams.losses import StreamDamaged, losses_of
+from dataflow.process.streams.outlet import Network, Outlet, incarnations_of, left_by
+from dataflow.process.streams.pace import Pace
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import StreamOrderError
 from dataflow.transport import Bus, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
@@ -112,7 +112,7 @@ class OperatorProcess:
             self.feeding,
             channel,
         )
-        self.orders = Orders(
+        self.orders = Control(
             (self.window, self.backlog),
             self.runners,
             self.feeding,
@@ -122,7 +122,7 @@ class OperatorProcess:
             self.requests,
             self.release,
         )
-        self._standing = Standing(
+        self._standing = IdleReport(
             channel,
             self.orders,
             self.runners,
@@ -180,7 +180,7 @@ class OperatorProcess:
     def make(self) -> None:
         """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
         parts = (self.pace, self.runners, self.feeding, self.live, self.outlet)
-        Making(self.config, self.graph, self.channel, *parts).make()
+        Builder(self.config, self.graph, self.channel, *parts).make()
 
     def set_up(self) -> None:
         """Calls `setup()` of every operator, with as many library threads as the graph allows."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.process.channel import Channel
-from dataflow.process.speech import log_failure
+from dataflow.process.log_pipe import log_failure
 
 
 def tell_outlived(channel: Channel, failure: OperatorFailure, pause: float) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 from dataflow.operator import ParameterError
 from dataflow.process.live_sources import LiveSources
-from dataflow.process.outlet import Outlet
 from dataflow.process.runners import Runners
+from dataflow.process.streams.outlet import Outlet
 
 MALFORMED = b"\x00malformed\xff" * 8
 

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from dataflow.feeds.log import LogFeed
-from dataflow.firing.calls import summary_of
-from dataflow.firing.protocol import Runner
-from dataflow.firing.source import SourceRunner
+from dataflow.execution.calls import summary_of
+from dataflow.execution.feeds.log import LogFeed
+from dataflow.execution.protocol import Runner
+from dataflow.execution.source import SourceRunner
 from dataflow.process.channel import Channel
 from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources

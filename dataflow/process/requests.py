@@ -8,18 +8,18 @@ from typing import Any
 
 import msgpack
 
-from dataflow.feeds.playback import Action
-from dataflow.firing.source import SourceRunner
+from dataflow.execution.feeds.playback import Action
+from dataflow.execution.source import SourceRunner
 from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_live
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
-from dataflow.process.inbox import Inbox
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.progress import Progress
-from dataflow.process.recent import RecentFirings
 from dataflow.process.runners import Maker, Runners
+from dataflow.process.streams.inbox import Inbox
+from dataflow.process.streams.recent import RecentFirings
 from dataflow.remote import Remote
 from dataflow.transport import Bus
 from dataflow.transport.codec import decode

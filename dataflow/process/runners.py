@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.chaos.faults import OperatorFaults
-from dataflow.feeds.log import LogFeed
-from dataflow.feeds.numbering import gapless
-from dataflow.feeds.playable import PlayableStreams
-from dataflow.firing.failure import OperatorFailure
-from dataflow.firing.live import LiveRunner
-from dataflow.firing.ports import Emitter
-from dataflow.firing.protocol import Runner
-from dataflow.firing.ready import Ready
-from dataflow.firing.runner import OperatorRunner
-from dataflow.firing.source import SourceRunner
+from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.feeds.log import LogFeed
+from dataflow.execution.feeds.numbering import gapless
+from dataflow.execution.feeds.playable import PlayableStreams
+from dataflow.execution.live import LiveRunner
+from dataflow.execution.ports import Emitter
+from dataflow.execution.protocol import Runner
+from dataflow.execution.ready import Ready
+from dataflow.execution.runner import OperatorRunner
+from dataflow.execution.source import SourceRunner
 from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.recording import Recording

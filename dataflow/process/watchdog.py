@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import psutil
 
-from dataflow.firing.protocol import Runner
+from dataflow.execution.protocol import Runner
 from dataflow.process.channel import Channel, ChannelClosed
-from dataflow.process.complaints import Complaints
+from dataflow.process.throttled_warnings import ThrottledWarnings
 
 PERIOD = 0.05
 BEAT_EVERY = 0.25
@@ -35,7 +35,7 @@ class Watchdog:
         self._looked, self._cpu = time.monotonic(), time.process_time()
         self._calls: dict[str, tuple[float, float]] = {}
         """Operator → when its call began (monotonic), and for how long it has been at it while this process ran."""
-        self._complaints = Complaints()
+        self._complaints = ThrottledWarnings()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
         self._thread.start()

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 from dataflow.recording import Recording
-from dataflow.recording.cutting import cut_of
 from dataflow.recording.layout import PARAMETERS, RECOVERED, TOLD
+from dataflow.recording.streams.cutting import cut_of
 from dataflow.records.cuts import Taken, cut_record, is_known
 from dataflow.records.firing import CALLS, FiringRecord, FiringRecordError, decode_batch, encode_batch
 from dataflow.records.reading import FiringLog, Maker, needed_from

@@ -11,10 +11,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from dataflow.feeds.log import LogFeed
-from dataflow.firing.memory import MemoryGuard
-from dataflow.firing.recorded import RecordedRunner
-from dataflow.firing.threads import limit_threads
+from dataflow.execution.feeds.log import LogFeed
+from dataflow.execution.memory import MemoryGuard
+from dataflow.execution.recorded import RecordedRunner
+from dataflow.execution.threads import limit_threads
 from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
 from dataflow.records.comparison import Verification

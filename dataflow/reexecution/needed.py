@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from dataflow.firing.recorded import RecordedRunner
+from dataflow.execution.recorded import RecordedRunner
 from dataflow.graph.model import Graph
 from dataflow.recording import Recorded, Recording
 from dataflow.records.reading import FiringLog

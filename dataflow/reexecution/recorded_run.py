@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from dataflow.feeds.playable import PlayableStreams
-from dataflow.firing.seeding import version_of
+from dataflow.execution.feeds.playable import PlayableStreams
+from dataflow.execution.generators.seeding import version_of
 from dataflow.graph.model import Graph
 from dataflow.graph.sections import Network
 from dataflow.messages.base import message_type

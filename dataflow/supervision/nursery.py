@@ -19,8 +19,8 @@ import msgpack
 
 from dataflow.process.channel import QueuedChannel
 from dataflow.process.polling import readable
+from dataflow.supervision.core.wording import how_it_ended
 from dataflow.supervision.nursery_process import DIE_WITHIN, ENVIRONMENT, MORE, MOST_DESCRIPTORS, SPAWN, adopt_orphans
-from dataflow.supervision.wording import how_it_ended
 
 LEAVE_WITHIN = 15.0
 WORDS_AT_ONCE = 65536

@@ -25,7 +25,7 @@ from typing import Any
 import msgpack
 import psutil
 
-from dataflow.firing.threads import take_over
+from dataflow.execution.threads import take_over
 from dataflow.process.polling import readable
 
 LEAVE_WITHIN = 12.0
@@ -36,7 +36,13 @@ MOST_DESCRIPTORS = 253
 MORE, SPAWN, ENVIRONMENT = b"+", b"s", b"e"
 """A request: descriptors, of which more follow; the last ones for a process that is to be started; a file with the
 environment of the processes to come."""
-PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "live_sink", "recorder", "main", "speech"))
+PRELOAD = (
+    "dataflow.process.operator_process",
+    "dataflow.process.log_pipe",
+    "dataflow.sinks.live_sink",
+    "dataflow.sinks.recorder",
+    "dataflow.supervision.process_main",
+)
 
 _PR_SET_CHILD_SUBREAPER = 36
 
@@ -61,8 +67,8 @@ def _fork_process(descriptor: int, words: int, handed: Sequence[int], inherited:
         for other in (words, *inherited):
             os.close(other)
         from dataflow.process import stacks
-        from dataflow.process.main import main
-        from dataflow.process.speech import install
+        from dataflow.process.log_pipe import install
+        from dataflow.supervision.process_main import main
 
         stacks.answer()
         install()

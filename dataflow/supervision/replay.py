@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from dataflow.feeds.playable import PlayableStreams
+from dataflow.execution.feeds.playable import PlayableStreams
 from dataflow.graph.model import Graph
-from dataflow.recording.cutting import cut_of
+from dataflow.recording.streams.cutting import cut_of
 from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps
 from dataflow.supervision.plan import LogPlan
 

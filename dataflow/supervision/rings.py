@@ -43,7 +43,7 @@ class Rings:
         return descriptor
 
     def handed(self, label: str) -> list[int]:
-        """Returns what a process inherits: see `dataflow.process.handed.take_handed`."""
+        """Returns what a process inherits: see `dataflow.process.descriptors.take_descriptors`."""
         given = [self._wakes[label]]
         for (producer, consumer), (ring, board) in self._links.items():
             if producer == label:

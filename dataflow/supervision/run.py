@@ -10,18 +10,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dataflow.feeds.playable import PlayableStreams
-from dataflow.firing import seeding
-from dataflow.firing.threads import environment
+from dataflow.execution.feeds.playable import PlayableStreams
+from dataflow.execution.generators import seeding
+from dataflow.execution.threads import environment
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.recording.facts import machine_facts
+from dataflow.recording.streams.facts import machine_facts
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
-from dataflow.supervision.early import EarlyNursery
+from dataflow.supervision.core.report import RunReport, Watch
+from dataflow.supervision.early_nursery import EarlyNursery
 from dataflow.supervision.interrupts import interrupts
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
-from dataflow.supervision.report import RunReport, Watch
 from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.supervision.supervisor import Supervisor
 

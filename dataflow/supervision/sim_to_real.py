@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 
-from dataflow.feeds.playable import PlayableStreams
+from dataflow.execution.feeds.playable import PlayableStreams
 from dataflow.graph.model import Graph, Node, OperatorImportError
 from dataflow.graph.problems import GraphError
 from dataflow.reexecution.recorded_run import ReplayError, graph_as_recorded, resolved_graph

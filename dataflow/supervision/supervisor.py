@@ -15,21 +15,21 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from dataflow.feeds.playback import Action
-from dataflow.firing.threads import environment
+from dataflow.execution.feeds.playback import Action
+from dataflow.execution.threads import environment
 from dataflow.process.awake import LONGEST_STEP, AwakeClock
 from dataflow.process.channel import ChannelClosed
-from dataflow.process.speech import heard, shown
-from dataflow.supervision import commands, events
-from dataflow.supervision.boxes import Boxes
-from dataflow.supervision.compose import core_of
+from dataflow.process.log_pipe import heard, shown
+from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.configs import configurations
-from dataflow.supervision.early import EarlyNursery
+from dataflow.supervision.console import Console
+from dataflow.supervision.core import commands, events
+from dataflow.supervision.core.compose import core_of
+from dataflow.supervision.core.report import RunFailed, RunReport, Status
+from dataflow.supervision.early_nursery import EarlyNursery
 from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed, adopting
 from dataflow.supervision.plan import RunPlan, process_plans
-from dataflow.supervision.report import RunFailed, RunReport, Status
 from dataflow.supervision.rings import Rings, pairs_of
-from dataflow.supervision.words import Words
 from dataflow.transport import registry, reserve_endpoints
 from dataflow.transport.log_file import LogFile
 
@@ -104,7 +104,7 @@ class Supervisor:
             self._rings = self._make_rings()
             stack.callback(self._rings.close)
             self._log_file = stack.enter_context(contextlib.closing(LogFile()))
-            self._words = Words(self._on_output)
+            self._words = Console(self._on_output)
             stack.callback(self._words.close)
             self._selector = stack.enter_context(selectors.DefaultSelector())
             self._nursery = self._start_nursery()

@@ -9,7 +9,7 @@ from typing import Any
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
-from dataflow.recording.diff import FieldDifference, differences
+from dataflow.recording.streams.diff import FieldDifference, differences
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog, Place

@@ -16,22 +16,22 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.graph.model import Graph
-from dataflow.process.recorder import RecorderSink
 from dataflow.recording import Recording
-from dataflow.recording.copying import Origin
 from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA
+from dataflow.recording.streams.copying import Origin
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import decode_batch
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Feeding, Recomputation
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
+from dataflow.sinks.recorder import RecorderSink
+from dataflow.supervision.core.report import Watch
 from dataflow.supervision.replay import plan_replay
-from dataflow.supervision.report import Watch
 from dataflow.sync import Entry
-from dataflow.verification.board import Board
 from dataflow.verification.choice import require_records
 from dataflow.verification.ledger import read_ledger
-from dataflow.verification.processes import Call, call_workers
+from dataflow.verification.workers.board import Board
+from dataflow.verification.workers.processes import Call, call_workers
 
 
 @dataclass(frozen=True, slots=True)

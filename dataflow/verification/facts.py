@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dataflow.firing.threads import environment
+from dataflow.execution.threads import environment
 from dataflow.graph.model import Graph
-from dataflow.recording.facts import machine_facts
+from dataflow.recording.streams.facts import machine_facts
 
 
 def differing_facts(metadata: Mapping[str, Mapping[str, str]], graph: Graph) -> tuple[tuple[str, str, str], ...]:

@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.recording.part_folder import parts_in
+from dataflow.recording.streams.part_folder import parts_in
 from dataflow.records.comparison import Verification
 from dataflow.reexecution.recorded_run import ReplayError
-from dataflow.supervision.report import RunFailed
+from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.errors import WRONG_INPUT
 from dataflow.verification.report import StandIn, VerifyReport
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.recording.cutting import Cut, cut_of
 from dataflow.recording.layout import OUTCOME, RECOVERED
+from dataflow.recording.streams.cutting import Cut, cut_of
 from dataflow.records.comparison import Verification
 from dataflow.records.cuts import held_by
 from dataflow.records.firing import CALLS, WITHHELD, Emission

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from dataflow.recording.cutting import Cut
+from dataflow.recording.streams.cutting import Cut
 from dataflow.records.comparison import Verification
-from dataflow.supervision.report import OperatorCounts
+from dataflow.supervision.core.report import OperatorCounts
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.ledger import Account
 from dataflow.verification.stored import StoredStream

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dataflow.records.comparison import Verification
-from dataflow.supervision.report import RunFailed
+from dataflow.supervision.core.report import RunFailed
 
 Answer = Mapping[str, Any]
 """The answer of `part.verify_part`."""

@@ -12,16 +12,15 @@ from typing import Any
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.recording.cutting import cut_of
 from dataflow.recording.layout import RECOVERED
+from dataflow.recording.streams.cutting import cut_of
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog, beginning, whole
 from dataflow.records.window import records_from
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, processes_of
-from dataflow.supervision.report import OperatorCounts, Watch
-from dataflow.verification import part, partition, slices
+from dataflow.supervision.core.report import OperatorCounts, Watch
 from dataflow.verification.choice import (
     accountable,
     chosen_operators,
@@ -34,12 +33,14 @@ from dataflow.verification.choice import (
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.facts import differing_facts
 from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
-from dataflow.verification.letters import shared_records
-from dataflow.verification.processes import Call, Locate, Workers, call_workers
 from dataflow.verification.report import StandIn, VerifyReport
 from dataflow.verification.retrial import Retrial, Trial, mates_of, retry
-from dataflow.verification.started import EarlyWorkers
 from dataflow.verification.stored import StoredStream
+from dataflow.verification.workers import job as part
+from dataflow.verification.workers import partition, slices
+from dataflow.verification.workers.mail import shared_records
+from dataflow.verification.workers.prestart import EarlyWorkers
+from dataflow.verification.workers.processes import Call, Locate, Workers, call_workers
 
 Attempt = Callable[[Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]], list[Any]]
 """Answers (what is special of a request, operators), as `part.verify_part` does."""
@@ -62,7 +63,7 @@ class _Task:
     stand_ins: tuple[str, ...]
     incomplete: frozenset[str]
     held: frozenset[str]
-    parts: tuple[partition.Part, ...]
+    parts: tuple[partition.Job, ...]
     unchecked: tuple[str, ...]
     facts: tuple[tuple[str, str, str], ...]
     begin: int | None

@@ -15,7 +15,7 @@ from watched import Broken, Camera, Counting, Interrupting, Judge, Photometer
 
 import dataflow
 from dataflow.graph import GraphError, load_graph
-from dataflow.supervision.report import RunFailed, Status
+from dataflow.supervision.core.report import RunFailed, Status
 
 FINDS_OPERATORS = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 """The environment of programs that import `watched`."""

@@ -13,7 +13,8 @@ from mcap.writer import Writer
 import dataflow
 from dataflow.api.names import StreamNameError
 from dataflow.messages import Imu, Message
-from dataflow.recording import RecordingError, reader
+from dataflow.recording import RecordingError
+from dataflow.recording.streams import reader
 
 
 @pytest.mark.parametrize("name", ["r1/robot/imu", "/r1/robot/imu", "robot/imu", "imu", "**/imu", "robot/im$*"])

@@ -9,7 +9,7 @@ import pytest
 
 import dataflow
 from dataflow.messages import Image
-from dataflow.supervision.report import RunFailed
+from dataflow.supervision.core.report import RunFailed
 from operators.cloud import CloudBuilder
 from operators.odometry import BaseOdometry, VisualOdometry
 from operators.sources import SyntheticRgbd

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from dataflow.cli.board import Board, Sample, heading, line, shown
+from dataflow.cli.support.board import Board, Sample, heading, line, shown
 from dataflow.client.processes import ProcessStatus
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph

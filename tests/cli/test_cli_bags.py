@@ -72,7 +72,7 @@ def test_a_star_within_a_part_stands_for_any_characters(dataflow, recorded, tmp_
 
 
 def test_the_former_name_of_the_choice_of_streams_works_and_says_so(dataflow, recorded, tmp_path: Path) -> None:
-    from dataflow.cli import plugins
+    from dataflow.cli.support import plugins
 
     plugins.renamed.cache_clear()
     told = dataflow("filter", recorded[0], "--streams", "left/*", "-o", tmp_path / "part.mcap").stderr

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.cli import completion
+from dataflow.cli.commands import completion
 from dataflow.transport.registry import register
 
 REPOSITORY = Path(__file__).resolve().parents[2]

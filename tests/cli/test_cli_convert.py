@@ -14,7 +14,7 @@ from made_bags import SECOND, header, imus, ros, transform, write_ros2, xyz, xyz
 from typer import Context
 from typer.main import get_command
 
-from dataflow.cli.convert import Format, convert
+from dataflow.cli.commands.convert import Format, convert
 from dataflow.cli.main import app
 from dataflow.recording import Recording
 
@@ -129,7 +129,7 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
         from mcap.writer import Writer
 
         from dataflow.interop.typestores import RosType
-        from dataflow.recording.codecs import SchemaText
+        from dataflow.recording.streams.codecs import SchemaText
 
         kind = RosType("sensor_msgs/msg/Imu", "cdr", SchemaText("sensor_msgs/msg/Imu", "", b"")).as_ros2()
         writer = Writer(file, chunk_size=4000)

@@ -9,10 +9,10 @@ import pytest
 from typer import Context
 from typer.main import get_command
 
-from dataflow.cli import arguments, plugins
 from dataflow.cli.app import call
-from dataflow.cli.commands import BUILT_IN, Command, Commands, Family
 from dataflow.cli.main import app
+from dataflow.cli.registry import BUILT_IN, Command, Commands, Family
+from dataflow.cli.support import arguments, plugins
 from dataflow.sync.stamps import parse_duration
 
 COMMANDS = sorted(each.called for each in BUILT_IN if isinstance(each, Command))

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from rich.console import Console
 from rich.text import Text
 
-from dataflow.cli.arguments import chosen_streams, existing, graph_file, output_file, window
-from dataflow.cli.output import about_a_file, friendly_errors, jsonable, plural, seconds, size, table
-from dataflow.cli.progress import RunDisplay, shown
-from dataflow.cli.report import print_report, report_json
-from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
+from dataflow.cli.support.arguments import chosen_streams, existing, graph_file, output_file, window
+from dataflow.cli.support.output import about_a_file, friendly_errors, jsonable, plural, seconds, size, table
+from dataflow.cli.support.progress import RunDisplay, shown
+from dataflow.cli.support.report import print_report, report_json
+from dataflow.supervision.core.report import OperatorCounts, RunFailed, RunReport, Status
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from dataflow.messages import Number
 from dataflow.recording import RecordingWriter
-from dataflow.recording.attachments import Attachment
+from dataflow.recording.mcap.attachments import Attachment
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_info_lists_what_else_the_file_carries(dataflow, tmp_path: Path) -> None
 
 
 def test_info_fits_80_columns_with_whole_stream_names(dataflow, recorded, monkeypatch) -> None:
-    monkeypatch.setattr("dataflow.cli.recordings.out.width", 80)
+    monkeypatch.setattr("dataflow.cli.commands.recordings.out.width", 80)
     lines = dataflow("info", recorded[0]).stdout.splitlines()
 
     assert max(map(len, lines)) <= 80

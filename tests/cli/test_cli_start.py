@@ -17,8 +17,11 @@ LOADED = "import sys; import {}; print(*(name for name in {!r}.split() if name i
     [
         ("dataflow.cli.main", "numpy zenoh pydantic mcap dataflow.graph.load"),
         ("dataflow.client.attach", "pydantic ruamel.yaml mcap scipy dataflow.graph.load dataflow.operator"),
-        ("dataflow.process.main, dataflow.process.operator_process, dataflow.process.recorder", "rosbags ruamel.yaml"),
-        ("dataflow.supervision.early", "numpy zenoh pydantic mcap dataflow.graph.load"),
+        (
+            "dataflow.supervision.process_main, dataflow.process.operator_process, dataflow.sinks.recorder",
+            "rosbags ruamel.yaml",
+        ),
+        ("dataflow.supervision.early_nursery", "numpy zenoh pydantic mcap dataflow.graph.load"),
     ],
 )
 def test_what_is_not_needed_is_not_imported(modules: str, heavy: str) -> None:

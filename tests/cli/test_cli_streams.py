@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from rich.text import Text
 
-from dataflow.cli import output
 from dataflow.cli.app import call
-from dataflow.cli.output import print_json
+from dataflow.cli.support import output
+from dataflow.cli.support.output import print_json
 
 PACKAGE = Path(__file__).resolve().parents[2]
 START = [sys.executable, "-P", "-m", "dataflow.cli.start"]
@@ -43,7 +43,7 @@ def shell(command: str, *words: object, folder: Path | None = None) -> subproces
     return subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=60)
 
 
-@pytest.mark.parametrize("module", ["typer", "dataflow.cli.recordings", "dataflow.recording"])
+@pytest.mark.parametrize("module", ["typer", "dataflow.cli.commands.recordings", "dataflow.recording"])
 def test_ctrl_c_while_something_is_imported_is_no_error(small: Path, module: str) -> None:
     told = subprocess.run(
         [sys.executable, "-c", INTERRUPTED_IMPORT, module, "info", str(small)],

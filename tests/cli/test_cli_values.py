@@ -13,8 +13,8 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.cli.commands import BUILT_IN, Commands
-from dataflow.cli.values import take_plainly
+from dataflow.cli.registry import BUILT_IN, Commands
+from dataflow.cli.support.values import take_plainly
 
 
 def command() -> Any:
@@ -110,7 +110,7 @@ def test_what_follows_a_graph_does_not_wait_for_pydantic_or_other_commands(words
         "with group.make_context('dataflow', sys.argv[1:]) as context:\n"
         "    name, command, rest = group.resolve_command(context, sys.argv[1:])\n"
         "    command.make_context(name, rest, parent=context)\n"
-        "late = ('pydantic', 'dataflow.cli.run', 'importlib.metadata', 'rerun')\n"
+        "late = ('pydantic', 'dataflow.cli.commands.run', 'importlib.metadata', 'rerun')\n"
         "print(*(name for name in late if name in sys.modules))\n"
     )
     done = subprocess.run(

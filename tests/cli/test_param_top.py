@@ -16,8 +16,8 @@ from dataflow.client.attach import find_running
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.records.reading import recorded_firings
+from dataflow.supervision.core.report import RunReport
 from dataflow.supervision.plan import RunPlan
-from dataflow.supervision.report import RunReport
 from dataflow.supervision.supervisor import Supervisor
 
 GRAPH = """\

@@ -9,12 +9,14 @@ from pathlib import Path
 import pytest
 import typer
 
-from dataflow.cli.storage import named, recording_file, splitting_of, storage_of
+from dataflow.cli.support.storage import named, recording_file, splitting_of, storage_of
 from dataflow.recording.parts import Splitting
 
 
 def test_a_name_with_the_time_is_never_used_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dataflow.cli.storage.time.gmtime", lambda: (1970, 1, 1, 0, 0, 30, 3, 1, 0))  # a dead battery
+    monkeypatch.setattr(
+        "dataflow.cli.support.storage.time.gmtime", lambda: (1970, 1, 1, 0, 0, 30, 3, 1, 0)
+    )  # a dead battery
     path = tmp_path / "a_{time}.mcap"
 
     first = named(path)

@@ -11,7 +11,7 @@ from typing import get_args
 from dataflow.chaos import kinds
 from dataflow.chaos import plan as chaos
 from dataflow.graph import load_graph
-from dataflow.supervision.health import LEVELS
+from dataflow.supervision.core.health import LEVELS
 
 
 def page(repository: Path) -> str:

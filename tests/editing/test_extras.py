@@ -24,10 +24,10 @@ from dataflow.editing.recover import recover
 from dataflow.editing.split import split
 from dataflow.messages import Number
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.recording import attachments as attachment_module
-from dataflow.recording.attachments import Attachment as Attached
-from dataflow.recording.attachments import names_once
-from dataflow.recording.copying import Origin
+from dataflow.recording.mcap import attachments as attachment_module
+from dataflow.recording.mcap.attachments import Attachment as Attached
+from dataflow.recording.mcap.attachments import names_once
+from dataflow.recording.streams.copying import Origin
 
 Extras = tuple[list[tuple[str, str, int, int, bytes]], list[tuple[str, dict[str, str]]]]
 CALIBRATION = ("calibration.yaml", "text/yaml", 7, 5, b"fx: 500")

@@ -16,7 +16,7 @@ from dataflow.editing.part import Part, write_part
 from dataflow.editing.spans import records_of_span
 from dataflow.interop.opening import is_foreign
 from dataflow.recording import Recording
-from dataflow.recording.copying import Origin
+from dataflow.recording.streams.copying import Origin
 from dataflow.records.firing import CALLS, Emission, FiringRecord
 from dataflow.records.reading import FiringLog, recorded_firings, whole
 from dataflow.supervision.run import replay

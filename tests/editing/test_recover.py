@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from dataflow.editing.recover import recover
 from dataflow.messages import Text
 from dataflow.recording import Recording, RecordingError, RecordingWriter
-from dataflow.recording.packing import Compression
+from dataflow.recording.mcap.packing import Compression
 
 HEAD = 9
 

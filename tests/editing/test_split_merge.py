@@ -14,7 +14,7 @@ from dataflow.editing.part import Part, write_part
 from dataflow.editing.split import split
 from dataflow.messages import Imu, Odometry
 from dataflow.recording import Recording, RecordingError, RecordingWriter
-from dataflow.recording.copying import Origin
+from dataflow.recording.streams.copying import Origin
 from dataflow.records.reading import FiringLog
 from dataflow.verification.verify import verify
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from dataflow.cli.main import app
 from dataflow.messages import Text
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.recording.attachments import Attachment
+from dataflow.recording.mcap.attachments import Attachment
 
 CALIBRATION = ("calibration.yaml", "text/yaml", 7, 5, b"fx: 500")
 START = 1_700_000_000_000_000_000

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dataflow.recording import RecordingError
-from dataflow.recording.pixels import as_depth, as_image, as_image16, stored_rows
+from dataflow.recording.streams.pixels import as_depth, as_image, as_image16, stored_rows
 
 RGB = np.random.default_rng(0).integers(0, 256, (4, 6, 3), np.uint8)
 

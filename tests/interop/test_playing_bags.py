@@ -71,8 +71,8 @@ def test_mapping_that_is_not_clear_is_an_error_with_the_topics_and_the_proposal(
 
 
 def test_bag_replayed_in_this_process_is_recorded_and_verified(graph: Path, bag: Path, tmp_path: Path) -> None:
-    from dataflow.cli.bags import replay_bag
-    from dataflow.cli.execution import Outputs
+    from dataflow.cli.support.bags import replay_bag
+    from dataflow.cli.support.execution import Outputs
 
     loaded, file = load_graph(graph), tmp_path / "out.mcap"
     outputs = Outputs(file, None, None, False, False)

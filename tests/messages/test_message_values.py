@@ -7,8 +7,8 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from dataflow.messages import Alarm, MessageError, Number, Switch, Text
 from dataflow.messages.values import ALARM_LEVELS
-from dataflow.recording.codecs import SchemaText, codec_for
-from dataflow.recording.foreign import foreign_decoder
+from dataflow.recording.streams.codecs import SchemaText, codec_for
+from dataflow.recording.streams.foreign import foreign_decoder
 
 
 def test_they_are_made_in_one_line() -> None:

@@ -54,6 +54,6 @@ class Disk:
                 raise OSError(errno.ENOSPC, "No space left on device")
             return write(descriptor, data)
 
-        monkeypatch.setattr("dataflow.recording.container.os.write", refusing)
-        monkeypatch.setattr("dataflow.process.outage.FIRST_PAUSE", 0.0)
-        monkeypatch.setattr("dataflow.process.outage.LONGEST_PAUSE", 0.0)
+        monkeypatch.setattr("dataflow.recording.mcap.container.os.write", refusing)
+        monkeypatch.setattr("dataflow.sinks.outage.FIRST_PAUSE", 0.0)
+        monkeypatch.setattr("dataflow.sinks.outage.LONGEST_PAUSE", 0.0)

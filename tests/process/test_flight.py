@@ -16,12 +16,12 @@ from process_doubles import Disk
 from dataflow.graph import Graph, load_graph
 from dataflow.graph.sections import Flight, Trigger
 from dataflow.messages import Diagnostics, FeatureVector
-from dataflow.process.flight import FlightSink
-from dataflow.process.triggers import Triggers
 from dataflow.recording import Recording
 from dataflow.recording.parts import Storage
 from dataflow.records.firing import encode_batch
 from dataflow.records.reading import FiringLog
+from dataflow.sinks.flight_recorder import FlightSink
+from dataflow.sinks.triggers import Triggers
 from dataflow.supervision.run import replay, run
 from dataflow.verification.verify import verify
 

@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from dataflow.graph import load_graph
-from dataflow.process import freed_memory, main
-from dataflow.process.sink import SinkConfig
+from dataflow.sinks import freed_memory
+from dataflow.sinks.sink import SinkConfig
+from dataflow.supervision import process_main as main
 
 GRAPH = Path(__file__).resolve().parents[2] / "graphs" / "synthetic_rgbd.yaml"
 PROGRAM = """
 import resource, sys
-from dataflow.process.freed_memory import keep_freed_memory
+from dataflow.sinks.freed_memory import keep_freed_memory
 if sys.argv[1] == "keep" and not keep_freed_memory():
     sys.exit(77)
 def faults():

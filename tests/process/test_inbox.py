@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from dataflow.process.inbox import Inbox
-from dataflow.process.main import await_leave
+from dataflow.process.streams.inbox import Inbox
+from dataflow.supervision.process_main import await_leave
 from dataflow.transport import Incoming, Outgoing, PoolReader, make_board, make_ring
 
 LONG = 60.0

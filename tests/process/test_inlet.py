@@ -7,9 +7,9 @@ import os
 import pytest
 from process_doubles import STREAM, RecordedChannel, end, frontier, message
 
-from dataflow.process.complaints import Complaints
-from dataflow.process.inlet import Inlet
-from dataflow.process.losses import StreamDamaged, losses_of
+from dataflow.process.streams.inlet import Inlet
+from dataflow.process.streams.losses import StreamDamaged, losses_of
+from dataflow.process.throttled_warnings import ThrottledWarnings
 from dataflow.sync import FOREVER
 from dataflow.transport import Envelope, Kind, encode
 
@@ -28,7 +28,7 @@ class Inflow:
             static=static,
             losses=losses_of("taker", self.channel, live=live),  # type: ignore[arg-type]
             from_start=from_start,
-            complaints=Complaints(lambda: self.now, lambda line: self.printed.append(line) is None),
+            complaints=ThrottledWarnings(lambda: self.now, lambda line: self.printed.append(line) is None),
         )
 
     def take(self, *envelopes: Envelope) -> None:
@@ -109,7 +109,7 @@ def test_garbage_is_counted_and_complained_about_once_in_a_while() -> None:
 def test_what_nobody_reads_is_counted_instead_of_waited_for() -> None:
     read: list[str] = []
     reading = False
-    complaints = Complaints(lambda: 0.0, lambda line: reading and read.append(line) is None)
+    complaints = ThrottledWarnings(lambda: 0.0, lambda line: reading and read.append(line) is None)
 
     complaints.say("left", "first")
     complaints.say("left", "second")

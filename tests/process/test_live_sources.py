@@ -11,13 +11,13 @@ import process_operators
 import pytest
 from process_doubles import RecordedChannel
 
-from dataflow.feeds.window import Window
-from dataflow.firing.failure import OperatorFailure
-from dataflow.firing.source import SourceRunner
+from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.feeds.window import Window
+from dataflow.execution.source import SourceRunner
 from dataflow.graph import load_text
 from dataflow.process import live_sources
 from dataflow.process.live_sources import LiveSources
-from dataflow.process.pace import Pace
+from dataflow.process.streams.pace import Pace
 from dataflow.records.firing import FiringRecord
 from dataflow.sync import Entry
 

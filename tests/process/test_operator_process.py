@@ -15,7 +15,7 @@ import pytest
 from process_doubles import RecordedChannel
 from process_operators import value
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.graph import load_text
 from dataflow.names import firings_key
 from dataflow.process import live_sources, operator_process

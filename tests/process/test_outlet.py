@@ -10,8 +10,8 @@ import pytest
 from process_doubles import RecordedChannel
 
 from dataflow.messages import FeatureVector
-from dataflow.process import outlet
-from dataflow.process.outlet import Outlet
+from dataflow.process.streams import outlet
+from dataflow.process.streams.outlet import Outlet
 from dataflow.sync import Entry
 from dataflow.transport import Fanout, Incoming, Kind, Outgoing, PoolReader, decode, make_board, make_ring
 

@@ -16,12 +16,12 @@ from process_doubles import Disk
 from dataflow.editing.merge import merge
 from dataflow.graph import Graph, load_graph
 from dataflow.messages import FeatureVector
-from dataflow.process.parts import PartsSink
 from dataflow.recording import Recording, RecordingError
-from dataflow.recording.copying import Origin
 from dataflow.recording.parts import Splitting, Storage, parts_of
+from dataflow.recording.streams.copying import Origin
 from dataflow.records.firing import CALLS, encode_batch
 from dataflow.records.reading import FiringLog
+from dataflow.sinks.parts import PartsSink
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
 

@@ -13,8 +13,10 @@ from typing import Any
 import pytest
 
 from dataflow.graph import load_graph
-from dataflow.process import live_sink, main, priority
-from dataflow.process.sink import SinkConfig
+from dataflow.process import priority
+from dataflow.sinks import live_sink
+from dataflow.sinks.sink import SinkConfig
+from dataflow.supervision import process_main as main
 
 GRAPH = Path(__file__).resolve().parents[2] / "graphs" / "synthetic_rgbd.yaml"
 

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
-SHOW = "from dataflow.process.main import show_name; show_name({!r}); print(open('/proc/self/comm').read(), end='')"
+SHOW = (
+    "from dataflow.supervision.process_main import show_name; show_name({!r}); "
+    "print(open('/proc/self/comm').read(), end='')"
+)
 
 
 @pytest.mark.skipif(not Path("/proc/self/comm").exists(), reason="this system has no /proc/self/comm")

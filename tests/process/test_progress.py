@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from process_doubles import RecordedChannel
 
-from dataflow.firing.work import Work
+from dataflow.execution.work import Work
 from dataflow.process.progress import REPORT_EVERY, REPORT_IDLE, Progress
 
 

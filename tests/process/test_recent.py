@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataflow.process.recent import KEPT, OVER, RecentFirings
+from dataflow.process.streams.recent import KEPT, OVER, RecentFirings
 from dataflow.records.firing import FiringRecord, Kind, Outcome, decode_batch
 from dataflow.sync import Drop
 

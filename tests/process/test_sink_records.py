@@ -11,8 +11,8 @@ from process_doubles import RecordedChannel
 
 from dataflow.graph import load_text
 from dataflow.names import firings_key
-from dataflow.process.sink import SinkConfig, SinkProcess
 from dataflow.records.firing import FiringRecord, decode_batch, encode_batch
+from dataflow.sinks.sink import SinkConfig, SinkProcess
 from dataflow.transport import Envelope, Kind
 
 GRAPH = """\

@@ -12,10 +12,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.firing.failure import OperatorFailure
-from dataflow.firing.shared_generators import AT_WORK
-from dataflow.process.speech import LONGEST, MARK, SOURCE_THREAD, _Handler, _Lines, _say, heard, log_failure, shown
-from dataflow.recording.logs import LEVELS, LogLine
+from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.generators.shared_generators import AT_WORK
+from dataflow.process.log_pipe import LONGEST, MARK, SOURCE_THREAD, _Handler, _Lines, _say, heard, log_failure, shown
+from dataflow.recording.streams.logs import LEVELS, LogLine
 
 
 def piped(speak) -> list[str]:
@@ -85,7 +85,7 @@ def test_prints_become_whole_lines_and_the_rest_at_a_flush() -> None:
 
 def test_a_logger_whose_arguments_do_not_fit_is_heard_all_the_same(monkeypatch) -> None:
     said: list[str] = []
-    monkeypatch.setattr("dataflow.process.speech._say", lambda *fields, operator: said.append(fields[2]))
+    monkeypatch.setattr("dataflow.process.log_pipe._say", lambda *fields, operator: said.append(fields[2]))
     _Handler().emit(logging.LogRecord("n", logging.WARNING, "f.py", 3, "%d apples", ("no",), None))
     assert "%d apples" in said[0]
     assert "cannot be formatted" in said[0]
@@ -96,7 +96,7 @@ def test_a_failure_that_is_outlived_is_an_error_of_its_operator_with_file_and_li
         np.linalg.inv(np.zeros((2, 2)))
 
     written: list[bytes] = []
-    monkeypatch.setattr("dataflow.process.speech.os.write", lambda _, data: written.append(bytes(data)) or len(data))
+    monkeypatch.setattr("dataflow.process.log_pipe.os.write", lambda _, data: written.append(bytes(data)) or len(data))
     monkeypatch.setattr(logging.getLogger("dataflow.failure"), "handlers", [_Handler()])
     try:
         crash()

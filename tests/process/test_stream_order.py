@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from process_doubles import end, frontier, message
 
-from dataflow.process.stream_order import StreamOrder, Verdict
+from dataflow.process.streams.stream_order import StreamOrder, Verdict
 from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Envelope, Kind
 

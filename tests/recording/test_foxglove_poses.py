@@ -16,8 +16,8 @@ from dataflow.messages import Image, Image16, Transforms
 from dataflow.messages import LaserScan as ScanMessage
 from dataflow.messages import PointCloud as CloudMessage
 from dataflow.recording import RecordingError
-from dataflow.recording.codecs import SchemaText
-from dataflow.recording.foreign import foreign_decoder
+from dataflow.recording.streams.codecs import SchemaText
+from dataflow.recording.streams.foreign import foreign_decoder
 
 HALF = float(np.sqrt(0.5))
 

@@ -15,8 +15,9 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from dataflow.messages import Image, Odometry, Pose
-from dataflow.recording import Recording, RecordingError, RecordingWriter, container, describe, packing
-from dataflow.recording.seals import Seal, seal_of, sealed
+from dataflow.recording import Recording, RecordingError, RecordingWriter, describe
+from dataflow.recording.mcap import container, packing
+from dataflow.recording.mcap.seals import Seal, seal_of, sealed
 
 FLIPS_PER_KIND = 40
 

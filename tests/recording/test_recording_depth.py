@@ -14,9 +14,9 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from dataflow.messages import DepthImage
 from dataflow.recording import RecordingError
-from dataflow.recording.codecs import codec_for
-from dataflow.recording.foxglove.images import decode_depth
-from dataflow.recording.pixels import as_millimetres
+from dataflow.recording.streams.codecs import codec_for
+from dataflow.recording.streams.foxglove.images import decode_depth
+from dataflow.recording.streams.pixels import as_millimetres
 
 CODEC = codec_for(DepthImage)
 

@@ -12,7 +12,8 @@ import pytest
 from mcap.writer import Writer
 
 from dataflow.messages import DepthImage, Image, LaserScan, Message, Pose, WheelTicks
-from dataflow.recording import DiffReport, Recording, RecordingError, diff
+from dataflow.recording import DiffReport, Recording, RecordingError
+from dataflow.recording.streams import diff
 
 
 def compare(a: Path, b: Path, **options: Any) -> DiffReport:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from dataflow.recording.codecs import codec_for
-from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS
+from dataflow.recording.streams.codecs import codec_for
+from dataflow.recording.streams.foxglove import FOXGLOVE_SCHEMAS
 
 
 def test_the_table_of_well_known_types_is_complete(repository: Path) -> None:

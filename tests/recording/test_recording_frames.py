@@ -10,7 +10,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from dataflow.messages import Odometry, Transforms
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.recording.frames import VIEWER_ROOT, FrameTree
+from dataflow.recording.streams.frames import VIEWER_ROOT, FrameTree
 
 
 def odometry(stamp: int, frame: str = "odom", child: str = "base_link") -> Odometry:

@@ -13,7 +13,8 @@ import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
 
-from dataflow.recording import Recording, RecordingError, contents
+from dataflow.recording import Recording, RecordingError
+from dataflow.recording.mcap import contents
 
 MAGIC = b"\x89MCAP0\r\n"
 LIMIT_S = 30

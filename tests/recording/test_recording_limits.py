@@ -10,9 +10,9 @@ import pytest
 
 from dataflow.messages import FeatureVector, Image
 from dataflow.recording import Recording, RecordingError, RecordingWriter, limits
-from dataflow.recording.attachments import Attachment
-from dataflow.recording.container import ContainerWriter
-from dataflow.recording.index import McapFile
+from dataflow.recording.mcap.attachments import Attachment
+from dataflow.recording.mcap.container import ContainerWriter
+from dataflow.recording.mcap.index import McapFile
 from dataflow.records.firing import MAX_STATE_BYTES, FiringRecord, encode_batch
 
 LIMITS = {"MAX_CHUNK_BYTES": 20_000, "MAX_RECORD_BYTES": 10_000, "MAX_CHUNK_MESSAGES": 50, "MAX_PARSED": 60}

@@ -11,7 +11,8 @@ import pytest
 from mcap.opcode import Opcode
 
 from dataflow.messages import Image, Pose
-from dataflow.recording import Recording, RecordingWriter, chunk_indexes, contents, message_index, summary
+from dataflow.recording import Recording, RecordingWriter
+from dataflow.recording.mcap import chunk_indexes, contents, message_index, summary
 
 
 def write(path: Path, pose: Callable[..., Pose]) -> None:

@@ -36,9 +36,9 @@ from dataflow.messages import (
 )
 from dataflow.messages import Path as PathMessage
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.recording.codecs import codec_for
-from dataflow.recording.json_codec import LONG_BYTES, MAX_SAFE_INTEGER
 from dataflow.recording.layout import DIGESTS
+from dataflow.recording.streams.codecs import codec_for
+from dataflow.recording.streams.json_codec import LONG_BYTES, MAX_SAFE_INTEGER
 
 TYPES = {name: cls for name, cls in message_types().items() if cls.__module__.startswith("dataflow.messages.")}
 

@@ -13,8 +13,9 @@ from example_messages import example
 from dataflow.messages import Message, array, scalar
 from dataflow.messages import base as registry
 from dataflow.messages.declaration import Declaration, GenericMessage, generic_type
-from dataflow.recording import Recording, RecordingWriter, describe, diff, writer
+from dataflow.recording import Recording, RecordingWriter, describe
 from dataflow.recording.layout import DIGESTS
+from dataflow.recording.streams import diff, writer
 
 
 class Beacon(Message, schema="tests.own.Beacon"):

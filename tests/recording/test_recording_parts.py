@@ -12,9 +12,9 @@ from dataflow.editing.split import split
 from dataflow.interop.opening import is_foreign
 from dataflow.messages import Pose
 from dataflow.recording import Recording, RecordingError, RecordingWriter, describe
-from dataflow.recording.attachments import Attachment
-from dataflow.recording.copying import Origin
-from dataflow.recording.part_folder import parts_in
+from dataflow.recording.mcap.attachments import Attachment
+from dataflow.recording.streams.copying import Origin
+from dataflow.recording.streams.part_folder import parts_in
 from dataflow.records.reading import FiringLog, whole
 from dataflow.verification.gate import recordings_in
 

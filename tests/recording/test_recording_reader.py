@@ -19,10 +19,11 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from dataflow.messages import CompressedImage, DepthImage, Image, Pose, Transforms
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording import ForeignDecoder, Recording, RecordingError, RecordingWriter, chunks, register_decoder
-from dataflow.recording.codecs import SchemaText, build
-from dataflow.recording.foxglove import file_descriptor_set
+from dataflow.recording import ForeignDecoder, Recording, RecordingError, RecordingWriter, register_decoder
 from dataflow.recording.layout import DIGESTS
+from dataflow.recording.mcap import chunks
+from dataflow.recording.streams.codecs import SchemaText, build
+from dataflow.recording.streams.foxglove import file_descriptor_set
 
 once = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -310,7 +311,7 @@ def test_a_type_that_is_not_declared_here_is_listed_and_raw(
     record: Callable[..., Path], pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = record([("a", pose(1)), ("b", Image(stamp=2, frame="c", data=[[1]]))])
-    import dataflow.recording.streams as streams
+    import dataflow.recording.streams.streams as streams
 
     known = {name: cls for name, cls in streams.message_types().items() if name != "Pose"}
     monkeypatch.setattr(streams, "message_types", lambda: known)
@@ -347,7 +348,7 @@ def test_a_recording_of_a_newer_format_is_refused_with_what_to_do(
     tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "newer.mcap"
-    monkeypatch.setattr("dataflow.recording.writer.FORMAT", "2")
+    monkeypatch.setattr("dataflow.recording.streams.writer.FORMAT", "2")
     with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
         writer.add_stream("robot1/a/pose", Pose)
         writer.write("robot1/a/pose", pose(1), seq=0)

@@ -18,7 +18,8 @@ import pytest
 from mcap.reader import make_reader
 
 from dataflow.messages import Image, Pose
-from dataflow.recording import Recording, RecordingError, RecordingWriter, container
+from dataflow.recording import Recording, RecordingError, RecordingWriter
+from dataflow.recording.mcap import container
 
 WRITE_UNTIL_KILLED = """
 import sys, numpy as np

@@ -6,7 +6,7 @@ import threading
 from typing import Any
 
 from dataflow.graph import Graph
-from dataflow.supervision.report import RunReport
+from dataflow.supervision.core.report import RunReport
 from dataflow.supervision.run import run
 
 

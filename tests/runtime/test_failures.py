@@ -18,8 +18,8 @@ from tests_runtime_graphs import chain
 from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.records.reading import recorded_firings
+from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.plan import RunPlan
-from dataflow.supervision.report import RunFailed
 from dataflow.supervision.supervisor import Supervisor
 
 HERE = Path(__file__).resolve().parent

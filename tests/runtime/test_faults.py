@@ -16,8 +16,8 @@ from dataflow.messages import Diagnostics
 from dataflow.names import diagnostics_key
 from dataflow.recording import Recording
 from dataflow.records.reading import recorded_firings
-from dataflow.supervision import heartbeats
-from dataflow.supervision.report import RunFailed, RunReport
+from dataflow.supervision.core.report import RunFailed, RunReport
+from dataflow.supervision.core.watchers import heartbeats
 from dataflow.supervision.run import replay, run
 from dataflow.verification.verify import verify
 

@@ -11,7 +11,7 @@ import pytest
 
 from dataflow.records.comparison import Difference, Verification
 from dataflow.reexecution.recorded_run import ReplayError
-from dataflow.supervision.report import RunFailed
+from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.gate import (
     Baseline,

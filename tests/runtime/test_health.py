@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dataflow.messages import Diagnostics, Level
-from dataflow.process.sink import _diagnostics
-from dataflow.supervision.health import SILENT_AFTER, Health, HealthMonitor, diagnostics_fields
+from dataflow.sinks.sink import _diagnostics
+from dataflow.supervision.core.health import SILENT_AFTER, Health, HealthMonitor, diagnostics_fields
 
 Counts = dict[str, tuple[int, int, int, int, int, int]]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataflow.feeds.window import Window
+from dataflow.execution.feeds.window import Window
 from dataflow.graph import Graph, load_text
-from dataflow.supervision.live_flow import LiveFlow, sources_upstream, waited_for
+from dataflow.supervision.core.live_flow import LiveFlow, sources_upstream, waited_for
 from dataflow.sync import FOREVER, NEVER
 
 GRAPH = """

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.firing.source import SourceRunner
+from dataflow.execution.source import SourceRunner
 from dataflow.graph import load_graph, load_text
 from dataflow.recording import Recording
 from dataflow.recording.layout import RUN

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 from dataflow.chaos.plan import plan_of
-from dataflow.firing.recorded import RecordedRunner
+from dataflow.execution.recorded import RecordedRunner
 from dataflow.graph import load_graph
-from dataflow.recording import Recording, reader
+from dataflow.recording import Recording
+from dataflow.recording.streams import reader
 from dataflow.records.reading import FiringLog, recorded_firings
 from dataflow.reexecution import engine
 from dataflow.reexecution.engine import Recomputation, plan_feeding

@@ -16,8 +16,8 @@ from dataflow.messages import Number, Text
 from dataflow.operator import Out
 from dataflow.recording import Recording
 from dataflow.remote import MOST, Remote
+from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan
-from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import run
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.verification.verify import verify

@@ -18,7 +18,7 @@ from tests_runtime_graphs import chain
 from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.recording.parts import Storage
-from dataflow.supervision.report import RunFailed, RunReport
+from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.run import run
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.verification.verify import verify

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.firing.restarts import LONGEST_BACKOFF, MOST_DOUBLINGS, Restarts
+from dataflow.execution.restarts import LONGEST_BACKOFF, MOST_DOUBLINGS, Restarts
 from dataflow.graph.model import Restart
 
 

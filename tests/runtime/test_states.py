@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.firing.snapshots import StateError, pack_state, unpack_state
+from dataflow.execution.snapshots import StateError, pack_state, unpack_state
 
 arrays = hnp.arrays(
     st.one_of(

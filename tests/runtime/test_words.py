@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
-from dataflow.supervision import words
-from dataflow.supervision.words import KEPT, Words
+from dataflow.supervision import console as words
+from dataflow.supervision.console import KEPT, Console
 
 
 def test_a_terminal_that_is_stopped_holds_up_no_process() -> None:
@@ -19,7 +19,7 @@ def test_a_terminal_that_is_stopped_holds_up_no_process() -> None:
         stopped.wait(20)
         shown.append(f"[{label}] {line}")
 
-    said = Words(show)
+    said = Console(show)
     said.put("left", "first")
     assert entered.wait(10)
     for k in range(KEPT + 5):
@@ -34,7 +34,7 @@ def test_a_terminal_that_is_stopped_holds_up_no_process() -> None:
 def test_the_end_waits_for_the_last_words_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(words, "CLOSE_WITHIN", 0.01)
     stopped = threading.Event()
-    said = Words(lambda label, line: bool(stopped.wait(20)))
+    said = Console(lambda label, line: bool(stopped.wait(20)))
     said.put("left", "last")
 
     said.close()

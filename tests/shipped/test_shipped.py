@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dataflow import shipped
-from dataflow.cli import demo as demo_command
+from dataflow.cli.commands import demo as demo_command
 from dataflow.cli.main import app
 from dataflow.graph import load_graph
 

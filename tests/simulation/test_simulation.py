@@ -108,7 +108,7 @@ def test_who_spins_is_named() -> None:
 def test_nothing_reads_the_clock_past_the_simulation() -> None:
     """The engine reads time through the name `time` of each module: a function bound there would be the real one."""
     names = {module for module, _ in bindings.clocks()}
-    assert {"dataflow.process.operator_process", "dataflow.supervision.supervisor", "dataflow.firing.live"} <= names
+    assert {"dataflow.process.operator_process", "dataflow.supervision.supervisor", "dataflow.execution.live"} <= names
     real = {time.monotonic, time.time, time.sleep, time.monotonic_ns, time.perf_counter}
     for module in names:
         bound = [name for name, thing in vars(sys.modules[module]).items() if callable(thing) and thing in real]

@@ -11,10 +11,10 @@ from dataflow.graph import load_text
 from dataflow.process.stacks import ASK
 from dataflow.records.black_box import Reached, Remains
 from dataflow.records.firing import FiringRecord, encode_batch
-from dataflow.supervision.commands import Command, Over, Send, Signal, Spawn
-from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
-from dataflow.supervision.events import Begin, Died, Event, Moment, Remained, Said, StopAsked, Tick
+from dataflow.supervision.core.commands import Command, Over, Send, Signal, Spawn
+from dataflow.supervision.core.compose import core_of
+from dataflow.supervision.core.events import Begin, Died, Event, Moment, Remained, Said, StopAsked, Tick
 from dataflow.supervision.plan import RunPlan, process_plans
 
 WALL = 1_700_000_000.0

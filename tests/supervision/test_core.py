@@ -7,8 +7,8 @@ import re
 import pytest
 from plays import Play, asked_where, killed, sent, spawned
 
-from dataflow.supervision.commands import Announce, Over, Withdraw
-from dataflow.supervision.events import Aborted, Begin, Died, HungUp, LeftBehind, Paused, Printed, Said, Tick
+from dataflow.supervision.core.commands import Announce, Over, Withdraw
+from dataflow.supervision.core.events import Aborted, Begin, Died, HungUp, LeftBehind, Paused, Printed, Said, Tick
 from dataflow.sync import FOREVER
 
 

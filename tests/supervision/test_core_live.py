@@ -10,8 +10,8 @@ from plays import LEFT, STEP, Play, asked_where, killed, sent, spawned
 from dataflow.chaos.plan import Fault
 from dataflow.recording.parts import Storage
 from dataflow.records.firing import Emission, FiringRecord
-from dataflow.supervision.commands import Send, Signal, Spawn
-from dataflow.supervision.events import Begin, Died, NotReading, Said, Tick
+from dataflow.supervision.core.commands import Send, Signal, Spawn
+from dataflow.supervision.core.events import Begin, Died, NotReading, Said, Tick
 from dataflow.sync import FOREVER
 
 AGAIN = "live: {restart: {max: 2, backoff: 100ms}}"

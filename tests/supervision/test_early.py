@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.firing.threads import environment
+from dataflow.execution.threads import environment
 from dataflow.graph import load_text
 from dataflow.supervision import supervisor
-from dataflow.supervision.early import EarlyNursery, early_nursery
+from dataflow.supervision.early_nursery import EarlyNursery, early_nursery
 from dataflow.supervision.run import run
 
 GRAPH = """\

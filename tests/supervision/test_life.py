@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plays import LEFT, SUM, Play
 
-from dataflow.supervision.events import Died, Event, HungUp, NotReading, Printed, Said, StopAsked, Tick
-from dataflow.supervision.life import HAS_PROCESS, TRANSITIONS, Life, Step, after
+from dataflow.supervision.core.events import Died, Event, HungUp, NotReading, Printed, Said, StopAsked, Tick
+from dataflow.supervision.core.life import HAS_PROCESS, TRANSITIONS, Life, Step, after
 
 
 def test_every_state_is_in_the_table_and_can_be_reached() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.recording.logs import LogLine
-from dataflow.supervision.log_keeper import AT_ONCE, KEPT, LogKeeper
+from dataflow.recording.streams.logs import LogLine
+from dataflow.supervision.core.log_keeper import AT_ONCE, KEPT, LogKeeper
 
 
 class Run:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from dataflow.graph import load_text
-from dataflow.process.handed import Handed, take_handed
+from dataflow.process.descriptors import Descriptors, take_descriptors
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.plan import RunPlan, process_plans
 from dataflow.supervision.rings import Rings, pairs_of
@@ -62,12 +62,12 @@ def test_one_process_needs_no_link() -> None:
 
 
 @contextmanager
-def opened(made: RunPlan) -> Iterator[Mapping[str, Handed]]:
+def opened(made: RunPlan) -> Iterator[Mapping[str, Descriptors]]:
     """What each process of a run is handed, opened as it would open it."""
     processes = process_plans(made)
     rings = Rings(list(processes), pairs_of(made.graph, processes))
     configs = configurations(made, processes, dict.fromkeys(processes, "unixsock-stream//nowhere"))
-    yield {label: take_handed(rings.handed(label), configs[label][1]) for label in processes}
+    yield {label: take_descriptors(rings.handed(label), configs[label][1]) for label in processes}
     rings.close()
 
 

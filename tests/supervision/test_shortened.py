@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataflow.supervision.shortened import shortened
+from dataflow.supervision.core.stack_traces import shortened
 
 LISTENER = [
     "Thread 0x00007fe4ecbff6c0 (most recent call first):",
     '  File "/there/dataflow/process/channel.py", line 80 in _read',
-    '  File "/there/dataflow/process/main.py", line 37 in _listen',
+    '  File "/there/dataflow/supervision/process_main.py", line 37 in _listen',
     '  File "/usr/lib/python3.11/threading.py", line 982 in run',
     "",
 ]
 ENGINE = [
-    '  File "/there/dataflow/firing/calls.py", line 40 in setup',
-    '  File "/there/dataflow/process/main.py", line 150 in main',
+    '  File "/there/dataflow/execution/calls.py", line 40 in setup',
+    '  File "/there/dataflow/supervision/process_main.py", line 150 in main',
     '  File "<frozen runpy>", line 88 in _run_code',
 ]
 

@@ -21,8 +21,8 @@ BY_NUMBER = {"kill", "killpg"}
 NOT_WAITED_FOR_YET = {
     "supervision/nursery.py": 1,
     "supervision/nursery_process.py": 3,
-    "verification/started.py": 1,
-    "verification/worker.py": 1,
+    "verification/workers/prestart.py": 1,
+    "verification/workers/worker.py": 1,
 }
 """Where a number is used: by the parent, of a child that it waits for only afterwards, which keeps the number taken."""
 

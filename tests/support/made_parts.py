@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dataflow.editing.part import Part, write_part
 from dataflow.recording import Recording
-from dataflow.recording.copying import Origin
+from dataflow.recording.streams.copying import Origin
 
 SECOND = 1_000_000_000
 

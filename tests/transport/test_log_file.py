@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.recording.logs import LogLine
+from dataflow.recording.streams.logs import LogLine
 from dataflow.transport import log_file
 from dataflow.transport.log_file import LogFile, LogFollower
 from dataflow.transport.registry import registry_folder

@@ -32,8 +32,10 @@ def kept() -> Path:
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets verification call its workers' functions in this process: for tests of what they find."""
-    from dataflow.verification import letters, processes, verify
-    from dataflow.verification.board import Board
+    from dataflow.verification import verify
+    from dataflow.verification.workers import mail as letters
+    from dataflow.verification.workers import processes
+    from dataflow.verification.workers.board import Board
 
     def call(calls: Sequence[processes.Call], **options: Any) -> list[Any]:
         return [_called(one, letters) for one in calls]

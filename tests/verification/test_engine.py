@@ -12,7 +12,7 @@ from dataflow.graph import Graph
 from dataflow.graph.sections import Network
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded_run import recorded_graph
-from dataflow.supervision.report import RunFailed, Status
+from dataflow.supervision.core.report import RunFailed, Status
 from dataflow.verification.verify import verify
 
 

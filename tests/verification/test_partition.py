@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataflow.graph import load_graph
-from dataflow.verification.partition import START_NS, Part, balanced, jobs_for, units, with_checks
+from dataflow.verification.workers.partition import START_NS, Job, balanced, jobs_for, units, with_checks
 
 MIXED = Path(__file__).resolve().parent.parent / "runtime" / "mixed.yaml"
 OPERATORS = ("mix", "smooth", "merge", "sum")
@@ -70,7 +70,7 @@ def test_a_stream_is_checked_by_a_part_that_reads_it_anyway_else_by_its_maker_el
     graph = load_graph(MIXED)
     checks = ["test/left/slow", "test/merge/seen", "test/mix/mixed", "test/smooth/mean"]
 
-    parts = with_checks(graph, [Part(("sum",)), Part(("smooth", "merge"))], checks)
+    parts = with_checks(graph, [Job(("sum",)), Job(("smooth", "merge"))], checks)
 
     assert [part.checks for part in parts] == [
         ("test/left/slow", "test/merge/seen"),

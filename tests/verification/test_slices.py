@@ -14,10 +14,10 @@ from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord
 from dataflow.reexecution.recorded_run import recorded_graph
-from dataflow.supervision.report import Status
-from dataflow.verification import slices
-from dataflow.verification.slices import LEAST_NS, cut, shares
+from dataflow.supervision.core.report import Status
 from dataflow.verification.verify import verify
+from dataflow.verification.workers import slices
+from dataflow.verification.workers.slices import LEAST_NS, cut, shares
 
 PER_CALL = 50_000
 

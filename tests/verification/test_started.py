@@ -10,9 +10,9 @@ import psutil
 import pytest
 
 from dataflow.process.channel import ready
-from dataflow.supervision.report import RunFailed
-from dataflow.verification.processes import Call, call_workers
-from dataflow.verification.started import EarlyWorkers, Started, early_workers
+from dataflow.supervision.core.report import RunFailed
+from dataflow.verification.workers.prestart import EarlyWorkers, Started, early_workers
+from dataflow.verification.workers.processes import Call, call_workers
 
 
 @pytest.fixture

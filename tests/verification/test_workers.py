@@ -14,8 +14,8 @@ from typing import Any
 import psutil
 import pytest
 
-from dataflow.supervision.report import RunFailed, Status
-from dataflow.verification.processes import Call, call_workers
+from dataflow.supervision.core.report import RunFailed, Status
+from dataflow.verification.workers.processes import Call, call_workers
 
 HERE = Path(__file__).resolve().parent
 
@@ -104,7 +104,7 @@ def test_an_interruption_ends_all_workers(tmp_path: Path) -> None:
 def test_workers_do_not_outlive_a_parent_that_is_killed(tmp_path: Path) -> None:
     note = tmp_path / "pid"
     script = (
-        "import sys; from dataflow.verification.processes import Call, call_workers; "
+        "import sys; from dataflow.verification.workers.processes import Call, call_workers; "
         "call_workers([Call('worker_functions:wait_for_ever', {'note': sys.argv[1]})], threads=1)"
     )
     path = os.pathsep.join([str(HERE), *filter(None, sys.path)])

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from zoo.cages import CAGES
 
-from dataflow.supervision.report import RunFailed
+from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
 

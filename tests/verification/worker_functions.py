@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dataflow.verification.board import Board
+from dataflow.verification.workers.board import Board
 
 
 def describe(request: Mapping[str, Any], board: Board) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.interop.mcap_bag import McapBag
 from dataflow.interop.unpacking import Unpacked
-from dataflow.recording.attachments import Attachment, names_once, tells_of_run
-from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RESERVED_METADATA
+from dataflow.recording.mcap.attachments import Attachment, names_once, tells_of_run
+from dataflow.recording.mcap.index import McapFile
 
 RUN_FACTS = "metadata of the run"
 ROSBAG2 = "rosbag2"

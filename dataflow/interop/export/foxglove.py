@@ -11,7 +11,7 @@ from dataflow.interop.export.extras import carry
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Message
-from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS
+from dataflow.recording.streams.foxglove import FOXGLOVE_SCHEMAS
 
 
 def export_foxglove(material: Material, file: Path, done: Exported) -> None:

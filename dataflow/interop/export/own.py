@@ -8,8 +8,8 @@ from dataflow.interop.export.extras import Extras, tell_runs
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.recording import RecordingWriter
-from dataflow.recording.attachments import tells_of_run
 from dataflow.recording.layout import BAG
+from dataflow.recording.mcap.attachments import tells_of_run
 
 
 def export_own(material: Material, file: Path, done: Exported, *, overwrite: bool = False) -> None:

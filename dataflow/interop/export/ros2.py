@@ -30,8 +30,8 @@ from dataflow.messages import (
     RangeReading,
     Transforms,
 )
-from dataflow.recording.codecs import SchemaText
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.streams.codecs import SchemaText
 
 VOLATILE, LATCHED = 2, 1
 _QOS = """- history: 1

@@ -12,7 +12,7 @@ from dataflow.interop.seen import lose
 from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, Image16
 from dataflow.messages.images import PNG_SIGNATURE
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.pixels import as_depth, as_image, as_image16, is_16_bit, is_depth, stored_rows
+from dataflow.recording.streams.pixels import as_depth, as_image, as_image16, is_16_bit, is_depth, stored_rows
 
 _DEPTH_HEADER = struct.Struct("<iff")
 """The header that compressed_depth_image_transport puts before the PNG: format, quantisation parameters A and B."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image
 from dataflow.testing import Played, play
 from operators.depth import StereoDepth

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import dataflow
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Image
 from dataflow.operator import Out
 from dataflow.testing import play

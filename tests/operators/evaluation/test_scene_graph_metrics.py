@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Detections2D, Odometry, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import play

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Mesh, PointCloud
 from dataflow.testing import play
 from operators.evaluation import SurfaceMetrics

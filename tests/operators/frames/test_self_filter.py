@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, PointCloud, Transforms
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import play

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Diagnostics, Number, Odometry, Pose, Transforms
 from dataflow.testing import Played, play
 from operators.frames import TransformTree

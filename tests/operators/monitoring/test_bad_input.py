@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dataflow import Played, play
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import CameraInfo, DepthImage, Image, Odometry, PointCloud
 from dataflow.messages.diagnostics import Level
 from operators.monitoring import ColorDepthCheck, DepthScanCheck

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Odometry, Transforms
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix
 from dataflow.testing import play

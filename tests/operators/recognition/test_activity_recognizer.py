@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Activity, Boxes3D, Classification, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import play

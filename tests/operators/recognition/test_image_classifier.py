@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_pictures import SHAPES, image, picture, scene
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Detections2D
 from dataflow.testing import play
 from operators.recognition import ImageClassifier

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Boxes3D, Classification, Clusters, PointCloud, Pose, SceneGraph
 from dataflow.testing import play
 from operators.recognition import PostureRecognizer

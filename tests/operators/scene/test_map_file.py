@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from made_scene import INFO, Solid, camera, look
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Boxes3D, Clusters, PointCloud, Pose, SceneGraph
 from dataflow.testing import Played, play
 from operators.scene import ObjectLifter, SemanticMap

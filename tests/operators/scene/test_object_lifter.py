@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from made_scene import INFO, Solid, camera, look
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Boxes3D, CameraInfo, Clusters, Detections2D, Diagnostics, PointCloud, Transforms
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import Played, play

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Activity, Diagnostics, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import Played, play

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from made_scene import INFO, Solid, camera, look
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Boxes3D, Clusters, PointCloud, Pose, SceneGraph
 from dataflow.messages.geometry import yaw_of
 from dataflow.testing import Played, play

@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Image, SegmentationMap
 from dataflow.testing import play
 from operators.inference import ModelError

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Image, SegmentationMap
 from dataflow.testing import play
 from operators.segmentation import TorchvisionSegmenter

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import project

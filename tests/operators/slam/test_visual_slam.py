@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image
 from dataflow.messages.geometry import invert
 from dataflow.testing import Played, play

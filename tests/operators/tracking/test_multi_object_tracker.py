@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Detections2D, Diagnostics, FeatureVector, Tracks, TrackState
 from dataflow.testing import play
 from operators.tracking import MultiObjectTracker

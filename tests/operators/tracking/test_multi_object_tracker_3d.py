@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Boxes3D, Diagnostics, Pose, Tracks, TrackState
 from dataflow.messages.geometry import quaternion_from_yaw, quaternion_to_matrix, yaw_of
 from dataflow.testing import play

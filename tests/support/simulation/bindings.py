@@ -11,7 +11,17 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-ENGINE = ("chaos", "feeds", "firing", "process", "records", "recording", "reexecution", "supervision", "transport")
+ENGINE = (
+    "chaos",
+    "execution",
+    "process",
+    "records",
+    "recording",
+    "reexecution",
+    "sinks",
+    "supervision",
+    "transport",
+)
 
 Bindings = dict[tuple[str, str], Any]
 """(module, name) → what it stands for."""
@@ -20,9 +30,9 @@ Bindings = dict[tuple[str, str], Any]
 def _load() -> None:
     for name in ENGINE:
         package = importlib.import_module(f"dataflow.{name}")
-        for module in pkgutil.iter_modules(package.__path__):
-            if module.name != "nursery_process":
-                importlib.import_module(f"{package.__name__}.{module.name}")
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith(".nursery_process"):
+                importlib.import_module(module.name)
 
 
 @functools.cache

@@ -24,14 +24,14 @@ from dataflow.recording import Recording, RecordingError
 from dataflow.recording.parts import Storage
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.core.report import RunReport
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
-from dataflow.supervision.report import RunReport
 from dataflow.sync import messages_of
-from dataflow.verification.board import Board
-from dataflow.verification.processes import Call
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
+from dataflow.verification.workers.board import Board
+from dataflow.verification.workers.processes import Call
 from simulation.bindings import bound
 from simulation.run import Machine, Outcome, simulate
 from simulation.scenario import PATIENCE, TICKING, TIMEOUT, Scenario
@@ -164,10 +164,10 @@ def _verify_from_middle(path: Path) -> None:
 def verified(path: Path, *, start: float | None = None, jobs: int = 1) -> VerifyReport:
     """Verifies in this process: the workers' functions are called, one after the other."""
     bindings = {
-        ("dataflow.verification.verify", "machine_facts"): lambda environment: {"threads": {}},
+        ("dataflow.verification.facts", "machine_facts"): lambda environment: {"threads": {}},
         ("dataflow.graph", "load_bundle"): _load_bundle,
     }
-    importlib.import_module("dataflow.verification.verify")
+    importlib.import_module("dataflow.verification.facts")
     with bound(bindings):
         return verify(path, start=start, jobs=jobs, workers=_call_here)
 

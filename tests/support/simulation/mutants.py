@@ -7,14 +7,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from dataflow.feeds.window import Window
-from dataflow.firing.admission import AdmissionQueue, Patience
-from dataflow.firing.live import LiveRunner
-from dataflow.firing.ports import OutputPorts
-from dataflow.firing.runner import OperatorRunner
+from dataflow.execution.admission import AdmissionQueue, Patience
+from dataflow.execution.feeds.window import Window
+from dataflow.execution.live import LiveRunner
+from dataflow.execution.ports import OutputPorts
+from dataflow.execution.runner import OperatorRunner
 from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import ChannelClosed, QueuedChannel
-from dataflow.process.losses import LossTold
+from dataflow.process.streams.losses import LossTold
 from dataflow.sync import FOREVER, NEVER
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from dataflow.process.channel import QueuedChannel
-from dataflow.process.main import main
 from dataflow.supervision.nursery import Child, End, Leftovers
+from dataflow.supervision.process_main import main
 from simulation.machine import Handle, ReadEnd, Socket, System, Waiters, WriteEnd
 from simulation.world import Killed, Process, World
 

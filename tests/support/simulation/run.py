@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
+from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.nursery import Child
 from dataflow.supervision.plan import RunPlan
-from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import _metadata
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.transport import make_ring
@@ -160,16 +160,16 @@ class Simulation:
         facts: dict[str, Any] = {"threads": {}}
         return {
             **dict.fromkeys(bindings.clocks(), time),
-            (f"{process}.main", "threading"): threads,
-            (f"{process}.main", "os"): system,
+            (f"{supervision}.process_main", "threading"): threads,
+            (f"{supervision}.process_main", "os"): system,
             (f"{process}.channel", "socket"): machine.Sockets(system),
             (f"{process}.channel", "threading"): threads,
             (f"{process}.watchdog", "threading"): threads,
             (f"{process}.watchdog", "psutil"): SimpleNamespace(Process=_Resident, Error=OSError),
             (f"{process}.live_sources", "threading"): threads,
-            (f"{process}.inbox", "os"): system,
-            (f"{process}.inbox", "select"): machine.Select(system),
-            (f"{process}.inbox", "threading"): threads,
+            (f"{process}.streams.inbox", "os"): system,
+            (f"{process}.streams.inbox", "select"): machine.Select(system),
+            (f"{process}.streams.inbox", "threading"): threads,
             (f"{process}.polling", "select"): machine.Select(system),
             (f"{process}.operator_process", "Bus"): lambda config: network.Bus(world, self._served),
             (f"{process}.operator_process", "TapServer"): network.Nobody,
@@ -182,23 +182,23 @@ class Simulation:
             (f"{supervision}.rings", "os"): system,
             (f"{supervision}.rings", "make_ring"): functools.partial(make_ring, self._ring_bytes),
             (f"{process}.operator_process", "limit_threads"): _nothing,
-            (f"{process}.live_sink", "let_others_begin"): _nothing,
+            ("dataflow.sinks.live_sink", "let_others_begin"): _nothing,
             (f"{process}.operator_process", "gc"): SimpleNamespace(freeze=lambda: None),  # processes end here
             (f"{supervision}.supervisor", "os"): system,
             (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),
             (f"{supervision}.supervisor", "Nursery"): lambda environment: Nursery(system, self._named, self._born),
-            (f"{supervision}.supervisor", "Words"): _Shown,
+            (f"{supervision}.supervisor", "Console"): _Shown,
             (f"{supervision}.supervisor", "LogFile"): _NoLog,
             (f"{supervision}.supervisor", "registry"): SimpleNamespace(register=self._released),
             (f"{supervision}.supervisor", "reserve_endpoints"): lambda number: _reserved(endpoints, number),
             (f"{supervision}.supervisor", "environment"): _nothing,
             (f"{supervision}.nursery", "os"): system,
             (f"{supervision}.nursery", "signal"): machine.Signals(system),
-            ("dataflow.process.handed", "BACKLOG"): (1, 1),
+            ("dataflow.process.descriptors", "BACKLOG"): (1, 1),
             (f"{supervision}.run", "machine_facts"): lambda environment: facts,
-            ("dataflow.recording.container", "os"): self.disk,
+            ("dataflow.recording.mcap.container", "os"): self.disk,
             ("dataflow.recording.parts", "os"): self.disk,
-            ("dataflow.firing.source", "Tripwire"): _NoTripwire,
+            ("dataflow.execution.source", "Tripwire"): _NoTripwire,
         }
 
     # Processes

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_walls import RATE, SIZE, K, aside, rendered
 
-from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, Image, Odometry, Transforms
 from dataflow.operator import Context
 from dataflow.testing import Played, play

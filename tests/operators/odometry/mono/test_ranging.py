@@ -9,7 +9,7 @@ import pytest
 from made_walls import RATE, SIZE, K, aside, depth_from, rendered
 from numpy.typing import NDArray
 
-from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image, Transforms
 from dataflow.testing import Played, play
 from operators.evaluation.trajectory import align

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from made_hallway import RIG, SIZE, Matrix, Pair, driving, pairs_at
 
-from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.odometry.stereo.map import StereoMap

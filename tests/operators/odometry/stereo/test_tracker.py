@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from made_hallway import RIG, SIZE, Gray, K, Matrix, Pair, driving, sequence
 
-from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, Image
 from dataflow.messages.geometry import invert
 from operators.geometry import se3

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.firing.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Diagnostics, JointState, Odometry, WheelTicks
 from dataflow.messages.geometry import yaw_of
 from dataflow.testing import Played, play

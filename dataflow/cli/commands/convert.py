@@ -1,0 +1,336 @@
+"""`dataflow convert`: recordings and bags in the formats of other systems, and bags as recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn
+from rich.text import Text
+
+from dataflow.cli.support.arguments import (
+    FLAG,
+    AnyRecording,
+    Clock,
+    End,
+    Json,
+    OutInstead,
+    Overwrite,
+    Start,
+    Streams,
+    Strict,
+    Without,
+    chosen_streams,
+    existing_recording,
+    named_once,
+    output_file,
+)
+from dataflow.cli.support.output import (
+    DIFFERENT,
+    count,
+    err,
+    fail,
+    friendly_errors,
+    out,
+    plural,
+    print_json,
+    say,
+    shown,
+    table,
+)
+
+if TYPE_CHECKING:
+    from dataflow.interop.account import Account
+    from dataflow.interop.export.material import Material
+    from dataflow.interop.export.report import Exported
+    from dataflow.interop.playing import Wishes
+
+Format = Literal[
+    "mcap",
+    "ros2",
+    "foxglove",
+    "rrd",
+    "tum",
+    "7scenes",
+    "euroc",
+    "kitti",
+    "kitti-raw",
+    "lerobot",
+    "lerobot-v3",
+    "csv",
+    "parquet",
+]
+SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
+"""Of formats that are one file; the others are folders."""
+_MCAP = ("mcap", "foxglove", "ros2")
+"""Formats that have places for attachments and metadata records."""
+
+
+def convert(
+    recording: AnyRecording,
+    output: Annotated[
+        Path | None, typer.Argument(metavar="OUTPUT", help="The file or folder to write; or name it with --out.")
+    ] = None,
+    out_option: OutInstead = None,
+    to: Annotated[
+        Format | None,
+        typer.Option(
+            "--to", metavar="FORMAT", help="The format; the examples name all of them. Not needed for NAME.rrd."
+        ),
+    ] = None,
+    streams: Streams = None,
+    without: Without = None,
+    start: Start = None,
+    end: End = None,
+    clock: Clock = "auto",
+    action: Annotated[
+        str | None, typer.Option("--action", metavar="STREAM", help="Of lerobot: the stream that is the action.")
+    ] = None,
+    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="Of lerobot: what is done.")] = "",
+    depth: Annotated[
+        list[str] | None,
+        typer.Option("--depth", metavar="TOPIC", help="16-bit grey images of this topic are depth, in millimetres."),
+    ] = None,
+    lossy: Annotated[
+        bool, typer.Option("--lossy", metavar=FLAG, help="Write values with fewer bits where the format has fewer.")
+    ] = False,
+    strict: Strict = False,
+    overwrite: Overwrite = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="Show no progress.")] = False,
+    json: Json = False,
+) -> None:
+    """Convert a recording or a bag to another format.
+
+    Into ros2, ROS topics of a bag go byte for byte, streams of a recording as the ROS types they have a counterpart in;
+    what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
+    kept as they are. Into mcap, ros2 and foxglove, attachments and metadata records of an MCAP file go along; other
+    formats have no place for them, which is said. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a
+    kind: --without leaves out others, --stream names all that are taken. Into lerobot (format 2.1) and lerobot-v3
+    (3.0), every image of the first camera is a frame, with the newest message of every other stream; images stay
+    images, lossless, since no video encoder is among the dependencies.
+
+    All that has no place is said, and stands in --json and in the metadata: messages that cannot be read, fields, bits,
+    shapes. Where a format has fewer bits than a stream, the command refuses; --lossy writes it all the same, and into
+    mcap 16-bit images as images of 8 bits.
+
+    Exit codes:
+
+      0    everything was written, but for what is said to be left out
+      1    it was written, and the file holds fewer messages than it promises
+      2    could not convert: a wrong option, a stream that the format needs and the recording lacks
+
+    Examples:
+
+      dataflow convert run.mcap bag --to ros2
+      dataflow convert drive.bag drive.mcap --to mcap
+      dataflow convert run.mcap run_foxglove.mcap --to foxglove
+      dataflow convert run.mcap run.rrd --to rrd
+      dataflow convert run.mcap folder --to tum
+      dataflow convert run.mcap folder --to 7scenes
+      dataflow convert run.mcap folder --to euroc
+      dataflow convert run.mcap folder --to kitti --stream "camera/*"
+      dataflow convert run.mcap folder --to kitti-raw
+      dataflow convert run.mcap folder --to lerobot --action cmd/twist
+      dataflow convert run.mcap folder --to lerobot-v3 --task "pick up cups"
+      dataflow convert run.mcap folder --to csv --stream imu/imu
+      dataflow convert run.mcap folder --to parquet --start 5 --end 10
+    """
+    with friendly_errors():
+        existing_recording(recording)
+        output = named_once("OUTPUT", output, out_option)
+        if output is None:
+            raise fail("nothing says where to write: name a file or folder behind the recording, or with --out")
+        if to is None:
+            if output.suffix != ".rrd":
+                raise fail(f"nothing says the format of {output}: give one with --to: {', '.join(get_args(Format))}")
+            to = "rrd"
+        _check_output(output, to, overwrite)
+        if to == "rrd":
+            from dataflow.cli.support.drawing import draw_recording, drawn_as_json, report
+            from dataflow.view import Save
+
+            with _complete(output) as place:
+                drawn = draw_recording(recording, Save(place), streams, without, start, end, clock)
+            account, done = _left_by_rrd(recording)
+            if json:
+                print_json(drawn_as_json(drawn[0], output) | {"left_out": done.left_out, "source": account.as_json()})
+            else:
+                report(*drawn, output)
+                _print_left_out(done)
+            _fail_if_short(account)
+            return
+        from dataflow.interop.playing import Wishes
+
+        wishes = Wishes(tuple(depth or ()), lossy=lossy, strict=strict)
+        if not to.startswith("lerobot") and (action is not None or task):
+            raise fail("--action and --task are of --to lerobot and lerobot-v3")
+        with (
+            _opened(recording, streams, without, start, end, clock, wishes) as material,
+            _progress(quiet or json) as watch,
+            _complete(output) as place,
+        ):
+            done = _export(material, place, to, watch, action, task, lossy=lossy)
+        done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
+        shown([*material.account.notes, *material.account.short])
+    account = material.account
+    if json:
+        print_json(done.as_json() | {"source": account.as_json()})
+        _fail_if_short(account)
+        return
+    made = table("stream", "messages", right=("messages",))
+    for name, number in done.written.items():
+        made.add_row(Text(name), count(number))
+    out.print(made)
+    if done.attachments or done.metadata:
+        out.print(f"carried over: {plural(done.attachments, 'attachment')}, {count(done.metadata)} metadata records")
+    for line in account.lines(lambda topic: topic.strip("/")):
+        say(f"[yellow]{escape(line)}[/]")
+    _print_left_out(done)
+    files = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
+    for file in files:
+        out.print(f"wrote {escape(file)}", soft_wrap=True)
+    _fail_if_short(account)
+
+
+def _left_by_rrd(recording: Path) -> tuple[Account, Exported]:
+    from dataflow.interop.export.extras import tell_left_out
+    from dataflow.interop.export.material import Material
+    from dataflow.interop.export.report import Exported
+
+    done = Exported()
+    with Material(recording) as material:
+        tell_left_out(material, "rrd", done)
+        return material.account, done
+
+
+def _print_left_out(done: Exported) -> None:
+    for name, reason in done.left_out.items():
+        say(f"[yellow]left out:[/] {escape(name)}: {escape(reason)}")
+    for name, losses in done.lost.items():
+        for what, number in losses.items():
+            say(f"[yellow]no place for:[/] {escape(name)}: {escape(what)} ({count(number)})")
+
+
+def _fail_if_short(account: Account) -> None:
+    if account.short:
+        raise typer.Exit(DIFFERENT)
+
+
+def _check_output(output: Path, to: str, overwrite: bool) -> None:
+    suffix = SUFFIXES.get(to)
+    if suffix is not None:
+        output_file(output, suffix, overwrite=overwrite, option=f"--to {to}")
+    elif output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise fail(f"{output} exists; {to} is written to a new or empty folder")
+    elif output.exists():
+        output.rmdir()
+
+
+@contextmanager
+def _complete(output: Path) -> Iterator[Path]:
+    """Gives a place to write to, of the same name; what is written there appears as `output` when it is complete."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:
+        place = Path(folder) / output.name
+        yield place
+        if place.exists():
+            place.replace(output)
+
+
+@contextmanager
+def _opened(
+    path: Path,
+    words: list[str] | None,
+    without: list[str] | None,
+    start: float | None,
+    end: float | None,
+    clock: Literal["auto", "header", "log"],
+    wishes: Wishes,
+) -> Iterator[Material]:
+    from dataflow.interop.export.material import Material
+    from dataflow.recording.layout import RECORDING
+    from dataflow.recording.streams.cutting import cut_of
+
+    metadata: Mapping[str, Mapping[str, str]]
+    with Material(path, clock=clock, wishes=wishes) as whole:
+        if not any(topic.count for topic in whole.bag.topics.values()) and whole.account.notes:
+            raise fail(f"{path} holds no message that can be read: {'; '.join(whole.account.notes)}")
+        names = [*whole.streams, *(t.name for t in whole.untouched)]
+        namespace, metadata = "", {}
+        if not whole.foreign:
+            from dataflow.recording import Recording
+
+            with Recording(path) as opened:
+                metadata = opened.metadata
+                namespace = metadata.get(RECORDING, {}).get("namespace", "")
+        chosen = chosen_streams(words, names, namespace, without) if words or without else None
+        firsts = [i.first for i in whole.streams.values() if i.first is not None and not i.static]
+        firsts += [t.first for t in whole.untouched if t.first is not None]
+        part = None if whole.foreign else cut_of(metadata)
+        first = min(firsts, default=0) if part is None or part.start is None else part.start
+        if whole.clock:
+            say(f"[dim]stamps: {escape(whole.clock)}[/]")
+    begin = None if start is None else first + round(start * 1e9)
+    finish = None if end is None else first + round(end * 1e9)
+    with Material(path, chosen, clock, begin, finish, wishes) as material:
+        yield material
+
+
+def _export(
+    material: Material,
+    output: Path,
+    to: str,
+    watch: Callable[[int], None] | None,
+    action: str | None,
+    task: str,
+    *,
+    lossy: bool,
+) -> Exported:
+    from dataflow.interop.export.datasets import DATASETS, tell_untaken
+    from dataflow.interop.export.extras import tell_left_out
+    from dataflow.interop.export.foxglove import export_foxglove
+    from dataflow.interop.export.own import export_own
+    from dataflow.interop.export.report import Exported
+    from dataflow.interop.export.ros2 import export_ros2
+    from dataflow.interop.export.tables import export_csv, export_parquet
+
+    done = Exported(lossy=lossy, watch=watch)
+    match to:
+        case "mcap":
+            export_own(material, output, done)
+        case "foxglove":
+            export_foxglove(material, output, done)
+        case "ros2":
+            export_ros2(material, output, done)
+        case "lerobot" | "lerobot-v3":
+            from dataflow.interop.export.lerobot import export_lerobot
+            from dataflow.interop.export.lerobot_layouts import Layout21, Layout30
+
+            layout = Layout21() if to == "lerobot" else Layout30()
+            export_lerobot(material, output, done, layout=layout, action=action, task=task)
+        case "csv":
+            export_csv(material, output, done)
+        case "parquet":
+            export_parquet(material, output, done)
+        case _:
+            DATASETS[to](material, output, done)
+            tell_untaken(material, to, done)
+    if to not in _MCAP:
+        tell_left_out(material, to, done)
+    return done
+
+
+@contextmanager
+def _progress(hidden: bool) -> Iterator[Callable[[int], None] | None]:
+    """Shows how many messages are written."""
+    if hidden or not err.is_terminal:
+        yield None
+        return
+    with Progress(SpinnerColumn(), TextColumn("{task.description}"), console=err, transient=True) as progress:
+        task = progress.add_task("converting")
+        yield lambda seen: progress.update(task, description=f"converting · {count(seen)} messages")

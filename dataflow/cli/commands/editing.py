@@ -1,0 +1,185 @@
+"""`dataflow cut`, `filter` and `split`: parts of recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.text import Text
+
+from dataflow.cli.support.arguments import FLAG, Json, Overwrite, Without, chosen_streams, output_file
+from dataflow.cli.support.material import (
+    Compression,
+    Material,
+    Out,
+    Quiet,
+    Word,
+    asked_span,
+    copying,
+    opened_material,
+    print_edited,
+    print_unknown,
+    refuse_itself,
+)
+from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, seconds, size, table
+from dataflow.cli.support.quantities import parsed_duration, parsed_size
+
+
+def cut(
+    recording: Material,
+    output: Out,
+    start: Annotated[
+        Word, typer.Option("--from", "--start", metavar="TIME", help="Begin there. Default: at the beginning.")
+    ] = None,
+    end: Annotated[Word, typer.Option("--to", "--end", metavar="TIME", help="End there. Default: at the end.")] = None,
+    duration: Annotated[Word, typer.Option("--duration", metavar="TIME", help="Instead of --to: last so long.")] = None,
+    bare: Annotated[
+        bool,
+        typer.Option("--bare", metavar=FLAG, help="Exactly the messages of the span, without firing records."),
+    ] = False,
+    compression: Compression = "zstd",
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Cut a span out of a recording.
+
+    A TIME is seconds after the first message (12.5), a duration (500ms, 2min), or a date in ISO 8601 with its time
+    zone. Messages go over byte for byte, static streams always.
+
+    The part replays from there with the states that operators had, and verifies: every operator is taken up after its
+    last recorded state at or before --from, and what its firings took since then goes along. For that, record with
+    `record: {snapshots: 10s}`. Operators that keep a state and gave none are named; of them `dataflow verify` says that
+    they cannot be verified, until their next recorded state.
+
+    Exit codes:
+
+      0    written
+      2    could not cut: a wrong option, a file that cannot be read
+
+    Examples:
+
+      dataflow cut run.mcap --from 30 --to 45 -o part.mcap
+      dataflow cut run.mcap --from 2min --duration 10s -o part.mcap
+      dataflow cut run.mcap --from 2026-03-01T12:00:00Z -o end.mcap
+      dataflow cut bag.mcap --to 10 --bare -o beginning.mcap
+    """
+    from dataflow.editing.part import Part, write_part
+
+    with friendly_errors(), opened_material(recording) as origin, copying("cutting", quiet or json) as watch:
+        output_file(output, ".mcap", overwrite=overwrite, option="--out")
+        refuse_itself(output, [recording])
+        part = asked_span(origin, start, end, duration)
+        done = write_part(
+            origin, Part(*part, bare=bare), output, compression=compression, overwrite=overwrite, watch=watch
+        )
+    if json:
+        print_json(done.as_json())
+    else:
+        print_edited(done)
+
+
+def filter_(
+    recording: Material,
+    output: Out,
+    streams: Annotated[
+        list[str] | None,
+        typer.Option("--stream", metavar="STREAM", help="Keep these streams; wildcards work. May be repeated."),
+    ] = None,
+    without: Without = None,
+    compression: Compression = "zstd",
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Keep some streams of a recording and leave out the others.
+
+    Firing records stay, so `dataflow verify` still compares what operators make with the digests of what they made,
+    where their inputs are there or can be made again; where they are not, it says so. With the sensors alone, the
+    recording becomes a thin one, from which `dataflow replay --complete` makes the whole again.
+
+    Exit codes:
+
+      0    written
+      2    could not filter: no stream matches, a file that cannot be read
+
+    Examples:
+
+      dataflow filter run.mcap --stream imu/imu --stream "camera/*" -o s.mcap
+      dataflow filter run.mcap --without "camera/**" -o small.mcap
+    """
+    from dataflow.editing.part import Part, write_part
+
+    with friendly_errors(), opened_material(recording) as origin, copying("filtering", quiet or json) as watch:
+        if not streams and not without:
+            raise fail("nothing to choose by: name streams with --stream, or with --without")
+        output_file(output, ".mcap", overwrite=overwrite, option="--out")
+        refuse_itself(output, [recording])
+        names = sorted(origin.counts())
+        kept = chosen_streams(streams, names, origin.namespace, without)
+        done = write_part(origin, Part(streams=kept), output, compression=compression, overwrite=overwrite, watch=watch)
+    if json:
+        print_json(done.as_json())
+    else:
+        print_edited(done)
+
+
+def split(
+    recording: Material,
+    every: Annotated[
+        Word, typer.Option("--every", metavar="TIME", help="Event time of a part: 60s, 5min, or a number of seconds.")
+    ] = None,
+    nbytes: Annotated[
+        Word, typer.Option("--size", metavar="SIZE", help="Size of a part, about: 500MB, 2GB, 100MiB.")
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="The folder to write to. Default: named as the recording."),
+    ] = None,
+    compression: Compression = "zstd",
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Split a recording into parts of a duration or a size.
+
+    Each part is a recording by itself, cut as `dataflow cut` does: it replays, verifies where it can, and holds what
+    its first firings need from before it. `dataflow merge` makes one of them again.
+
+    Exit codes:
+
+      0    written
+      2    could not split: a wrong option, a file that cannot be read
+
+    Examples:
+
+      dataflow split run.mcap --every 60s
+      dataflow split run.mcap --size 500MB -o parts
+    """
+    from dataflow.editing.split import split as parts_of
+
+    with friendly_errors(), opened_material(recording) as origin, copying("splitting", quiet or json) as watch:
+        if (every is None) == (nbytes is None):
+            raise fail("say how to split: --every TIME or --size SIZE")
+        target = folder or recording.with_suffix("")
+        if target.exists() and not target.is_dir():
+            raise fail(f"--out {target}: expected a folder")
+        period = None if every is None else parsed_duration("--every", every)
+        most = None if nbytes is None else parsed_size("--size", nbytes)
+        done = list(
+            parts_of(origin, target, every=period, size=most, compression=compression, overwrite=overwrite, watch=watch)
+        )
+    if json:
+        print_json([one.as_json() for one in done])
+        return
+    made = table("part", "begins", "lasts", "messages", "size", right=("begins", "lasts", "messages", "size"))
+    first = next((one.span[0] for one in done if one.span is not None), 0)
+    for one in done:
+        low, high = one.span or (first, first)
+        row = (f"{(low - first) * 1e-9:.2f} s", seconds((high - low) * 1e-9), count(one.messages), size(one.bytes))
+        made.add_row(Text(Path(one.path).name), *row)
+    out.print(made)
+    print_unknown({name for one in done for name in one.unknown})
+    out.print(f"wrote {plural(len(done), 'part')} to {escape(str(target))}", soft_wrap=True)

@@ -1,0 +1,215 @@
+"""`dataflow foxglove`: streams in Foxglove, live or from a recording."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.text import Text
+
+from dataflow.cli.commands.live import GraphName, Wait, running_graph, say_followed
+from dataflow.cli.support.arguments import (
+    Clock,
+    End,
+    Start,
+    Streams,
+    chosen_streams,
+    existing_recording,
+    number,
+    span,
+    window,
+)
+from dataflow.cli.support.output import err, fail, friendly_errors, out, plural, say
+
+if TYPE_CHECKING:
+    from dataflow.client.playback import Steering
+    from dataflow.client.replay_bar import ReplayBar
+    from dataflow.foxglove.server import FoxgloveServer
+    from dataflow.interop.clocks import Choice
+    from dataflow.recording import Recorded
+
+PORT = 8765
+
+
+def foxglove(
+    recording: Annotated[
+        Path | None,
+        typer.Argument(metavar="RECORDING", help="A recording or a bag. Without one: the running graph."),
+    ] = None,
+    port: Annotated[int, typer.Option("--port", metavar="PORT", help="Where to listen; 0: a free one.")] = PORT,
+    host: Annotated[
+        str, typer.Option("--host", metavar="ADDRESS", help="The address to listen on; other machines need another.")
+    ] = "127.0.0.1",
+    streams: Streams = None,
+    speed: Annotated[
+        float,
+        typer.Option("--speed", metavar="FACTOR", parser=number(0.01, 100, "a factor of real time"), help="At first."),
+    ] = 1.0,
+    start: Start = None,
+    end: End = None,
+    clock: Clock = "auto",
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+) -> None:
+    """Serve a running graph or a recording to Foxglove.
+
+    In Foxglove: Open connection, Foxglove WebSocket, and the address that is printed. Its playback bar plays the
+    recording: pause, speed, any place. Where the running graph is a replay (`dataflow replay`), the bar pauses it and
+    changes its speed; a jump is refused with the option that begins there, since operators hold what came before.
+    Images, clouds, boxes, masks, tracks, trajectories, maps and the scene graph are
+    sent as Foxglove's own schemas; a client can never slow the graph.
+
+    Examples:
+
+      dataflow foxglove
+      dataflow foxglove run.mcap --start 5 --speed 0.5
+      dataflow foxglove drive.bag
+      dataflow foxglove --stream "camera/*" --port 9000
+      dataflow foxglove --wait 10
+    """
+    from dataflow.foxglove.server import FoxgloveError
+
+    with friendly_errors():
+        if not 0 <= port < 65536:
+            raise fail(f"--port {port}: expected 0 to 65535")
+        try:
+            if recording is not None:
+                if graph is not None or wait:
+                    raise fail("--graph and --wait are about a running graph; leave them out to play a recording")
+                _play(existing_recording(recording), host, port, streams, speed, start, end, clock)
+            else:
+                if start is not None or end is not None or speed != 1.0 or clock != "auto":
+                    raise fail("--start, --end, --speed and --clock are about a recording; name one")
+                _follow(host, port, streams, graph, wait)
+        except FoxgloveError as error:
+            raise fail(str(error)) from error
+
+
+def _play(
+    path: Path,
+    host: str,
+    port: int,
+    words: list[str] | None,
+    speed: float,
+    start: float | None,
+    end: float | None,
+    stamps: Choice,
+) -> None:
+    from dataflow.cli.support.drawing import opened_streams
+    from dataflow.foxglove import player
+    from dataflow.foxglove.server import FoxgloveServer
+    from dataflow.recording.layout import RECORDING
+
+    with opened_streams(path, stamps) as opened:
+        readable = [name for name, info in opened.streams.items() if info.message_type is not None]
+        namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
+        chosen = chosen_streams(words, readable, namespace)
+        whole = span(opened, chosen)
+        if whole is None:
+            raise fail(f"{path} holds no message of {', '.join(chosen) or 'a type that is known here'}")
+        begin, finish = window(whole, start, end, path)
+        clock = player.Clock(begin or whole[0], whole[1] if finish is None else min(finish, whole[1]), speed=speed)
+        with FoxgloveServer(
+            path.name, namespace=namespace, host=host, port=port, controls=clock, span=(clock.first, clock.last)
+        ) as server:
+            _say_where(server)
+
+            def show(recorded: Recorded) -> None:
+                if recorded.stamp <= clock.last:
+                    server.show(recorded.stream, recorded.message)
+                    server.time(recorded.stamp)
+
+            def arrived() -> None:
+                server.playback(clock, did_seek=True)
+
+            def ended() -> None:
+                server.playback(clock, ended=True)
+                say("at its end; the playback bar of Foxglove goes back, Ctrl-C ends")
+
+            try:
+                player.play(opened, chosen, clock, show, arrived=arrived, ended=ended)
+            except KeyboardInterrupt:
+                say("ended")
+    out.print(f"shown: {plural(server.shown, 'message')}")
+
+
+def _follow(host: str, port: int, words: list[str] | None, name: str | None, wait: float) -> None:
+    from dataflow.client.attach import graph_of, still_runs, tap
+    from dataflow.client.playback import steering
+    from dataflow.foxglove.server import FoxgloveServer
+
+    found = running_graph(name, wait)
+    running = graph_of(found)
+    chosen = chosen_streams(words, running.streams, running.namespace)
+    with ExitStack() as stack:
+        bar = _bar(stack.enter_context(steering(found)))
+        server = stack.enter_context(
+            FoxgloveServer(
+                running.name,
+                namespace=running.namespace,
+                host=host,
+                port=port,
+                controls=bar,
+                span=None if bar is None else bar.span,
+            )
+        )
+        _say_where(server)
+        say_followed(found)
+        if bar is not None:
+            say("a replay: the playback bar of Foxglove pauses it and changes its speed")
+            stack.enter_context(_told(server, bar))
+        clock = 0
+        try:
+            with tap(found, [f"/{stream}" for stream in chosen] if words else ["**"]) as client:
+                while (taken := client.take(timeout=0.5)) is not None or still_runs(found):
+                    message = None if taken is None else taken.decode().message
+                    if taken is None or message is None:
+                        continue
+                    server.show(taken.stream, message)
+                    if message.stamp > clock:
+                        clock = message.stamp
+                        server.time(clock)
+        except KeyboardInterrupt:
+            say("ended")
+        else:
+            say("the graph has ended")
+    out.print(f"shown: {plural(server.shown, 'message')}")
+
+
+def _bar(steering: Steering) -> ReplayBar | None:
+    """Finds what a playback bar moves, where a recording is played through the graph; None elsewhere."""
+    from dataflow.client.attach import NotRunning
+    from dataflow.client.replay_bar import ReplayBar
+
+    try:
+        standing = steering.ask(None)
+    except NotRunning:  # a live run has nothing to move
+        return None
+    return None if standing["replay"] is None else ReplayBar(steering, standing)
+
+
+@contextmanager
+def _told(server: FoxgloveServer, bar: ReplayBar) -> Iterator[None]:
+    """Tells the clients meanwhile where the replay stands, about twice a second."""
+    over = threading.Event()
+
+    def tell() -> None:
+        while not over.wait(0.5):
+            bar.refresh()
+            server.playback(bar, ended=bar.ended)
+
+    teller = threading.Thread(target=tell, name="playback", daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        over.set()
+        teller.join(5.0)
+
+
+def _say_where(server: FoxgloveServer) -> None:
+    err.print(Text(f"Foxglove: Open connection, Foxglove WebSocket, {server.address}"), soft_wrap=True)

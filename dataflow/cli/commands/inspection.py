@@ -1,0 +1,148 @@
+"""`dataflow check`, `show`, `operators`: what a graph and its operators are, without running anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.padding import Padding
+from rich.text import Text
+
+from dataflow.cli.support.arguments import FLAG, GraphFile, Json, ModuleFolders, Settings, find_modules_in, graph_file
+from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say
+from dataflow.text import visible_lines
+
+if TYPE_CHECKING:
+    from dataflow.graph.catalogue import Catalogue
+
+
+def check(
+    graphs: Annotated[list[Path], typer.Argument(metavar="GRAPH...", help="Graph files (.yaml).")],
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    json: Json = False,
+) -> None:
+    """Check graph files wholly, without running them.
+
+    Names, streams, types, parameters, cycles, processes. Exit code 0: all are sound; 1: one has faults; 2: one cannot
+    be read.
+
+    Examples:
+
+      dataflow check graphs/*.yaml
+      dataflow check graphs/rgbd_perception.yaml --set cloud.stride=8
+    """
+    from dataflow.graph import GraphError, Problem, load_graph
+
+    faults: list[Problem] = []
+    faulty = 0
+    graphs = [graph_file(file) for file in graphs]
+    find_modules_in(path)
+    for file in graphs:
+        with friendly_errors():
+            try:
+                graph = load_graph(file, settings=settings or ())
+            except GraphError as error:
+                faults += error.problems
+                faulty += 1
+                if not json:
+                    out.print(
+                        Text.assemble(("faults", "bold red"), f"  {file}: {plural(len(error.problems), 'fault')}")
+                    )
+                    out.print(Text(str(error)), soft_wrap=True)
+                continue
+        if not json:
+            what = f"{plural(len(graph.nodes), 'operator')}, {plural(len(graph.streams), 'stream')}"
+            out.print(Text.assemble(("ok", "green"), f"  {file}: {what}"), soft_wrap=True)
+    if json:
+        print_json({"ok": not faults, "problems": [problem.to_json() for problem in faults]})
+    elif len(graphs) > 1 and faulty:
+        say(f"{faulty} of {plural(len(graphs), 'graph')} cannot run")
+    if faults:
+        raise typer.Exit(DIFFERENT)
+
+
+def show(
+    graph: GraphFile,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    mermaid: Annotated[bool, typer.Option("--mermaid", metavar=FLAG, help="Print a Mermaid flowchart.")] = False,
+    svg: Annotated[str | None, typer.Option("--svg", hidden=True)] = None,
+    json: Json = False,
+) -> None:
+    """Show a graph: processes, operators, what each takes and makes.
+
+    Examples:
+
+      dataflow show graphs/synthetic_rgbd.yaml
+      dataflow show graphs/synthetic_rgbd.yaml --mermaid
+      dataflow show graphs/synthetic_rgbd.yaml --json
+    """
+    from dataflow.graph import draw, load_graph
+
+    with friendly_errors():
+        if svg is not None:
+            raise fail("--svg is gone: --mermaid prints a flowchart, which GitHub, editors and mermaid.live draw")
+        if json and mermaid:
+            raise fail("--json and --mermaid exclude each other")
+        find_modules_in(path)
+        loaded = load_graph(graph_file(graph), settings=settings or ())
+        if json:
+            print_json(loaded.to_json())
+        elif mermaid:
+            print(visible_lines(draw.mermaid(loaded)))
+        else:
+            out.print(draw.tree(loaded))
+
+
+def operators(
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME", help="One operator: its ports, parameters and documentation."),
+    ] = None,
+    path: ModuleFolders = None,
+    json: Json = False,
+) -> None:
+    """List the operators that are installed, or describe one.
+
+    Examples:
+
+      dataflow operators
+      dataflow operators CloudBuilder
+      dataflow operators operators.cloud:CloudBuilder --json
+    """
+    from dataflow.graph import catalogue
+
+    with friendly_errors():
+        find_modules_in(path)
+        if name is None:
+            found = catalogue.discover()
+            if json:
+                print_json(found.to_json())
+            else:
+                _print_operators(found)
+            return
+        try:
+            described = catalogue.look_up(name)
+        except LookupError as error:
+            raise fail(str(error.args[0])) from None
+        if json:
+            print_json(described.to_json())
+        else:
+            out.print(catalogue.page(described))
+
+
+def _print_operators(found: Catalogue) -> None:
+    """One operator after the other: path, what goes in and out, first sentence of its documentation."""
+    for path, operator in found.operators.items():
+        spec = operator.spec
+        takes = ", ".join(dict.fromkeys(p.type_text() for p in spec.inputs.values()))
+        makes = ", ".join(dict.fromkeys(p.type_text() for p in spec.outputs.values()))
+        out.print(Text(path, style="bold cyan"), soft_wrap=True)
+        flow = f"{takes} → {makes}" if takes and makes else f"source of {makes}" if makes else f"sink of {takes}"
+        out.print(Padding(Text(flow, style="dim"), (0, 0, 0, 4)))
+        out.print(Padding(Text(spec.doc.partition("\n\n")[0].replace("\n", " ")), (0, 0, 0, 4)))
+    for line in found.failure_lines():
+        say(f"[red]{escape(line)}[/]")

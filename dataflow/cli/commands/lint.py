@@ -1,0 +1,143 @@
+"""`dataflow lint`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.text import Text
+
+from dataflow.cli.support.arguments import (
+    FLAG,
+    AnyRecording,
+    Json,
+    Overwrite,
+    existing,
+    existing_recording,
+    output_file,
+)
+from dataflow.cli.support.output import DIFFERENT, count, fail, friendly_errors, out, plural, print_json, table
+
+if TYPE_CHECKING:
+    from dataflow.lint.look import Report
+    from dataflow.lint.material import Material
+
+_STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
+
+
+def lint(
+    recording: AnyRecording,
+    contract: Annotated[
+        Path | None,
+        typer.Option("--contract", metavar="FILE.yaml", help="What the recording has to hold, kept with your code."),
+    ] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option("--write-contract", metavar="FILE.yaml", help="Write a contract that this recording keeps."),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", metavar=FLAG, help="Leave the clocks out, for which images are decoded.")
+    ] = False,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Look for what is wrong with recorded data.
+
+    Gaps, timestamps that repeat or go back, rates, streams that begin late or end early, frames that hang on nothing or
+    have two parents. Clocks: gyroscopes, wheels, odometry, poses and images all show how the robot turns; where their
+    timestamps do not fit, the offset is told with its sign (+: the timestamps are late) and how it drifts. The clock
+    that most streams have is taken for right, unless the contract names one.
+
+    Exit codes:
+
+      0    nothing was found (notes aside)
+      1    something was
+      2    could not run: no such file, a contract that cannot be read
+
+    Examples:
+
+      dataflow lint run.mcap
+      dataflow lint run.mcap --write-contract robot.yaml
+      dataflow lint run.mcap --contract robot.yaml --json
+      dataflow lint rosbag2_folder --quick
+    """
+    from dataflow.lint.contract import ContractError, load_contract, proposed
+    from dataflow.lint.look import lint as look
+
+    with friendly_errors():
+        if write is not None:
+            output_file(write, ".yaml", overwrite=overwrite, option="--write-contract")
+        try:
+            terms = None if contract is None else load_contract(existing(contract, "a contract"))
+        except ContractError as error:
+            raise fail(str(error)) from None
+        with _material(existing_recording(recording)) as material:
+            report = look(material, terms, clocks=not quick)
+            if write is not None:
+                name, namespace = recording.stem, material.namespace
+                text = proposed(name, namespace, material.streams, report.timings, report.root)
+                write.write_text(text, encoding="utf-8")
+    if json:
+        print_json(report.to_json())
+    else:
+        _print(report, f"{material.namespace}/" if material.namespace else "")
+        if write is not None:
+            out.print(Text(f"wrote {write}: look it over, and keep it with your code"), soft_wrap=True)
+    if not report.sound:
+        raise typer.Exit(DIFFERENT)
+
+
+@contextmanager
+def _material(path: Path) -> Iterator[Material]:
+    """A recording of ours, or a bag."""
+    from dataflow.interop.opening import is_foreign, open_bag
+    from dataflow.lint.bags import BagMaterial
+    from dataflow.lint.material import RecordedMaterial
+    from dataflow.recording import Recording
+
+    if is_foreign(path):
+        with closing(open_bag(path)) as bag:
+            yield BagMaterial(bag)
+    else:
+        with Recording(path) as opened:
+            yield RecordedMaterial(opened)
+
+
+def _print(report: Report, prefix: str) -> None:
+    numbers = ("messages", "Hz", "longest ms", "clock ms", "drift ms/s")
+    shown = table("stream", *numbers, right=numbers)
+    for name, timing in report.timings.items():
+        clock = report.clocks.get(name)
+        reference = name == report.reference
+        shown.add_row(
+            Text(name.removeprefix(prefix)),
+            count(timing.count),
+            f"{timing.rate:.4g}" if timing.steady else "",
+            f"{timing.longest * 1e3:,.1f}" if timing.longest else "",
+            "reference" if reference else "" if clock is None else _deviating(clock.offset, clock.offset_deviation),
+            "" if reference or clock is None else _deviating(clock.drift, clock.drift_deviation),
+        )
+    out.print(shown)
+    for finding in report.findings:
+        line = Text.assemble((f"{finding.severity:<8}", _STYLES[finding.severity]), (f"{finding.check}  ", "dim"))
+        if finding.stream:
+            line.append(f"{finding.stream.removeprefix(prefix)}: ", style="bold")
+        line.append(finding.text)
+        if finding.at is not None:
+            from dataflow.sync.stamps import format_stamp
+
+            line.append(f"; first at {format_stamp(finding.at)}", style="dim")
+        out.print(line, soft_wrap=True)
+    if report.findings:
+        out.print(Text(plural(len(report.findings), "finding"), style="bold"))
+    elif report.timings:
+        out.print(Text("nothing was found", style="green"))
+    else:
+        out.print(Text("there is no stream that could be looked at", style="yellow"))
+
+
+def _deviating(value: float, deviation: float) -> str:
+    return f"{value * 1e3:+.1f} ± {deviation * 1e3:.1f}"

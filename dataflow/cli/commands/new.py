@@ -1,0 +1,142 @@
+"""`dataflow new operator`, `new graph`, `new project`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+from rich.text import Text
+
+from dataflow.cli.support.arguments import Json
+from dataflow.cli.support.output import fail, out, print_json
+
+HERE = Path()
+Made = TypeVar("Made")
+To = Annotated[
+    Path, typer.Option("--to", "--out", "-o", metavar="DIR", help="The folder to write into; made where it is missing.")
+]
+
+
+def operator(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Such as NearestObstacle.")],
+    kind: Annotated[
+        str,
+        typer.Option(
+            "--kind",
+            metavar="KIND",
+            help="operator: fires for each message; timer: at each tick of event time; source: reads a device.",
+        ),
+    ] = "operator",
+    to: To = HERE,
+    json: Json = False,
+) -> None:
+    """Begin an operator: a module and its test, which passes.
+
+    In a folder that is a package the module is put into it, and the test into the `tests` beside it.
+
+    Examples:
+
+      dataflow new operator NearestObstacle
+      dataflow new operator Thermometer --kind source
+      dataflow new operator Watchdog --kind timer --to my_robot
+    """
+    from dataflow.scaffold.files import KINDS, operator_files, snake
+
+    if kind not in KINDS:
+        raise fail(f"--kind {kind}: expected one of {', '.join(KINDS)}")
+    chosen = next(known for known in KINDS if known == kind)
+    package = _package(to)
+    files = _named(lambda: operator_files(name, chosen, package))
+    tests = to.resolve().parents[package.count(".")] / "tests" if package else to
+    placed = {(tests if file.name.startswith("test_") else to) / file: text for file, text in files.items()}
+    module = _named(lambda: snake(name))
+    hints = (f"run its test: pytest {_shown(tests / f'test_{module}.py')}",)
+    _write(placed, hints, json=json)
+
+
+def graph(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Such as obstacle_watch.")],
+    to: To = HERE,
+    json: Json = False,
+) -> None:
+    """Begin a graph file: a synthetic camera and the clouds of what it sees. It runs as it is.
+
+    Examples:
+
+      dataflow new graph obstacle_watch
+      dataflow new graph obstacle_watch --to graphs
+    """
+    from dataflow.scaffold.files import graph_files
+
+    files = {to / file: text for file, text in _named(lambda: graph_files(name)).items()}
+    _write(files, (f"run it: dataflow run {_shown(next(iter(files)))}",), json=json)
+
+
+def project(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Such as my_robot: the folder and its package.")],
+    to: To = HERE,
+    json: Json = False,
+) -> None:
+    """Begin a project: a package with an operator, a graph, tests of both, and a pyproject.toml.
+
+    Examples:
+
+      dataflow new project my_robot
+      dataflow new project my_robot --to ~/src
+    """
+    from dataflow.scaffold.files import project_files, snake
+
+    made = _named(lambda: project_files(name))
+    folder = to.expanduser() / name
+    if folder.exists() and any(folder.iterdir()):
+        raise fail(f"{folder} is there already, and not empty; choose another name or folder")
+    package = _named(lambda: snake(name))
+    hints = (f"run its tests and its graph: cd {_shown(folder)} && pytest && dataflow run graphs/{package}.yaml",)
+    _write({folder / file: text for file, text in made.items()}, hints, json=json)
+
+
+def _named(make: Callable[[], Made]) -> Made:
+    """Ends the command where a name cannot be."""
+    from dataflow.scaffold.files import NameFault
+
+    try:
+        return make()
+    except NameFault as fault:
+        raise fail(str(fault)) from None
+
+
+def _package(folder: Path) -> str:
+    """The import path of a folder that is a package; empty for any other."""
+    resolved, parts = folder.expanduser().resolve(), list[str]()
+    while (resolved / "__init__.py").is_file():
+        parts.insert(0, resolved.name)
+        resolved = resolved.parent
+    return ".".join(parts)
+
+
+def _write(files: Mapping[Path, str], hints: tuple[str, ...], *, json: bool) -> None:
+    """Writes all files or none: one that is there already is never replaced."""
+    present = [file for file in files if file.exists()]
+    if present:
+        raise fail(f"{present[0]} is there already; choose another name or folder")
+    for file, text in files.items():
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise fail(f"{file} cannot be written: {error.strerror}") from None
+    if json:
+        print_json({"files": [str(file) for file in files]})
+        return
+    for file in files:
+        out.print(Text(f"wrote {_shown(file)}"), soft_wrap=True)
+    for hint in hints:
+        out.print(Text(hint, style="dim"), soft_wrap=True)
+
+
+def _shown(path: Path) -> str:
+    """A path as short as it can be from here."""
+    resolved, here = path.resolve(), Path.cwd()
+    return str(resolved.relative_to(here)) if resolved.is_relative_to(here) else str(resolved)

@@ -1,0 +1,294 @@
+"""`dataflow verify`: are these recordings what the code makes of them?"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from dataflow.cli.support.arguments import (
+    FLAG,
+    Json,
+    ModuleFolders,
+    Settings,
+    check_offset,
+    existing,
+    find_modules_in,
+    graph_file,
+    offset,
+    output_file,
+)
+from dataflow.cli.support.output import (
+    COULD_NOT_RUN,
+    DIFFERENT,
+    err,
+    fail,
+    friendly_errors,
+    out,
+    own_traceback,
+    print_json,
+    say,
+)
+from dataflow.cli.support.run_options import Paranoid, Quiet
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from dataflow.verification.gate import Baseline, Checked
+    from dataflow.verification.report import VerifyReport
+
+_GATE = "Regression gate"
+MOST_JOBS = 1024
+
+
+def verify(
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING", help="Recordings (.mcap), or folders of them.")
+    ],
+    graph: Annotated[
+        Path | None,
+        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
+    ] = None,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    first: Annotated[
+        str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="OPERATOR", help="Only this operator; may be given several times."),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            "--tolerance",
+            metavar="T",
+            help="Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
+            "inputs. Reported as within tolerance, never as identical.",
+        ),
+    ] = None,
+    start: Annotated[
+        float | None,
+        typer.Option(
+            "--start",
+            metavar="TIME",
+            parser=offset,
+            help="Begin so long after the recording's first message (seconds, or 500ms, 2min), from the states that it "
+            "holds there.",
+        ),
+    ] = None,
+    baseline: Annotated[
+        Path | None,
+        typer.Option(
+            "--baseline",
+            metavar="FILE.json",
+            rich_help_panel=_GATE,
+            help="Outcomes that are accepted although they are not what was recorded.",
+        ),
+    ] = None,
+    accept: Annotated[
+        bool,
+        typer.Option(
+            "--accept", metavar=FLAG, rich_help_panel=_GATE, help="Write what differs now into the --baseline file."
+        ),
+    ] = False,
+    junit: Annotated[
+        Path | None,
+        typer.Option(
+            "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs",
+            "-j",
+            metavar="N",
+            help="Worker processes. Default: one for each core, fewer where little is to do.",
+        ),
+    ] = None,
+    paranoid: Paranoid = False,
+    quiet: Quiet = False,
+    one_process: Annotated[
+        bool, typer.Option("--one-process", metavar=FLAG, help="Deprecated: means --jobs 1.")
+    ] = False,
+    process_each: Annotated[
+        bool, typer.Option("--process-each", metavar=FLAG, help="Deprecated: has no effect.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Re-execute recorded runs by their firing records, and compare every output.
+
+    Every operator is fed from the recording, in worker processes that use no network. Its outputs, and the stored
+    messages, are compared with the recorded digests. A culprit (same inputs, other output) is shown with the field that
+    differs, and run once more, to see whether it differs alike each time.
+
+    Of a folder, every .mcap in it is verified, at any depth; one that cannot be read does not keep the others from it.
+
+    Exit codes:
+
+      0    identical, or within --tolerance, or as --baseline accepts
+      1    different, not wholly verifiable, or nothing verified
+      2    could not run (of several recordings: at least one), or an operator is not here any more
+      130  interrupted with Ctrl-C
+
+    Examples:
+
+      dataflow verify run.mcap
+      dataflow verify run.mcap --only odometry --json
+      dataflow verify run.mcap --only odometry --only mapper
+      dataflow verify run.mcap --from odometry --graph changed.yaml
+      dataflow verify run.mcap --tolerance 1e-5
+      dataflow verify run.mcap --start 60
+      dataflow verify runs/ --junit verify.xml
+      dataflow verify runs/ --baseline runs/accepted.json --accept
+    """
+    from dataflow.verification.workers.prestart import early_workers
+
+    with friendly_errors():
+        if one_process and process_each:
+            raise fail("--one-process and --process-each exclude each other")
+        if jobs is not None and (one_process or not 1 <= jobs <= MOST_JOBS):
+            raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}, without --one-process")
+        if one_process or process_each:
+            instead = "--jobs 1" if one_process else "nothing: each operator is fed from the recording"
+            say(f"[yellow]note:[/] {'--one-process' if one_process else '--process-each'} is deprecated; use {instead}")
+        only = only or None  # typer gives an empty list where there is none
+        if first is not None and only is not None:
+            raise fail("--from and --only exclude each other")
+        if graph is None and settings:
+            raise fail("--set changes a graph file: name it with --graph")
+        if tolerance is not None and not 0 <= tolerance < float("inf"):
+            raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
+        check_offset("--start", start)
+        if start is not None and baseline is not None:
+            raise fail("--start and --baseline exclude each other: a baseline is of whole recordings")
+        if accept and baseline is None:
+            raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
+        if accept and (first is not None or only is not None):
+            raise fail("--accept takes whole recordings: leave --from and --only out")
+        for target in recordings:
+            if not target.is_dir():
+                existing(target, "a recording")
+        if junit is not None:
+            output_file(junit, ".xml", overwrite=True, option="--junit")
+        if baseline is not None:
+            output_file(baseline, ".json", overwrite=True, option="--baseline")
+        with early_workers(1 if one_process else jobs) as early:  # while this process imports what it needs itself
+            from dataflow.graph import load_graph
+            from dataflow.verification.gate import Baseline, BaselineError, recordings_in
+
+            try:
+                known = None if baseline is None else Baseline.load(baseline)
+            except BaselineError as error:
+                raise fail(str(error)) from None
+            find_modules_in(path)
+            loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+            options: dict[str, Any] = {
+                "early": early,
+                "graph": loaded,
+                "first": first,
+                "only": only,
+                "tolerance": tolerance,
+                "start": start,
+                "jobs": 1 if one_process else jobs,
+                "paranoid": paranoid,
+            }
+            found = recordings_in(recordings)
+            single = len(recordings) == 1 and recordings[0] == found[0][0]
+            checked = _check(found, known, options, quiet=quiet, single=single)
+            _report(checked, single=single, json=json, junit=junit)
+            if known is not None:
+                _mind_baseline(known, checked, accept=accept, whole=not single)
+    raise typer.Exit(_exit_code(checked, known if accept else None))
+
+
+def _check(
+    targets: list[tuple[Path, str]], known: Baseline | None, options: dict[str, Any], *, quiet: bool, single: bool
+) -> list[Checked]:
+    from dataflow.verification.gate import check
+
+    checked = []
+    for number, (path, name) in enumerate(targets, start=1):
+        if not quiet and not single:
+            say(f"[dim]{number} of {len(targets)}: {escape(name)}[/]")
+        accepted = {} if known is None else known.of(path)
+        one = check(path, name, _verifier(options, quiet=quiet), accepted, options["graph"])
+        if one.not_in_graph:
+            names = escape(", ".join(one.not_in_graph))
+            say(f"[yellow]note:[/] {escape(name)}: recorded operators that the graph does not have: {names}")
+        checked.append(one)
+    return checked
+
+
+def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], VerifyReport]:
+    from dataflow.verification.verify import verify as verify_recording
+
+    if quiet:  # nothing is shown: what would show it is not imported
+        return partial(verify_recording, **options)
+    from dataflow.cli.support.progress import RunDisplay, shown
+
+    def verifier(path: Path) -> VerifyReport:
+        with shown(err, RunDisplay(err), quiet=quiet) as watch:
+            return verify_recording(path, watch=watch, **options)
+
+    return verifier
+
+
+def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | None) -> None:
+    from dataflow.cli.support.verdicts import explain, print_many, print_one, reservations
+
+    if single and checked[0].report is None:
+        [one] = checked
+        fail(one.error, details=own_traceback(one.details) if one.internal else one.details)
+    elif single and json:
+        print_json(checked[0].as_json())
+    elif single:
+        print_one(out, checked[0])
+    elif json:
+        print_json({"passed": all(c.passed for c in checked), "recordings": [c.as_json() for c in checked]})
+    else:
+        print_many(out, checked)
+    if junit is not None:
+        from dataflow.cli.support.junit import write_junit
+
+        write_junit(junit, checked, explain, reservations)
+
+
+def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, whole: bool) -> None:
+    """Says what the baseline names in vain; with `accept`, takes over what differs and says what that is."""
+    if not accept:
+        if whole and (unused := known.unused(checked)):
+            names = escape(", ".join(unused))
+            say(f"[yellow]note:[/] {escape(str(known.file))} names recordings that were not verified: {names}")
+        return
+    news = []
+    for one in checked:
+        if one.report is None:
+            continue
+        changed, refused = known.accept(one)
+        news += [f"{one.name}: {name}" for name in changed]
+        for name in refused:
+            say(
+                f"[yellow]not accepted:[/] {escape(one.name)}: {name} (not wholly verifiable, or different each time: "
+                "it could not be recognised again)"
+            )
+    known.save()
+    say(escape(f"accepted into {known.file}: " + ("; ".join(news) if news else "nothing new")))
+
+
+def _exit_code(checked: list[Checked], accepted: Baseline | None) -> int:
+    if any(c.report is None or c.report.absent for c in checked):
+        return COULD_NOT_RUN
+    if accepted is None or any(c.report is not None and (c.report.empty or c.report.changed) for c in checked):
+        return 0 if all(c.passed for c in checked) else DIFFERENT
+    left = [
+        j
+        for c in checked
+        for j in c.judged
+        if not j.passed and (not j.firm or accepted.of(c.path).get(j.operator) != j.outcome)
+    ]
+    return DIFFERENT if left else 0

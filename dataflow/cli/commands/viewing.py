@@ -1,0 +1,214 @@
+"""`dataflow view`: a recording, or a graph that runs."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from dataflow.cli.commands.live import GraphName, Wait, running_graph, say_followed
+from dataflow.cli.support.arguments import (
+    Clock,
+    End,
+    Every,
+    Overwrite,
+    Start,
+    Streams,
+    Without,
+    chosen_streams,
+    existing_recording,
+    output_file,
+)
+from dataflow.cli.support.drawing import Announcer, draw_recording, open_sink, report, showing, until_interrupted
+from dataflow.cli.support.output import fail, friendly_errors, say
+
+if TYPE_CHECKING:
+    from dataflow.graph import Graph
+    from dataflow.messages import Message
+    from dataflow.transport import RunningGraph, TapClient
+    from dataflow.view import Target
+
+LOOK_EVERY = 0.25
+"""Seconds between two looks at the log of the graph that is followed."""
+
+
+def view(
+    recording: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="RECORDING",
+            help="A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder. Without one: the running graph.",
+        ),
+    ] = None,
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            "--out",
+            "-o",
+            metavar="TARGET",
+            help="spawn: a window; serve: a page for a browser; FILE.rrd: a file; or the address of a viewer that "
+            "runs (rerun+http://127.0.0.1:9876/proxy).",
+        ),
+    ] = "spawn",
+    streams: Streams = None,
+    without: Without = None,
+    start: Start = None,
+    end: End = None,
+    clock: Clock = "auto",
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    every: Every = None,
+    overwrite: Overwrite = False,
+    modules: Annotated[
+        list[str] | None,
+        typer.Option("--import", metavar="MODULE", help="Import a module with visualisers first. May be repeated."),
+    ] = None,
+    until_end: Annotated[bool, typer.Option("--until-end", hidden=True)] = False,
+) -> None:
+    """Show a recording or a bag, or attach to a running graph.
+
+    A viewer can never slow the graph: it skips what it cannot draw in time. A recording is shown whole.
+
+    Examples:
+
+      dataflow view run.mcap
+      dataflow view run.mcap --to run.rrd --start 5 --end 10
+      dataflow view run.mcap --to run.rrd --every 0
+      dataflow view run.mcap --to serve --stream "camera/*"
+      dataflow view drive.bag --to drive.rrd
+      dataflow view --graph rgbd_perception --to serve
+    """
+    with friendly_errors():
+        _import(modules or ())
+        if recording is not None:
+            if graph is not None or wait:
+                raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
+            path = existing_recording(recording)
+            target = _target(to, overwrite)
+            report(*draw_recording(path, target, streams, without, start, end, clock, every))
+        else:
+            if start is not None or end is not None:
+                raise fail("--start and --end are about a recording; name one")
+            _view_running(_target(to, overwrite), streams, graph, wait, every, until_end=until_end)
+
+
+def _import(modules: Iterable[str]) -> None:
+    for name in modules:
+        try:
+            importlib.import_module(name)
+        except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
+            raise fail(f"--import {name}: {type(error).__name__}: {error}") from error
+
+
+def _target(to: str, overwrite: bool) -> Target:
+    from dataflow.view import Save, Spawn, parse_target
+
+    target = parse_target(to)
+    if isinstance(target, Save):
+        output_file(target.path, ".rrd", overwrite=overwrite, option="--to")
+    if isinstance(target, Spawn):
+        require_display()
+    return target
+
+
+def require_display() -> None:
+    """An error, with what to use instead, where no window can be opened."""
+    from dataflow.view.process import display_problem
+
+    if (problem := display_problem()) is not None:
+        raise fail(
+            f"cannot open a viewer window: {problem}; use serve (a page for a browser) or a file name ending in .rrd"
+        )
+
+
+def _view_running(
+    target: Target, streams: list[str] | None, name: str | None, wait: float, every: float | None, *, until_end: bool
+) -> None:
+    from dataflow.client.attach import graph_of, tap
+    from dataflow.graph.sections import PLACE_FRAMES
+
+    if wait:
+        importlib.import_module("dataflow.view.sink")  # takes long; done when the graph begins, which may be short
+    found = running_graph(name, wait)
+    running = graph_of(found)
+    chosen = chosen_streams(streams, running.streams, running.namespace)
+    others = [name for name, stream in running.streams.items() if set(stream.types) & set(PLACE_FRAMES)]
+    others = [name for name in others if name not in chosen]
+    with tap(found, [f"/{name}" for name in (*chosen, *others)] if streams else ["**"]) as client:
+        say_followed(found)
+        _draw_running(target, client, found, running, chosen, others, every, logs=not streams, until_end=until_end)
+
+
+def _draw_running(
+    target: Target,
+    client: TapClient,
+    found: RunningGraph,
+    running: Graph,
+    chosen: list[str],
+    others: list[str],
+    every: float | None,
+    *,
+    logs: bool,
+    until_end: bool,
+) -> None:
+    """Draws the streams that were chosen until the graph ends, and what it logs with them.
+
+    `others` are not shown, but place frames.
+    """
+    from dataflow.client.attach import still_runs
+    from dataflow.names import logs_key
+    from dataflow.recording import LogLine
+    from dataflow.transport.log_file import LogFollower
+    from dataflow.view import Serve, as_alarm
+
+    log_stream = logs_key(running.namespace)
+    with open_sink(target, every) as sink, closing(LogFollower(found.pid)) as follower:
+        types = _types(running, [*chosen, *others], log_stream if logs else None)
+        sink.open(types, showing(running, None if logs else chosen), hidden=others)
+        Announcer(sink).announce()
+        clock, look_due = 0, 0.0
+        while True:
+            taken = client.take(timeout=0.5)
+            if logs and time.monotonic() >= look_due:
+                look_due = time.monotonic() + LOOK_EVERY
+                for value in follower.lines():
+                    sink.log(log_stream, as_alarm(LogLine.from_json(value), clock))
+            if taken is None:
+                if not still_runs(found):
+                    break
+                continue
+            envelope = taken.decode()
+            if envelope.message is not None:
+                clock = max(clock, envelope.message.stamp)
+                sink.log(taken.stream, envelope.message)
+        client.close()
+        if isinstance(target, Serve) and not until_end:
+            say("the graph has ended; still serving until Ctrl-C")
+            until_interrupted()
+        complete = sink.close(timeout=60.0)
+    report(sink, complete)
+
+
+def _types(running: Graph, chosen: list[str], logs: str | None) -> dict[str, type[Message]]:
+    """The class that each stream is drawn as; `logs`: the stream of the lines that are logged, if they are drawn."""
+    from dataflow.client.attach import types_of
+    from dataflow.messages import Alarm, Message, MessageError
+
+    for stream in chosen:
+        try:
+            running.message_types(stream)  # with the module come the visualisers of its types
+        except MessageError as error:
+            say(f"[yellow]{escape(str(error))}; drawn by its fields[/]")
+    class_of = types_of(running)
+    first = {name: running.streams[name].types[0] for name in chosen}
+    drawn: dict[str, type[Message]] = {
+        name: Message if schema == "Message" else class_of(schema) for name, schema in first.items()
+    }
+    return drawn if logs is None else drawn | {logs: Alarm}

@@ -1,0 +1,189 @@
+"""The commands of this package. The module of each is imported when that command, or the help of all, is asked for."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, MutableMapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import typer
+
+from dataflow.cli.support.values import take_plainly
+
+MAKE = "Run, replay, verify"
+LOOK = "Look at graphs, operators and recordings"
+MATERIAL = "Work with recordings and bags"
+FOLLOW = "Follow a running graph"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A function of a module beside this one, as a command."""
+
+    home: str
+    """The module and the function: "replay:replay"."""
+    panel: str | None = None
+    """The heading under which the help lists it."""
+    name: str = ""
+    """By default that of the function."""
+    ignore_unknown_options: bool = False
+
+    @property
+    def called(self) -> str:
+        """The word that calls it."""
+        return self.name or self.home.partition(":")[2]
+
+    def make(self) -> Any:
+        """The command as Typer's group takes it."""
+        app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+        self.add_to(app)
+        return typer.main.get_command(app)
+
+    def add_to(self, app: typer.Typer) -> None:
+        """Registers the function with an application."""
+        module, _, function = self.home.partition(":")
+        called: Callable[..., None] = getattr(import_module(f"dataflow.cli.commands.{module}"), function)
+        settings = {"ignore_unknown_options": True} if self.ignore_unknown_options else {}
+        app.command(
+            self.called, rich_help_panel=self.panel, help=paragraphs(called.__doc__ or ""), context_settings=settings
+        )(called)
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """Commands under one word."""
+
+    called: str
+    panel: str
+    help: str
+    members: tuple[Command, ...]
+
+    def make(self) -> Any:
+        """The group as Typer's group takes it."""
+        app = typer.Typer(
+            name=self.called,
+            no_args_is_help=True,
+            help=paragraphs(self.help),
+            add_completion=False,
+            rich_markup_mode="rich",
+            pretty_exceptions_enable=False,
+        )
+        for member in self.members:
+            member.add_to(app)
+        group = typer.main.get_command(app)
+        group.rich_help_panel = self.panel  # type: ignore[attr-defined]
+        return group
+
+
+BUILT_IN: tuple[Command | Family, ...] = (
+    Command("demo:demo", MAKE),
+    Command("run:run", MAKE),
+    Command("replay:replay", MAKE),
+    Command("verification:verify", MAKE),
+    Command("inspection:check", LOOK),
+    Command("inspection:show", LOOK),
+    Command("doctor:doctor", LOOK),
+    Command("completion:completion", LOOK),
+    Command("inspection:operators", LOOK),
+    Command("messages:messages", LOOK),
+    Command("demo:graphs", LOOK),
+    Command("recordings:info", LOOK),
+    Command("recordings:diff", LOOK),
+    Command("convert:convert", MATERIAL),
+    Command("editing:cut", MATERIAL),
+    Command("editing:filter_", MATERIAL, "filter"),
+    Command("editing:split", MATERIAL),
+    Command("merging:merge", MATERIAL),
+    Command("merging:recover", MATERIAL),
+    Command("latency:latency", LOOK),
+    Command("lint:lint", LOOK),
+    Command("viewing:view", LOOK),
+    Command("foxglove:foxglove", LOOK),
+    Command("live:list_running", FOLLOW, "list"),
+    Command("live:echo", FOLLOW),
+    Command("live:hz", FOLLOW),
+    Command("top:top", FOLLOW),
+    Command("logs:logs", FOLLOW),
+    Command("pub:pub", FOLLOW),
+    Command("recording:record", FOLLOW),
+    Command("playback:playback", FOLLOW),
+    Command("recording:trigger", FOLLOW),
+    Family(
+        "new",
+        MAKE,
+        """Begin an operator, a graph or a project, with tests that pass.
+
+        Examples:
+
+          dataflow new project my_robot
+          dataflow new operator NearestObstacle
+          dataflow new graph obstacle_watch
+        """,
+        (Command("new:operator"), Command("new:graph"), Command("new:project")),
+    ),
+    Family(
+        "param",
+        FOLLOW,
+        """Read and change the parameters of a running graph.
+
+        Examples:
+
+          dataflow param list
+          dataflow param set detector.score_threshold 0.5
+          dataflow param dump tuned.yaml
+        """,
+        (
+            Command("param:set_", name="set", ignore_unknown_options=True),  # so that -1 is a value
+            Command("param:get"),
+            Command("param:list_", name="list"),
+            Command("param:dump"),
+            Command("param:load"),
+        ),
+    ),
+)
+
+
+class Commands(MutableMapping[str, Any]):
+    """The commands of a group by name, each of ours made when it is first looked up."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, Command | Family] = {each.called: each for each in BUILT_IN}
+        self._made: dict[str, Any] = dict.fromkeys(self._waiting)  # keeps the order
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self._waiting:
+            self._made[name] = made = self._waiting.pop(name).make()
+            for command in (made, *getattr(made, "commands", {}).values()):
+                for param in command.params:
+                    take_plainly(param)
+        return self._made[name]
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        self._waiting.pop(name, None)
+        self._made[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._made[name]
+        self._waiting.pop(name, None)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._made
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._made)
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+
+def paragraphs(text: str) -> str:
+    """A docstring with the lines of each paragraph joined, so that it wraps where the terminal ends; lists stay.
+
+    An empty paragraph follows the first: Typer takes the rest for a docstring and would strip the indentation of
+    examples that stand alone in it.
+    """
+    first, *rest = (block for block in inspect.cleandoc(text).split("\n\n") if block.strip())
+    blocks = (first, "", *rest) if rest else (first,)
+    return "\n\n".join(block if block.startswith(" ") else " ".join(block.split("\n")) for block in blocks)

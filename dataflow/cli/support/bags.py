@@ -1,0 +1,166 @@
+"""Bags of other systems on the command line: replayed through a graph, described."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn
+from rich.text import Text
+
+from dataflow.cli.support.arguments import span, window
+from dataflow.cli.support.execution import Outputs, execute
+from dataflow.cli.support.output import DIFFERENT, count, err, out, plural, print_json, say, seconds, shown, size, table
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from dataflow.graph import Graph
+    from dataflow.interop.playing import Matching
+    from dataflow.interop.streams import BagStreams
+
+
+def replay_bag(
+    path: Path,
+    graph: Graph,
+    maps: Sequence[str],
+    clock: Literal["auto", "header", "log"],
+    start: float | None,
+    end: float | None,
+    outputs: Outputs,
+    options: dict[str, Any],
+    *,
+    strict: bool = False,
+    began: float,
+    json: bool,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Replays a bag through a graph, and says what of it is played, by which clock, and what was repaired."""
+    from dataflow.editing.untouched import keep_untouched
+    from dataflow.interop.playing import match
+    from dataflow.interop.streams import BagStreams
+    from dataflow.recording.layout import BAG
+    from dataflow.supervision.replay import plan_replay
+    from dataflow.supervision.run import replay
+
+    matching = match(path, graph, maps)
+    with _counting(quiet) as watch, BagStreams(path, matching.played(), clock, watch=watch, strict=strict) as opened:
+        if not quiet:
+            say_what_is_played(matching, opened)
+        whole = span(opened, plan_replay(opened, graph).streams)
+        begin, finish = window(whole, start, end, path)
+        shown = None if whole is None else (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
+        metadata = {BAG: opened.facts()}
+        report = execute(
+            lambda watch: replay(opened, graph=graph, start=start, end=end, watch=watch, metadata=metadata, **options),
+            graph,
+            outputs,
+            shown,
+            began=began,
+            json=json,
+            quiet=quiet,
+            verbose=verbose,
+        )
+        if outputs.record is not None:
+            played = {p.topic for p in opened.played.values()}
+            kept = keep_untouched(outputs.record, path, played, begin, finish, shift=opened.clock.shift)
+            if kept and not quiet:
+                names = ", ".join(sorted(kept))
+                say(f"[dim]kept as they are: {plural(sum(kept.values()), 'message')} of {escape(names)}[/]")
+        if start is None and end is None:
+            _say_what_was_not_read(opened, {name: held for name, (held, _) in report.streams.items()})
+        if opened.account.short:
+            raise typer.Exit(DIFFERENT)
+
+
+def _say_what_was_not_read(opened: BagStreams, delivered: Mapping[str, int]) -> None:
+    """Of topics that came with fewer messages than the bag holds of them: how many, and why."""
+    missing = {
+        played.topic
+        for stream, played in opened.played.items()
+        if not played.static and delivered.get(stream, 0) < opened.streams[stream].count
+    }
+    opened.look_for_unread(missing)
+    for topic, unread in opened.account.unread.items():
+        say(
+            f"[yellow]{escape(topic)}: {plural(unread.count, 'message')} that cannot be read passed over, the first: "
+            f"{escape(unread.reason)}[/]"
+        )
+
+
+def say_what_is_played(matching: Matching, opened: BagStreams) -> None:
+    """A line for each stream, one for the clock, one for each repair, on standard error."""
+    for line in opened.account.lines():
+        say(f"[yellow]{escape(line)}[/]")
+    names = {wanted.stream: wanted.name for wanted in matching.wanted}
+    for stream, played in opened.played.items():
+        info = opened.streams[stream]
+        what = opened.static_notes.get(stream, "static" if played.static else plural(info.count, "message"))
+        say(f"[dim]{escape(played.topic)} → {escape(names[stream])}: {played.type}, {what}[/]")
+        if lost := opened.losses(played.topic):
+            say(f"[yellow]{escape(played.topic)}: no place in {played.type} for {escape(', '.join(lost))}[/]")
+    what = "header stamps" if opened.clock.kind == "header" else "log times"
+    say(f"[dim]stamped with {what}: {escape(opened.clock.why)}[/]")
+
+
+@contextmanager
+def _counting(quiet: bool) -> Iterator[Callable[[int], None] | None]:
+    """Shows how many messages the first pass over a bag has seen."""
+    if quiet or not err.is_terminal:
+        yield None
+        return
+    with Progress(SpinnerColumn(), TextColumn("{task.description}"), console=err, transient=True) as progress:
+        task = progress.add_task("reading times")
+        yield lambda seen: progress.update(task, description=f"reading times · {count(seen)} messages")
+
+
+def describe_bag(path: Path, *, json: bool) -> None:
+    """Prints the topics of a bag: types, counts, rates, and what each can be played as."""
+    from dataflow.interop.bag import shortfalls
+    from dataflow.interop.opening import open_bag
+    from dataflow.interop.playing import readings_of
+    from dataflow.interop.summary import summaries, total
+    from dataflow.sync.stamps import format_stamp
+
+    bag = open_bag(path)
+    try:
+        rows = summaries(bag, readings_of(bag))
+        kind, notes = bag.kind, (*bag.notes, *shortfalls(bag))
+    finally:
+        bag.close()
+    shown(notes)
+    whole = total(rows)
+    if json:
+        facts = {"path": str(path), "format": kind, "notes": list(notes), "bytes": _bytes(path)}
+        print_json(facts | {"topics": [row.as_json() for row in rows]} | whole.as_json())
+        return
+    grid = table("", "")
+    grid.box, grid.show_header = None, False
+    for name, value in (
+        ("file", str(path)),
+        ("format", kind),
+        ("size", size(_bytes(path))),
+        *(("note", note) for note in notes),
+        *((("from", format_stamp(whole.first)), ("to", format_stamp(whole.last))) if whole.messages else ()),
+        ("duration", seconds(whole.duration * 1e-9)),
+        ("messages", count(whole.messages)),
+    ):
+        grid.add_row(Text(name, style="dim"), Text(value))
+    out.print(grid)
+    numbers = ("messages", "Hz")
+    made = table("topic", "type", *numbers, "read as", "", right=numbers)
+    for row in rows:
+        rate = "" if row.rate is None else f"{row.rate:.2f}"
+        notes_of = ", ".join(row.notes)
+        made.add_row(*map(Text, (row.topic, row.type, count(row.count), rate, " or ".join(row.read_as), notes_of)))
+    out.print(made)
+
+
+def _bytes(path: Path) -> int:
+    files = [path] if path.is_file() else [p for p in path.iterdir() if p.is_file()]
+    return sum(p.stat().st_size for p in files)

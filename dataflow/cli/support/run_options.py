@@ -1,0 +1,120 @@
+"""Options that `dataflow run` and `dataflow replay` share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from dataflow.cli.support.arguments import FLAG, number
+
+PLACEMENT, OUTPUT = "Placement", "Results"
+
+OneProcess = Annotated[
+    bool,
+    typer.Option("--one-process", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run all operators in one process."),
+]
+ProcessEach = Annotated[
+    bool,
+    typer.Option(
+        "--process-each", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run every operator in a process of its own."
+    ),
+]
+Place = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--place",
+        metavar="OPERATOR=PROCESS",
+        rich_help_panel=PLACEMENT,
+        help="Run OPERATOR in the process of that name. May be repeated.",
+    ),
+]
+Record = Annotated[
+    Path | None,
+    typer.Option(
+        "--record", metavar="FILE.mcap", rich_help_panel=OUTPUT, help="Record the graph's streams and firings."
+    ),
+]
+Compression = Annotated[
+    Literal["zstd", "lz4", "none"] | None,
+    typer.Option(
+        "--compression",
+        metavar="zstd|lz4|none",
+        rich_help_panel=OUTPUT,
+        help="How the recording is compressed: zstd gives the smallest file, lz4 takes less CPU time. Default: zstd.",
+    ),
+]
+View = Annotated[
+    str | None,
+    typer.Option(
+        "--view",
+        metavar="TARGET",
+        rich_help_panel=OUTPUT,
+        help="spawn: a viewer window; serve: a page for a browser; FILE.rrd: save everything that is shown.",
+    ),
+]
+Open = Annotated[
+    bool,
+    typer.Option(
+        "--open",
+        metavar=FLAG,
+        rich_help_panel=OUTPUT,
+        help="With --view FILE.rrd: open the saved file in the viewer when there is a display.",
+    ),
+]
+Replace = Annotated[
+    bool,
+    typer.Option("--overwrite", metavar=FLAG, rich_help_panel=OUTPUT, help="Replace output files that exist."),
+]
+Json = Annotated[
+    bool,
+    typer.Option("--json", metavar=FLAG, rich_help_panel=OUTPUT, help="Print the report, digests included, as JSON."),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        "--rate",
+        metavar="RATE",
+        parser=number(0.001, 1000, "1 is real time"),
+        help="Pace: 1 is real time. Default: as fast as the graph goes.",
+    ),
+]
+Step = Annotated[
+    bool, typer.Option("--step", metavar=FLAG, help="Begin paused: → or n makes a step, space lets it go on.")
+]
+Timeout = Annotated[
+    float,
+    typer.Option(
+        "--timeout",
+        metavar="SECONDS",
+        parser=number(0.1, 1e6, "seconds"),
+        help="Give up after so long without any progress, and when the operators take longer to be set up.",
+    ),
+]
+Live = Annotated[
+    bool,
+    typer.Option(
+        "--live",
+        metavar=FLAG,
+        help="Time does not wait: sources run by the clock, and operators that are too slow drop messages as their "
+        "`live:` policies say. Everything dropped is counted and recorded.",
+    ),
+]
+Paranoid = Annotated[
+    bool, typer.Option("--paranoid", metavar=FLAG, help="Catch operators that write into their inputs.")
+]
+LogLevel = Annotated[
+    str | None,
+    typer.Option(
+        "--log-level",
+        metavar="LEVEL",
+        help="The least level that operators' loggers hand on: debug, info, warning, error. Default: info. "
+        "Environment: DATAFLOW_LOG_LEVEL.",
+    ),
+]
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", metavar=FLAG, help="Report every operator, every figure, every loss."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]

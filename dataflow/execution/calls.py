@@ -1,0 +1,175 @@
+"""Calls an operator: the one way for a run, a live run and a re-execution, so that they cannot drift apart.
+
+Before every call the random generators are seeded (`dataflow.execution.generators.seeding`), so that it depends on its
+arguments and the operator's state alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from dataflow.execution.failure import RAISED, OperatorFailure
+from dataflow.execution.generators.loading import LOADS
+from dataflow.execution.generators.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
+from dataflow.execution.generators.shared_generators import AT_WORK
+from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.execution.threads import limit_threads_again
+from dataflow.graph.model import Node
+from dataflow.messages.base import Message
+from dataflow.operator import Context, Operator, OutputError, Outputs, outputs_of
+from dataflow.sync import NEVER, Entry, Firing, InputValue
+
+Place = tuple[int, int]
+"""The place of a call that is no firing: (incarnation, stamp)."""
+
+
+class Calls:
+    """One operator. `version` is that of the seeding; `operator` may be replaced, when it is restarted."""
+
+    def __init__(self, node: Node, operator: Operator, seed: int, *, version: int = VERSION) -> None:
+        self.node, self.operator, self.seed, self.version = node, operator, seed, version
+        self._seeded_by = f"{seed}/{node.name}/"
+
+    def setup(self) -> dict[str, Message]:
+        """`setup()`, then the messages of the static outputs. Raises `OperatorFailure`."""
+        try:
+            with AT_WORK.call(self.node.name, NEVER):
+                self._seed(firing_seed(self.seed, self.node.name, NEVER))
+                self.operator.setup()
+                limit_threads_again()
+                return self._static_outputs()
+        except RAISED as error:
+            raise OperatorFailure(self.node.name, "setup()", error) from error
+
+    def static_outputs(self) -> dict[str, Message]:
+        """The messages of the static outputs of an operator that is set up. Raises `OperatorFailure`."""
+        try:
+            with AT_WORK.call(self.node.name, NEVER):
+                self._seed(firing_seed(self.seed, self.node.name, NEVER))
+                return self._static_outputs()
+        except RAISED as error:
+            raise OperatorFailure(self.node.name, "static_outputs()", error) from error
+
+    def process(self, firing: Firing) -> dict[str, Message]:
+        """Returns what `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
+        AT_WORK.fires = True
+        AT_WORK.operator, AT_WORK.stamp = self.node.name, firing.stamp
+        AT_WORK.begun += 1
+        try:
+            seed = FiringSeed(self._seeded_by, firing.stamp)
+            seed_generators(seed, self.version)
+            self.operator.seed_rng(seed)
+            return outputs_of(self.operator, _call(self.operator, firing))
+        finally:
+            LOADS.seed = None
+            AT_WORK.ended += 1
+
+    def reset(self, input: str, place: Place) -> None:
+        """`on_reset()`. Raises what the operator raises."""
+        with AT_WORK.call(self.node.name, place[1]):
+            self._seed_change(f"reset {input}", place)
+            self.operator.on_reset(input)
+
+    def parameter(self, name: str, value: Any, place: Place) -> Any:
+        """Sets a parameter, which calls `on_parameter()`; its value as validated, in plain form.
+
+        Raises `ParameterError` and what the operator raises.
+        """
+        with AT_WORK.call(self.node.name, place[1]):
+            self._seed_change(f"param {name}", place)
+            self.operator.set_parameter(name, value)
+            return self.operator.params.model_dump(mode="json")[name]
+
+    def snapshot(self, place: Place) -> bytes | None:
+        """The state, packed; None where the operator gives none. Raises `OperatorFailure`."""
+        try:
+            with AT_WORK.call(self.node.name, place[1]):
+                self._seed_change("snapshot", place)
+                state = self.operator.snapshot()
+                return None if state is None else pack_state(state)
+        except RAISED as error:
+            raise OperatorFailure(self.node.name, f"snapshot() after stamp {place[1]}", error) from error
+
+    def restore(self, state: bytes, place: Place) -> None:
+        """Takes over a packed state. Raises `OperatorFailure`."""
+        try:
+            with AT_WORK.call(self.node.name, place[1]):
+                self._seed_change("restore", place)
+                self.operator.restore(unpack_state(state))
+        except RAISED as error:
+            raise OperatorFailure(self.node.name, "restore()", error) from error
+
+    def summary(self, place: Place) -> dict[str, float | int | str]:
+        """Returns what the operator sums up, as plain values. Raises `OperatorFailure`."""
+        with AT_WORK.call(self.node.name, place[1]):
+            self._seed_change("summary", place)
+            return summary_of(self.operator, self.node.name)
+
+    def _static_outputs(self) -> dict[str, Message]:
+        statics = dict(self.operator.static_outputs())
+        for name, message in statics.items():
+            port = self.operator.spec.outputs.get(name)
+            if port is None or not port.static:
+                raise OutputError(f"{self.node.name}: static_outputs() gave {name!r}, which is no static output port")
+            if not isinstance(message, port.types):
+                raise OutputError(f"{self.node.name}.{name} is a {port.type_text()}, got {type(message).__name__}")
+        return statics
+
+    def _seed_change(self, what: str, place: Place) -> None:
+        if self.version >= 2:
+            self._seed(change_seed(self.seed, self.node.name, what, *place))
+
+    def _seed(self, seed: int) -> None:
+        seed_generators(seed, self.version)
+        self.operator.seed_rng(seed)
+
+
+def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
+    """Returns what an operator sums up, as plain values. Raises `OperatorFailure`."""
+    try:
+        found = dict(operator.summary())
+        return {str(key): item if isinstance(item, str) else np.asarray(item).item() for key, item in found.items()}
+    except Exception as error:
+        raise OperatorFailure(name, "summary()", error) from error
+
+
+def entries_of(given: InputValue) -> Sequence[Entry]:
+    """All entries an input was given, in the order `process()` sees them."""
+    match given:
+        case None:
+            return ()
+        case Entry():
+            return (given,)
+        case Mapping():
+            return tuple(given.values())
+        case _:
+            return given
+
+
+def _call(operator: Operator, firing: Firing) -> Outputs:
+    if firing.kind == "finish":
+        return operator.finish()
+    arguments: dict[str, Any] = {}
+    given = firing.inputs
+    for name, absent in operator.spec.absent.items():
+        value = given.get(name, absent)
+        arguments[name] = value.value if value.__class__ is Entry else _value_of(value)
+    if operator.spec.takes_context:
+        arguments["context"] = Context(firing.stamp, firing.tick, firing.stale, firing.late)
+    return operator.process(**arguments)
+
+
+def _value_of(given: InputValue) -> Any:
+    """Returns what `process()` gets: a message, None, a tuple of messages, or a dict from stream to message."""
+    match given:
+        case None:
+            return None
+        case Entry():
+            return given.value
+        case Mapping():
+            return {stream: entry.value for stream, entry in given.items()}
+        case _:
+            return tuple(entry.value for entry in given)

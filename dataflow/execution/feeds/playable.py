@@ -1,0 +1,39 @@
+"""Recorded streams that stand in for sources, whatever they were recorded with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from dataflow.recording.streams.entries import Recorded
+from dataflow.recording.streams.streams import StreamInfo
+
+
+class PlayableStreams(Protocol):
+    """Streams of messages by name, read in the order of stamps: a recording, or a bag of another system.
+
+    `metadata`: what the file says of the run that made it, as recordings have it; empty where there was none.
+    """
+
+    path: Path
+    streams: Mapping[str, StreamInfo]
+    metadata: Mapping[str, Mapping[str, str]]
+
+    @property
+    def torn(self) -> bool:
+        """Tells whether the file has no proper end."""
+
+    def messages(
+        self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None
+    ) -> Iterator[Recorded]:
+        """Messages with start ≤ stamp ≤ end (ns), merged by (stamp, stream); static streams first and whole."""
+
+    def stamps(self, stream: str, start: int | None = None, end: int | None = None) -> Iterator[int]:
+        """The stamps of what `messages()` gives of one stream, in that order."""
+
+    def opening(self) -> Mapping[str, Any] | None:
+        """Plain values by which another process opens the same streams; None where the path alone suffices."""
+
+    def close(self) -> None:
+        """Closes the file. Idempotent."""

@@ -1,0 +1,1 @@
+"""Random generators, seeded before every call of an operator."""

@@ -1,0 +1,74 @@
+"""Seeds every random generator before a call of an operator, so that the call depends on nothing that ran before it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Final, SupportsInt
+
+import xxhash
+
+from dataflow.execution.generators import lazy_numpy, lazy_random
+from dataflow.execution.generators.libraries import seed_libraries
+from dataflow.execution.generators.loading import LOADS
+
+VERSION: Final = 3
+"""The scheme by which calls are seeded; recordings name it, and re-execution follows the one they name.
+
+1: `setup()`, `process()` and `finish()` are seeded. `on_reset()`, `on_parameter()`, `snapshot()`, `restore()` and
+   `summary()` go on with what the call before has left. Recordings that name no version are of this one.
+2: each of these is seeded too, from what it is, its incarnation and its stamp.
+3: a library that a call loads is seeded in that call, and so are torch's generators on GPUs that it initialises; what
+   modules draw while they are loaded is taken back (`dataflow.execution.generators.loading`).
+"""
+
+FACT: Final = "seeding"
+"""The name of the version among a recording's facts about its run."""
+
+
+def version_of(run_facts: Mapping[str, str]) -> int:
+    """The version by which a recorded run was seeded. Raises ValueError for one that this code does not know."""
+    version = int(run_facts.get(FACT, "1"))
+    if not 1 <= version <= VERSION:
+        raise ValueError(f"the run's generators were seeded by version {version}; this code knows 1 to {VERSION}")
+    return version
+
+
+def firing_seed(graph_seed: int, operator: str, stamp: int) -> int:
+    """63 bits from (graph seed, operator, stamp); independent of grouping, machine and run."""
+    return int(FiringSeed(f"{graph_seed}/{operator}/", stamp))
+
+
+def change_seed(graph_seed: int, operator: str, what: str, incarnation: int, stamp: int) -> int:
+    """63 bits for a call that is no firing, such as `on_reset()`."""
+    text = f"{graph_seed}/{operator}/{what}/{incarnation}/{stamp}"
+    return xxhash.xxh3_64_intdigest(text.encode()) & (2**63 - 1)
+
+
+class FiringSeed:
+    """The seed of a firing, made from (graph seed, operator, stamp) when somebody asks for it as an integer."""
+
+    __slots__ = ("_of", "_stamp")
+
+    def __init__(self, of: str, stamp: int) -> None:
+        """`of`: `GRAPH_SEED/OPERATOR/`."""
+        self._of, self._stamp = of, stamp
+
+    def __int__(self) -> int:
+        return xxhash.xxh3_64_intdigest(f"{self._of}{self._stamp}".encode()) & (2**63 - 1)
+
+
+def seed_generators(seed: SupportsInt, version: int = VERSION) -> None:
+    """Seeds the global generators of Python, numpy and the libraries that are loaded, for a call that begins.
+
+    Those of Python and numpy are seeded when something draws from them, those of a library that the call loads when it
+    is loaded. `LOADS.seed = None` ends the call.
+    """
+    lazy_random.seed_lazily(seed)
+    lazy_numpy.seed_lazily(seed)
+    seed_libraries(seed)
+    if version >= 3:
+        LOADS.seed, LOADS.thread = seed, threading.get_ident()
+
+
+LOADS.follow(seed_libraries)

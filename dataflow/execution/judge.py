@@ -1,0 +1,100 @@
+"""Compares a re-execution with its records: what was repeated, what differs, and whose fault it is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import PurePath
+
+from dataflow.execution.calls import entries_of
+from dataflow.execution.failure import readable
+from dataflow.messages.base import Message
+from dataflow.records.comparison import Difference, Verification
+from dataflow.records.firing import WITHHELD, Emission, FiringRecord
+from dataflow.records.reading import Digests
+from dataflow.sync import Firing
+
+_ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
+
+
+class Judge:
+    """Compares what one operator does with its records, and keeps the result.
+
+    A difference is the operator's own when everything that it was given until then is known to be as recorded.
+    """
+
+    def __init__(self, operator: str, ports: tuple[str, ...], inputs: Digests) -> None:
+        self.result = Verification(operator)
+        self._ports, self._inputs = ports, inputs
+
+    def given(self, record: FiringRecord, firing: Firing) -> None:
+        """Looks at what a firing is given. A message whose digest was not recorded (a record that is lost) is not known
+        to be the recorded one."""
+        if self.result.tainted is None and not self._as_recorded(firing):
+            self.result.tainted = record.index
+
+    def outputs(self, record: FiringRecord, messages: Mapping[str, Message]) -> Iterator[tuple[str, Message, int]]:
+        """Compares what came out; yields port, message and recorded number of what was sent in the recorded run."""
+        for name, expected in zip(self._ports, record.outputs or (None,) * len(self._ports), strict=True):
+            got = messages.get(name)
+            if expected is None and got is None:
+                continue
+            self.result.outputs += 1
+            if expected is None or got is None:
+                self.differ(record, name, _word(expected), _word(got))
+            elif got.digest() != expected.digest:
+                self.differ(record, name, expected.digest.hex(), got.digest().hex())
+            if expected is not None and got is not None and expected.seq != WITHHELD:
+                yield name, got, expected.seq
+
+    def statics(self, record: FiringRecord, messages: Mapping[str, Message]) -> None:
+        """Compares the static messages of an operator that was restarted, which are not sent again."""
+        for name, expected in zip(self._ports, record.outputs, strict=True):
+            if expected is not None and (name not in messages or messages[name].digest() != expected.digest):
+                self.differ(record, name, expected.digest.hex(), "another static message")
+
+    def error(self, record: FiringRecord, error: BaseException | None) -> None:
+        """Compares what a call raised, if anything; addresses in memory, which texts may hold, are left out."""
+        expected = f"error: {record.detail.get('error', '')}" if record.outcome == "error" else "no error"
+        got = "no error" if error is None else f"error: {readable(error)}"
+        if _ADDRESS.sub("", expected) != _ADDRESS.sub("", got):
+            self.differ(record, "", expected, got)
+
+    def summary(self, record: FiringRecord, got: Mapping[str, float | int | str]) -> None:
+        """Compares what the operator sums up at its end: all that a sink makes."""
+        expected = record.detail["summary"]
+        name = next((n for n in (*expected, *got) if repr(expected.get(n)) != repr(got.get(n))), None)
+        if name is not None:
+            self.differ(record, "", *(f"summary {name}: {values.get(name, 'nothing')}" for values in (expected, got)))
+
+    def state(self, record: FiringRecord, packed: bytes | None) -> None:
+        """Compares a snapshot, if its state was not too large to be recorded."""
+        if "state" in record.detail and (packed or b"") != record.detail["state"]:
+            self.result.states += 1
+            self.differ(record, "", "the recorded state", "another state")
+
+    def files(self, record: FiringRecord, now: Mapping[str, str]) -> None:
+        """Notes files whose content is that of no file of the same name that was read then, wherever that lay."""
+        known = {(PurePath(file).name, digest) for file, digest in record.detail.get("files", {}).items()}
+        changed = [file for file, digest in now.items() if (PurePath(file).name, digest) not in known]
+        self.result.files_changed = sorted(changed)
+
+    def differ(self, record: FiringRecord, port: str, expected: str, got: str) -> None:
+        """Notes one difference."""
+        self.result.differing += 1
+        if self.result.first is None:
+            self.result.own_fault = self.result.tainted is None
+            self.result.first = Difference(
+                record.index, record.kind, record.stamp, port, expected, got, record.incarnation
+            )
+
+    def _as_recorded(self, firing: Firing) -> bool:
+        return all(
+            self._inputs.get(entry.stream, {}).get((entry.incarnation, entry.seq)) == entry.digest
+            for given in firing.inputs.values()
+            for entry in entries_of(given)
+        )
+
+
+def _word(emission: Emission | Message | None) -> str:
+    return "nothing" if emission is None else f"a message at stamp {emission.stamp}"

@@ -1,0 +1,348 @@
+"""Runs one operator in a live run, where time will not wait for it.
+
+The aligner is the same as in a replay. In front of it stand bounded queues with the operator's declared policy, and a
+clock that gives up waiting: when an input's `wait` has run out, its frontier is forced. All of this only changes which
+messages reach which firing; the firing records say which, so a live run can be repeated exactly.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dataflow.execution.absent import without_absent
+from dataflow.execution.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
+from dataflow.execution.earlier import EarlierCounts
+from dataflow.execution.event_time import EventTime
+from dataflow.execution.failure import RAISED, OperatorFailure
+from dataflow.execution.log import FiringLog, unlisted
+from dataflow.execution.ports import Emitter
+from dataflow.execution.restarts import Restarts, close_quietly
+from dataflow.execution.runner import MOST_TICKS, OperatorRunner
+from dataflow.graph.model import Node
+from dataflow.operator import Operator
+from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
+from dataflow.sync.single import make_aligner
+
+MOST_TRIED = 256
+"""Messages and waits that are over, none of which decides a firing, in one step. A timer that falls behind drops its
+ticks one by one, while new ones come due: its process would never look at anything else."""
+
+Fault = Callable[[Firing], BaseException | None]
+"""A fault on purpose: is asked before each firing, may take its time, and gives an error to fail with instead."""
+
+
+class LiveRunner(OperatorRunner):
+    """One operator in a live run. It outlives its failures as its restart policy allows.
+
+    A failed operator is restarted after the back-off and goes on with what is then in its queues; its streams begin a
+    new incarnation. `on_failure` is told of every failure that is outlived.
+    """
+
+    keeps_time = True
+
+    def __init__(
+        self,
+        node: Node,
+        emitter: Emitter,
+        *,
+        static: frozenset[str],
+        seed: int = 0,
+        paranoid: bool = False,
+        operator: Operator | None = None,
+        snapshots: int | None = None,
+        clock: Clock | None = None,
+        event_clock: EventClock = time.time_ns,
+        on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
+        fault: Fault = lambda firing: None,
+    ) -> None:
+        more: dict[str, Any] = {"paranoid": paranoid, "operator": operator, "snapshots": snapshots}
+        super().__init__(node, emitter, static=static, seed=seed, lossy=True, **more)
+        triggers = {
+            stream: port.name
+            for port in self.spec.triggers
+            for stream in node.inputs.get(port.name, ())
+            if stream not in static
+        }
+        self._log = DropLog()  # of what did not reach an aligner
+        self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
+        clock = clock or time.monotonic
+        self._time = EventTime(event_clock)
+        self.patience = Patience(node.live.wait, clock, self._time.until)
+        self.restarts = Restarts(node.live.restart, clock)
+        self._timeouts: Counter[str] = Counter()
+        self._refused: Counter[str] = Counter()
+        self._earlier = EarlierCounts()
+        self._static = static
+        self._statics: dict[str, Entry] = {}
+        self._on_failure, self._fault = on_failure, fault
+        self._seen: dict[str, tuple[int, int]] = {}  # stream → incarnation, last stamp that the aligner was given
+        self._jumped: dict[str, int] = {}  # producer → incarnation since its clock jumped back
+        self._changed: dict[str, Any] = {}
+        self._told = True
+        """True when the aligner may have something to decide: it was told something since it had not."""
+
+    # Counts
+
+    @property
+    def drops(self) -> Mapping[tuple[str, str], int]:
+        withheld = {(f"→ {port}", "non_monotonic"): n for port, n in self.ports.withheld.items()}
+        return self._earlier.drops + Counter(self.aligner.drops) + self._log.counts + Counter(withheld)
+
+    @property
+    def timeouts(self) -> Mapping[str, int]:
+        return self._timeouts
+
+    @property
+    def late(self) -> Mapping[str, int]:
+        return self._earlier.late + Counter(self.aligner.late)
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        return self._refused
+
+    @property
+    def restarted(self) -> int:
+        return self.restarts.total
+
+    def take_drops(self) -> tuple[list[Drop], Mapping[tuple[str, str], int]]:
+        mine, more = self._log.take(), Counter(self._log.take_unlisted())
+        theirs, others = super().take_drops()
+        return [*mine, *theirs], more + Counter(others)
+
+    def has_drops(self) -> bool:
+        return self._log.pending or self.aligner.has_drops()
+
+    # What streams say
+
+    def push(self, stream: str, entry: Entry) -> None:
+        if stream in self._static:
+            self._statics[stream] = Entry(entry.stamp, entry.value, entry.seq, entry.incarnation, entry.digest, stream)
+        elif self._jumped and entry.incarnation < self._jumped.get(_producer(stream), 0):
+            self._log.add(dropped(self._input_of(stream), stream, entry, "reset"))  # of the time before the jump
+            return
+        else:
+            stamp, incarnation = entry.stamp, entry.incarnation
+            seen, last = self._seen.get(stream, (incarnation, NEVER))
+            if incarnation > seen and stamp <= last and not self.ended:
+                self._reset(stream, entry)
+            self._seen[stream] = (incarnation, stamp)
+            self._time.see(stamp)
+        if self.restarts.pending:
+            self.done = max(self.done, entry.stamp)  # nobody waits for an operator that is away
+        if not self.awake:
+            self.wake()
+        if stream in self.queue.triggers:
+            self.queue.put(stream, entry)
+        else:
+            self._admit(stream, entry)
+
+    def advance(self, stream: str, frontier: int) -> None:
+        self._promised(stream, Promise(frontier))
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        self._promised(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
+
+    def _promised(self, stream: str, promise: Promise) -> None:
+        self.wake()
+        if stream in self.queue.triggers:
+            self.queue.promise(stream, promise)
+        else:
+            self._admit(stream, promise)
+
+    # Work
+
+    def step(self) -> bool:
+        """One firing: of what is decided; else of what the queues hold; else of what has waited long enough.
+
+        True also after `MOST_TRIED` of the latter without a firing: what has arrived meanwhile is to be looked at.
+        """
+        if self.restarts.pending:
+            if self.restarts.due_in() > 0:
+                return False
+            self._start_again()
+        self._told = self._told or self.node.every is not None  # ticks may be left out since
+        for _ in range(MOST_TRIED):
+            if self.ended or not (self._told or self._admit_next()):
+                return False
+            if self._decide():
+                return True
+        self.wake()
+        return True
+
+    def _admit_next(self) -> bool:
+        """Tells the aligner what the queues hold, else that it need not wait any longer; False when neither is so."""
+        taken = self.queue.take()
+        if taken is None:
+            return self._give_up()
+        self._admit(*taken)
+        return True
+
+    def _decide(self) -> bool:
+        """Makes the next firing if it is decided.
+
+        What it emits and promises may come back to itself and decide another one: `_told` is cleared before.
+        """
+        self._told = False
+        if not super().step():
+            return False
+        self._told = self._told or self.idle == NEVER
+        self._wake_again()
+        return True
+
+    def _wake_again(self) -> None:
+        """Asks for another step, unless nothing is left that could be decided now or later."""
+        if self._told or self.restarts.pending or self.queue.holds or self.aligner.waiting() is not None:
+            self.wake()
+
+    def _bound_ticks(self, period: int) -> None:
+        """Of the ticks that came due while the operator was busy, only the newest are made up for, as many as its queue
+        holds; without this a slow operator would fall behind for ever. One that drops nothing is spared only what no
+        operator could make up for."""
+        if self.queue.policy != "block":
+            patience = max((wait for wait in self.node.live.wait.values() if wait is not None), default=0)
+            self.aligner.skip_ticks(self._time.now() - patience - self.queue.size * period)
+        number, _, last = self.aligner.owed_ticks()
+        if number > MOST_TICKS:
+            self.aligner.skip_ticks(last - (self.queue.size - 1) * period)
+
+    def next_due(self) -> float | None:
+        """Seconds until a decision need not wait any longer; None when nothing waits for the clock."""
+        if self.restarts.pending:
+            return self.restarts.due_in()
+        held = None if self.ended else self.aligner.waiting()
+        return None if held is None else self.patience.due_in(held.stamp, held.needs)
+
+    def set_parameter(self, name: str, value: Any) -> Any:
+        changed = super().set_parameter(name, value)
+        self._changed[name] = value
+        return changed
+
+    def resume(self, incarnation: int, last: Mapping[str, int], changed: Mapping[str, Any]) -> None:
+        self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
+        self.ports.resume(incarnation, last)
+        self._changed = dict(changed)
+        self._change_again()
+
+    def _fire(self, firing: Firing) -> None:
+        if self.absent:
+            firing = without_absent(firing, self.node, self.absent)
+        try:
+            if (error := self._fault(firing)) is not None:
+                self._fail_on_purpose(firing, error)
+            super()._fire(firing)
+        except OperatorFailure as failure:
+            if firing.kind == "finish" or not self.restarts.failed():
+                raise
+            self._on_failure(failure, self.restarts.due_in())
+
+    def _fail_on_purpose(self, firing: Firing, error: BaseException) -> None:
+        failure = OperatorFailure(self.node.name, f"{firing.kind} at stamp {firing.stamp}", error)
+        self._record(firing.kind, firing, time.time_ns(), (), failure.summary, injected=True)
+        raise failure
+
+    def _start_again(self) -> None:
+        """A fresh operator in the place of the failed one, with the parameters as they were last set."""
+        self.restarts.begun()
+        old, self.operator = self.operator, self.node.make()
+        self.calls.operator = self.operator
+        self._begin_incarnation()
+        try:
+            close_quietly(old)
+            self._change_again()
+            started = time.time_ns()
+            self.calls.setup()  # its static streams go on as they are
+            self.records.add_setup(self.operator, started, (None,) * len(self.ports.states))
+        except OperatorFailure as failure:
+            if not self.restarts.failed():
+                raise
+            self._on_failure(failure, self.restarts.due_in())
+
+    def _change_again(self) -> None:
+        for name, value in self._changed.items():
+            self.calls.parameter(name, value, (self.records.incarnation, NEVER))
+
+    def _reset(self, stream: str, entry: Entry) -> None:
+        """The clock behind a stream jumped back: alignment begins anew, and so do the operator's own streams.
+
+        Once for all streams of that producer: what those still bring from before is dropped, and what other streams
+        have brought counts no more, so that they may go back with it.
+        """
+        started = time.time_ns()
+        name = self._input_of(stream)
+        self.queue.clear()
+        drops, more = self.take_drops()
+        self._begin_alignment(stream)
+        self._jumped[_producer(stream)] = entry.incarnation
+        self._seen = {other: (incarnation, NEVER) for other, (incarnation, _) in self._seen.items()}
+        self._time.begin_at(entry.stamp)
+        self._begin_incarnation(stamps_go_back=True)
+        self.done = NEVER
+        detail: dict[str, Any] = {"input": name, **unlisted(more)}
+        try:
+            self.calls.reset(name, (self.records.incarnation, NEVER + 1))
+        except RAISED as error:
+            failure = OperatorFailure(self.node.name, "on_reset()", error)
+            detail["error"] = failure.summary
+            self.records.add("reset", NEVER + 1, started, outcome="error", drops=tuple(drops), detail=detail)
+            raise failure from error
+        self.records.add("reset", NEVER + 1, started, drops=tuple(drops), detail=detail)
+
+    def _begin_alignment(self, jumped: str) -> None:
+        old = self.aligner
+        self._earlier.take(old, self.spec)
+        self.aligner = make_aligner(old.spec)
+        self._told = True
+        for static in self._statics.values():
+            self.aligner.push(static.stream, static)
+        for stream, end in old.ends.items():
+            if stream != jumped and stream not in self._static:
+                self.aligner.end(stream, None, end.reason)
+
+    def _begin_incarnation(self, *, stamps_go_back: bool = False) -> None:
+        incarnation = self.records.incarnation + 1
+        self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
+        self.ports.begin(incarnation, stamps_go_back=stamps_go_back)
+
+    def _input_of(self, stream: str) -> str:
+        return next(name for name, streams in self.node.inputs.items() if stream in streams)
+
+    def _admit(self, stream: str, arrival: Arrival) -> None:
+        """Tells the aligner. What breaks a promise of its stream is refused and counted; a live run goes on."""
+        self._told = True
+        try:
+            if isinstance(arrival, Entry):
+                self.aligner.push(stream, arrival)
+            elif arrival.ends:
+                self._end_at(stream, None if arrival.stamp == NEVER else arrival.stamp, arrival.reason)
+            else:
+                self.aligner.advance(stream, arrival.stamp)
+        except StreamOrderError:
+            self._refused[stream] += 1
+            if isinstance(arrival, Entry):
+                self._log.add(dropped(self._input_of(stream), stream, arrival, "refused"))
+
+    def _end_at(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        try:
+            self.aligner.end(stream, final_stamp, reason)
+        except StreamOrderError:  # its clock went back, and it ended before it sent a message at its new time
+            self.aligner.end(stream, None, reason)
+
+    def _give_up(self) -> bool:
+        """Forces the frontiers of inputs whose wait has run out; False when that decides nothing new."""
+        held = self.aligner.waiting()
+        if held is None or not held.needs:
+            return False
+        moved = False
+        for name, frontier in self.patience.exhausted(held.stamp, held.needs).items():
+            if self.aligner.force(name, frontier):
+                self._timeouts[name] += 1
+                self._told = moved = True
+        return moved
+
+
+def _producer(stream: str) -> str:
+    """The operator that emits a stream, by the stream's name."""
+    return stream.rpartition("/")[0]

@@ -1,0 +1,101 @@
+"""Does what the supervisor tells a process of operators, and keeps what it has told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dataflow.execution.feeds.window import Window
+from dataflow.process.channel import ChannelClosed
+from dataflow.process.feeding import Feeding
+from dataflow.process.live_sources import LiveSources
+from dataflow.process.planned_faults import do_fault
+from dataflow.process.requests import Requests
+from dataflow.process.runners import Runners
+from dataflow.process.streams.inlet import Inlet
+from dataflow.process.streams.outlet import Outlet
+from dataflow.sync import FOREVER
+
+
+class Control:
+    """The orders that one process was given."""
+
+    def __init__(
+        self,
+        windows: tuple[Window, Window],
+        runners: Runners,
+        feeding: Feeding,
+        live: LiveSources,
+        inlet: Inlet,
+        outlet: Outlet,
+        requests: Requests,
+        release: Callable[[int | None, float], None],
+    ) -> None:
+        """`windows`: what sources may be ahead, and what may wait for operators that drop; `release`: begins."""
+        self._window, self._backlog = windows
+        self._runners, self._feeding, self._live = runners, feeding, live
+        self._inlet, self._outlet, self._requests, self._release = inlet, outlet, requests, release
+        self.probing = False
+        """Probes are to be sent: consumers prove that they listen."""
+        self.released = False
+        """All are linked, and sources may begin."""
+        self.stopping = False
+        """Sources are to end."""
+        self.left = False
+        """The process is to leave."""
+        self.asked: int | None = None
+        """The round in which it is asked for its state, until it has answered."""
+
+    def obey(self, kind: str, fields: Mapping[str, Any]) -> None:
+        """Does what a message says. Raises `ChannelClosed` when the supervisor is gone."""
+        match kind:
+            case "covered":
+                self._window.cover(fields["frontier"])
+                self._backlog.cover(fields.get("backlog", FOREVER))
+            case "probe":
+                self.probing = True
+            case "go":
+                self.probing, self.released = False, True
+                self._release(fields["first"], fields["at"])
+            case "absent":
+                self._mark(fields["streams"], absent=fields["absent"])
+            case "ended_elsewhere":
+                for stream in fields["streams"]:
+                    for runner in self._runners.taking(stream):
+                        runner.end(stream, None, fields["reason"])
+            case "fault":
+                kind, operator = fields["fault"], fields["operator"]
+                do_fault(
+                    kind,
+                    operator,
+                    fields["fields"],
+                    runners=self._runners,
+                    live=self._live,
+                    outlet=self._outlet,
+                )
+            case "grow":
+                self._window.grow()
+            case "poll":
+                self.asked = fields["round"]
+            case "playback":
+                self._requests.play(fields["action"], fields["steps"], fields["speed"])
+            case "stop":
+                self.stopping = True
+                self._feeding.finish("interrupted")
+                self._live.finish("interrupted")
+            case "gone":
+                self._outlet.consumer_gone(fields["ring"], fields["life"])
+            case "lacks":
+                self._outlet.send_again(fields["operator"])
+            case "leave":
+                self.left = True
+            case "lost":
+                raise ChannelClosed("the supervisor is gone")
+
+    def _mark(self, streams: list[str], *, absent: bool) -> None:
+        """Notes for whom takes some streams that nobody makes them at the moment, or that somebody does again."""
+        for stream in streams:
+            for consumer in self._runners.taking(stream):
+                (consumer.absent.add if absent else consumer.absent.discard)(stream)
+        if not absent:
+            self._inlet.restarted(streams)

@@ -1,0 +1,1 @@
+"""Messages of recordings: codecs, columns, readers and writers."""

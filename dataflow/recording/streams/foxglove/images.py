@@ -1,0 +1,142 @@
+"""Images, depth images and calibrations as Foxglove protobufs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage as CompressedImageProto
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+
+from dataflow.messages import CameraInfo, CompressedImage, DepthImage, Image, Image16
+from dataflow.recording.errors import RecordingError
+from dataflow.recording.streams.foxglove.values import Fields, Parts, frozen, matrix, timestamp_of, with_field
+from dataflow.recording.streams.pixels import as_depth, as_image, as_image16, as_millimetres, stored_rows
+
+UINT32_MAX = 2**32 - 1
+
+
+def _raw_image(
+    message: Image | Image16 | DepthImage, encoding: str, data: npt.NDArray[Any]
+) -> tuple[Parts, tuple[str, ...]]:
+    height, width = data.shape[:2]
+    proto = RawImage(
+        timestamp=timestamp_of(message.stamp),
+        frame_id=message.frame,
+        width=width,
+        height=height,
+        encoding=encoding,
+        step=width * (data.itemsize * (3 if data.ndim == 3 else 1)),
+    )
+    return with_field(proto, "data", data), ()
+
+
+def encode_image(message: Image) -> tuple[Parts, tuple[str, ...]]:
+    return _raw_image(message, "rgb8" if message.data.ndim == 3 else "mono8", message.data)
+
+
+def encode_image16(message: Image16) -> tuple[Parts, tuple[str, ...]]:
+    return _raw_image(message, "rgb16" if message.data.ndim == 3 else "mono16", message.data)
+
+
+def decode_image16(proto: RawImage) -> Fields:
+    channels = {"mono16": 1, "rgb16": 3, "bgr16": 3}.get(proto.encoding)
+    if channels is None:
+        raise RecordingError(f"RawImage encoding {proto.encoding!r} is no Image16; those known are rgb16 and mono16")
+    data = as_image16(proto.encoding, rows_of(proto, "<u2", channels))
+    data.flags.writeable = False
+    return {"frame": proto.frame_id, "data": data}
+
+
+def encode_depth(message: DepthImage) -> tuple[Parts, tuple[str, ...]]:
+    whole = as_millimetres(message.data)
+    return _raw_image(message, "32FC1", message.data) if whole is None else _raw_image(message, "16UC1", whole)
+
+
+def rows_of(proto: RawImage, dtype: str, channels: int) -> npt.NDArray[Any]:
+    """The pixels (H, W) or (H, W, C) of a raw image, its row padding removed; raises `RecordingError`."""
+    itemsize = np.dtype(dtype).itemsize
+    used = proto.width * channels * itemsize
+    step = proto.step or used
+    if step < used or len(proto.data) < step * proto.height:
+        raise RecordingError(
+            f"RawImage of {proto.width}x{proto.height} {proto.encoding} needs rows of {used} bytes, "
+            f"got step {proto.step} and {len(proto.data)} bytes"
+        )
+    shape = (proto.height, proto.width) if channels == 1 else (proto.height, proto.width, channels)
+    data = np.frombuffer(proto.data, np.uint8)[: step * proto.height]
+    if step != used:
+        data = np.ascontiguousarray(data.reshape(proto.height, step)[:, :used]).reshape(-1)
+    pixels = data.view(dtype).reshape(shape)
+    pixels.flags.writeable = False
+    return pixels
+
+
+def decode_image(proto: RawImage) -> Fields:
+    channels = {"rgb8": 3, "mono8": 1, "8UC1": 1}.get(proto.encoding)
+    if channels is not None:
+        return {"frame": proto.frame_id, "data": rows_of(proto, "u1", channels)}
+    flat = np.frombuffer(proto.data, np.uint8)
+    pixels = as_image(proto.encoding, stored_rows(proto.encoding, proto.width, proto.height, proto.step, flat))
+    pixels.flags.writeable = False
+    return {"frame": proto.frame_id, "data": pixels}
+
+
+def decode_depth(proto: RawImage) -> Fields:
+    if proto.encoding == "32FC1":
+        return {"frame": proto.frame_id, "data": rows_of(proto, "<f4", 1)}
+    if proto.encoding == "16UC1":
+        depth = as_depth("16UC1", rows_of(proto, "<u2", 1))
+        depth.flags.writeable = False
+        return {"frame": proto.frame_id, "data": depth}
+    raise RecordingError(f"RawImage encoding {proto.encoding!r} is no DepthImage; those known are 32FC1 and 16UC1")
+
+
+def encode_compressed(message: CompressedImage) -> tuple[Parts, tuple[str, ...]]:
+    proto = CompressedImageProto(timestamp=timestamp_of(message.stamp), frame_id=message.frame, format=message.format)
+    return with_field(proto, "data", message.data), ()
+
+
+def decode_compressed(proto: CompressedImageProto) -> Fields:
+    data = np.frombuffer(proto.data, np.uint8)
+    named = proto.format.lower().removeprefix("image/")
+    return {"frame": proto.frame_id, "format": "jpeg" if named == "jpg" else named, "data": data}
+
+
+def encode_camera(message: CameraInfo) -> tuple[Parts, tuple[str, ...]]:
+    rectification = np.eye(3) if message.R is None else message.R
+    projection = np.hstack([message.K, np.zeros((3, 1))]) if message.P is None else message.P
+    named = message.distortion_model != "none"
+    proto = CameraCalibration(
+        timestamp=timestamp_of(message.stamp),
+        frame_id=message.frame,
+        width=min(message.width, UINT32_MAX),
+        height=min(message.height, UINT32_MAX),
+        distortion_model=message.distortion_model if named else "",
+        D=[] if message.distortion is None else message.distortion.tolist(),
+        K=message.K.ravel().tolist(),
+        R=rectification.ravel().tolist(),
+        P=projection.ravel().tolist(),
+    )
+    lacks = [name for name in ("R", "P") if getattr(message, name) is None]
+    if message.distortion is not None and not message.distortion.size:
+        lacks.append("distortion")
+    if message.distortion_model == "":
+        lacks.append("distortion_model")
+    lacks += [name for name in ("width", "height") if getattr(message, name) != getattr(proto, name)]
+    return [proto.SerializeToString()], tuple(lacks)
+
+
+def decode_camera(proto: CameraCalibration) -> Fields:
+    return {
+        "frame": proto.frame_id,
+        "width": proto.width,
+        "height": proto.height,
+        "distortion_model": proto.distortion_model or "none",
+        "distortion": frozen(proto.D, "<f8", (-1,)) if proto.D else None,
+        "K": matrix(proto.K, "K", (3, 3)),
+        "R": matrix(proto.R, "R", (3, 3)) if proto.R else None,
+        "P": matrix(proto.P, "P", (3, 4)) if proto.P else None,
+    }

@@ -1,0 +1,18 @@
+"""A sink of a live run: it gives way to operators, and is behind by what it has not taken of each source."""
+
+from __future__ import annotations
+
+from dataflow.process.priority import let_others_begin
+from dataflow.sinks.sink import SinkProcess
+
+
+class LiveSinkProcess(SinkProcess):
+    """As `SinkProcess`, beside devices that wait for nobody."""
+
+    def open(self) -> None:
+        super().open()
+        let_others_begin()
+
+    def _reached(self) -> dict[str, int]:
+        """Tells up to where it has taken what follows from each source: operators drop, so their streams do not say."""
+        return dict(self._taken)

@@ -1,0 +1,126 @@
+"""The end of a run: first the processes with operators leave, then the recorder and the like, then nobody is left.
+
+A run that is stopped while it starts has nothing to drain: whoever is still busy with starting is killed soon, which is
+no failure. The sinks leave last: processes hand over firing records when they leave, and a sink is told how the run
+ended only when nothing can go wrong with the others any more. Every step is bounded; who is late is killed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from dataflow.supervision.core.life import Life, Step
+from dataflow.supervision.core.outcome import summaries_of
+from dataflow.supervision.core.report import RunFailed
+from dataflow.supervision.core.run_state import Phase, RunState
+from dataflow.supervision.core.stack_requests import Asking, notice
+from dataflow.supervision.core.supervised import Supervised
+
+LEAVE_TIMEOUT = 10.0
+LEAVE_AT_ONCE = 1.0
+DIE_WITHIN = 1.0
+"""Seconds that one that was killed may take to die: what it left is for the recorder, before that is told to leave."""
+CLOSE_TIMEOUT = 60.0
+"""Seconds for `close()` of every operator, at the orderly end of a run; a shorter `stall_timeout` shortens it."""
+SHORTEST = 5.0
+
+
+def bounded(stall_timeout: float) -> float:
+    """Returns the seconds that a run which is to end may take for it."""
+    return max(SHORTEST, min(CLOSE_TIMEOUT, stall_timeout))
+
+
+@dataclass(slots=True)
+class _Stage:
+    """The processes that leave together, and until when."""
+
+    sinks: bool
+    deadline: float
+
+
+class Closing:
+    """Lets all processes leave. `failure` is why the run ends early: what fails later is a consequence and noted."""
+
+    def __init__(
+        self, run: RunState, *, outcome: str, failure: RunFailed | None, at_once: bool, hand_over: Callable[[], None]
+    ) -> None:
+        self.run, self.outcome, self.failure = run, outcome, failure
+        self._at_once = at_once
+        self._hand_over = hand_over
+        self._asking = Asking(run)
+        run.enter(Phase.CLOSING)
+        self._stage = self._begin(sinks=False)
+
+    @property
+    def over(self) -> bool:
+        """Tells whether nobody is left; one that does not even die of a SIGKILL is not waited for."""
+        left = [p for p in self.run.processes.values() if p.reachable]
+        return all(p.life is Life.KILLED and self.run.steady - p.since > LEAVE_TIMEOUT for p in left)
+
+    def fail(self, failure: RunFailed) -> None:
+        """Something failed while the run is being closed."""
+        if self.failure is None:
+            self.failure = failure
+        else:
+            self.run.note(f"then: {failure}")
+
+    def hurry(self) -> None:
+        """The user does not want to wait."""
+        self._at_once = True
+        if self.failure is None:
+            self.failure = RunFailed("stopped before everything was closed", interrupted=True)
+        self._stage.deadline = min(self._stage.deadline, self.run.steady + self._time_for(sinks=self._stage.sinks))
+
+    def tick(self) -> None:
+        """Goes on when a stage is through, or its time is up."""
+        leaving = self._leaving(sinks=self._stage.sinks)
+        late = self.run.steady > self._stage.deadline
+        ahead = notice(self._time_for(sinks=self._stage.sinks))
+        if self._has_run and self.failure is None and self.run.steady > self._stage.deadline - ahead:
+            self._asking.ask(leaving, self._stage.deadline)
+        if leaving and late:
+            self._give_up_on(leaving)
+        given_up = self.run.steady > self._stage.deadline + DIE_WITHIN
+        if not self._stage.sinks and (not leaving or given_up):
+            if self.failure is not None:
+                self._hand_over()
+            self._stage = self._begin(sinks=True)
+
+    @property
+    def _has_run(self) -> bool:
+        """Tells whether sources were released, so that there may be something to drain and to write."""
+        return self.run.release is not None
+
+    def _leaving(self, *, sinks: bool) -> list[Supervised]:
+        return [p for p in self.run.processes.values() if p.is_sink == sinks and p.reachable]
+
+    def _time_for(self, *, sinks: bool) -> float:
+        if self._at_once:
+            return LEAVE_AT_ONCE if sinks else LEAVE_AT_ONCE / 2
+        if self.failure is not None or not self._has_run:
+            return LEAVE_TIMEOUT if sinks else LEAVE_TIMEOUT / 2
+        return bounded(self.run.plan.stall_timeout)
+
+    def _begin(self, *, sinks: bool) -> _Stage:
+        run = self.run
+        outcome = self.outcome if self.failure is None else f"failed: {str(self.failure).splitlines()[0]}"
+        for process in run.processes.values():
+            if process.life is Life.AWAY:
+                process.take(Step.GIVE_UP, run.steady)
+            elif process.is_sink == sinks and process.take(Step.LEAVE, run.steady):
+                if sinks:
+                    run.send(process, "leave", outcome=outcome, summaries=summaries_of(run))
+                else:
+                    run.send(process, "leave", outcome=outcome)
+        return _Stage(sinks, run.steady + self._time_for(sinks=sinks))
+
+    def _give_up_on(self, late: list[Supervised]) -> None:
+        names = "; ".join(p.describe() for p in late)
+        if self.failure is None and not self._has_run and not self._stage.sinks:
+            self.run.note(f"still starting, and killed: {names}")
+        elif self.failure is None:
+            timeout = self._time_for(sinks=self._stage.sinks)
+            self.failure = RunFailed(f"did not close within {timeout:g} s: {names}", self.run.last_words(late))
+        for process in late:
+            self.run.kill(process, process.cause or "was killed since it did not leave")

@@ -1,0 +1,145 @@
+"""Events that the supervisor's core is told, each with the moment at which it happened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dataflow.execution.feeds.playback import Action
+from dataflow.recording.streams.logs import LogLine
+from dataflow.records.black_box import Remains
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A clock value. `steady` (s) never goes back, stands still while the supervisor does not run, and times
+    everything; `wall` (s since the epoch) is for stamps."""
+
+    steady: float
+    wall: float
+
+
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """The run begins."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time has passed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Paused:
+    """The supervisor did not run for so many seconds: it, or the whole machine, was stopped. No clock went on."""
+
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class StopAsked:
+    """The user asks for an orderly end; a second time, for an end at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlaybackAsked:
+    """The user asks to pause, resume, step what is not live, or to change its speed."""
+
+    action: Action
+    steps: int = 1
+    speed: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TriggerAsked:
+    """The user asks the flight recorder to keep what was."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Aborted:
+    """The program around the core cannot go on."""
+
+    why: str
+    interrupted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """A process sent a message on its control channel."""
+
+    label: str
+    kind: str
+    fields: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Printed:
+    """A process printed or logged something; `line` is how people are shown it."""
+
+    label: str
+    line: str
+    log: LogLine | None = None
+    """None for the second and later lines of one call of a logger."""
+
+
+@dataclass(frozen=True, slots=True)
+class NotReading:
+    """A process has not taken what was sent to it for `seconds`. `overflowed`: some of it is lost."""
+
+    label: str
+    seconds: float
+    waiting: int
+    overflowed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class HungUp:
+    """A process has closed its control channel."""
+
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class LeftBehind:
+    """A process that ended, or one of several that ended at once, has left others, which were killed: each as "name
+    (process N)"."""
+
+    labels: tuple[str, ...]
+    processes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Remained:
+    """A process has ended, and these are the firing records that it left. Comes just before its `Died`."""
+
+    label: str
+    remains: Remains
+
+
+@dataclass(frozen=True, slots=True)
+class Died:
+    """A process has ended. `code`: exit code, negative for a signal; None: unknown. Its last event."""
+
+    label: str
+    code: int | None
+
+
+Event = (
+    Begin
+    | Tick
+    | Paused
+    | StopAsked
+    | PlaybackAsked
+    | TriggerAsked
+    | Aborted
+    | Said
+    | Printed
+    | NotReading
+    | HungUp
+    | LeftBehind
+    | Remained
+    | Died
+)

@@ -1,0 +1,164 @@
+"""State that all parts of the supervisor's core share: the processes, the status, the time, and the commands to be
+given."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from dataflow.supervision.core.commands import Command, Send, Signal, Spawn
+from dataflow.supervision.core.events import Moment
+from dataflow.supervision.core.life import WORKS, Life, Step
+from dataflow.supervision.core.report import OperatorCounts, Status
+from dataflow.supervision.core.stack_traces import shortened
+from dataflow.supervision.core.supervised import Supervised
+from dataflow.supervision.plan import ProcessPlan, RunPlan, taken_keys
+
+
+class Phase(Enum):
+    """Phases of a run, which only goes forward."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    STOPPING = "stopping"
+    CLOSING = "closing"
+    OVER = "over"
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Release of the sources: its moment, and the stamp that then was now (None: unknown)."""
+
+    first: int | None
+    at: Moment
+
+
+class RunState:
+    """The run as far as it is known. Parts read it, and act through its methods."""
+
+    def __init__(
+        self, plan: RunPlan, plans: Mapping[str, ProcessPlan], configs: Mapping[str, tuple[str, dict[str, Any]]]
+    ) -> None:
+        self.plan, self.configs = plan, configs
+        self.graph = plan.graph
+        self.processes = {label: Supervised(one) for label, one in plans.items()}
+        self.status = Status()
+        self.now = Moment(0.0, 0.0)
+        self.release: Release | None = None
+        self._phase = Phase.STARTING
+        self._commands: list[Command] = []
+        for label, process in self.processes.items():
+            for node in process.nodes or ((label,) if process.is_sink or process.plan.has_log else ()):
+                self.status.operators[node] = OperatorCounts()
+                self.status.process_of[node] = label
+
+    # Phase and time
+
+    @property
+    def phase(self) -> Phase:
+        return self._phase
+
+    def enter(self, phase: Phase) -> None:
+        order = list(Phase)
+        assert order.index(phase) > order.index(self._phase), f"{self._phase} → {phase}"
+        self._phase = phase
+        if phase is not Phase.OVER:
+            self.status.phase = phase.value
+
+    @property
+    def under_way(self) -> bool:
+        """Tells whether sources are released and nothing is being closed yet."""
+        return self._phase in (Phase.RUNNING, Phase.STOPPING)
+
+    @property
+    def steady(self) -> float:
+        return self.now.steady
+
+    def event_time(self) -> int:
+        """Returns event time now (ns), as far as the supervisor can tell."""
+        first = self.status.first
+        if first is None:
+            return round(self.now.wall * 1e9)
+        since = 0.0 if self.release is None else self.now.wall - self.release.at.wall
+        return first + round(since * 1e9 * (self.plan.rate or 1.0))
+
+    # Processes
+
+    def working(self) -> Iterator[Supervised]:
+        """Yields the processes that work, or have handed in their report."""
+        return (p for p in self.processes.values() if p.life in WORKS)
+
+    def consumers(self, process: Supervised) -> tuple[str, ...]:
+        """Returns what a process counts for in flow control: its operators with inputs, or itself if it is a sink."""
+        if process.is_sink:
+            return (process.label,)
+        return tuple(n for n in process.nodes if not self.graph.nodes[n].source)
+
+    def sources(self, process: Supervised) -> tuple[str, ...]:
+        return tuple(n for n in process.nodes if self.graph.nodes[n].source)
+
+    def takes(self, process: Supervised) -> set[str]:
+        """Returns the keys that a process takes from others."""
+        return taken_keys(self.graph, process.plan)
+
+    def last_words(self, late: Collection[Supervised] = ()) -> str:
+        """Returns what processes said last, stacks shortened; of those that are `late` all that is kept."""
+        said = ((p, line) for p in self.processes.values() for line in shortened(p.words)[0 if p in late else -5 :])
+        lines = [f"[{p.label}] {line}" for p, line in said]
+        return "\n".join(lines)
+
+    # Acting
+
+    def take_commands(self) -> list[Command]:
+        commands, self._commands = self._commands, []
+        return commands
+
+    def command(self, command: Command) -> None:
+        self._commands.append(command)
+
+    def spawn(self, process: Supervised, **more: Any) -> None:
+        """Starts a process by its configuration, `more` on top of it."""
+        process.since = self.steady
+        kind, config = self.configs[process.label]
+        self.command(Spawn(process.label))
+        self.command(Send(process.label, kind, config | {"life": process.life_number} | more))
+
+    def send(self, process: Supervised, kind: str, /, *, replaces: bool = False, **fields: Any) -> None:
+        """Sends to a process, if there is one."""
+        if process.reachable:
+            self.command(Send(process.label, kind, fields, replaces))
+
+    def send_all(self, kind: str, /, *, replaces: bool = False, **fields: Any) -> None:
+        for process in self.processes.values():
+            self.send(process, kind, replaces=replaces, **fields)
+
+    def kill(self, process: Supervised, cause: str = "") -> None:
+        """Kills a process, if there is one that was not killed before; `cause` says why, in words that follow it."""
+        if process.take(Step.KILL, self.steady):
+            process.cause = cause or process.cause
+            self.signal(process, signal.SIGKILL)
+
+    def signal(self, process: Supervised, number: int) -> None:
+        if process.life is not Life.AWAY:
+            self.command(Signal(process.label, number))
+
+    def note(self, text: str) -> None:
+        """Tells the user something, at once and in the report."""
+        self.status.notes.append(text)
+
+    def tell_recorder(self, kind: str, /, **fields: Any) -> None:
+        for process in self.processes.values():
+            if process.plan.sink == "record":
+                self.send(process, kind, **fields)
+
+    def trigger(self, text: str) -> None:
+        """Has the flight recorder keep what was."""
+        self.tell_recorder("event", name="trigger", stamp=self.event_time(), data={"text": text})
+
+    def event(self, name: str, text: str, /, **data: Any) -> None:
+        """Tells the user and the recording something that both must know."""
+        self.note(text)
+        self.tell_recorder("event", name=name, stamp=self.event_time(), data={"text": text, **data})

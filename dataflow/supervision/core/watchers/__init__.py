@@ -1,0 +1,1 @@
+"""Watchers: each follows the events of a run for one concern."""

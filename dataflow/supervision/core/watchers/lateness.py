@@ -1,0 +1,96 @@
+"""Sources of a live run against the clock: who falls behind it, and who waits for it without end.
+
+A source that can wait (a data set, a simulator) is read at the pace of the clock. Where that takes longer than real
+time, event time falls behind, and everything after it looks healthy; so it is said, at once and at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from dataflow.supervision.core.run_state import RunState
+from dataflow.supervision.core.supervised import Supervised
+from dataflow.supervision.core.watchers.watcher import Watcher
+from dataflow.supervision.core.wording import how_long
+
+LATE = 1.0
+"""Seconds behind the clock that are worth a word."""
+ITS_OWN = 0.5
+"""Share of its lateness that a source must have when it is read, to be the one that is slow."""
+AT_WORK = 0.7
+"""CPU time of a source, as a share of the time that has passed, from which reading it takes longer than real time."""
+
+
+IDLE = 0.05
+"""Share of CPU time in the time that reading takes, up to which it does nothing but wait."""
+
+
+def held_up_by(others: Sequence[str], read: float, sent: float, load: float, wall: float) -> str:
+    """Names who holds a source up.
+
+    `others`: the other operators of its process; `read`, `sent`: seconds by which its last message was late when it was
+    read, and when it was sent; `load`, `wall`: CPU time and time that reading it took, as shares of what has passed.
+    """
+    named = ", ".join(others)
+    if read < ITS_OWN * sent:
+        return f"its process is busy with {named or 'sending'}"
+    if load > AT_WORK:
+        return "reading it takes longer than real time"
+    computes = min(1.0, load / wall) if wall > 0 else 0.0
+    if computes <= IDLE:
+        return "reading it waits, for a device or a file, and computes next to nothing"
+    beside = f"with {named}, its process's others" if named else "with other processes"
+    return (
+        f"reading it computes for {computes:.0%} of the time that it takes, and for the rest it waits: for a device or "
+        f"a file, or for the CPU, which it shares {beside}"
+    )
+
+
+class Lateness(Watcher):
+    """Takes in how late each source's last message was, in s: when it was read, and when it was sent."""
+
+    def __init__(self, run: RunState) -> None:
+        super().__init__(run)
+        self._worst: dict[str, float] = {}
+        self._said: set[str] = set()
+
+    def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
+        if kind == "progress":
+            for source, (read, sent) in fields.get("behind", {}).items():
+                self._take(process, source, read, sent)
+        elif kind == "early":
+            self._waits(fields["operator"], fields["last"], fields["stamp"], fields["seconds"])
+
+    def _take(self, process: Supervised, source: str, read: float, sent: float) -> None:
+        behind = max(read, sent)
+        self.run.status.behind[source] = behind
+        self._worst[source] = max(behind, self._worst.get(source, 0.0))
+        if behind > LATE and source not in self._said:
+            self._said.add(source)
+            why = self._why(process, source, read, sent)
+            self.run.event("behind", f"source {source!r} has fallen behind the clock: {why}", operator=source)
+        elif behind < LATE / 2:
+            self._said.discard(source)
+
+    def _why(self, process: Supervised, source: str, read: float, sent: float) -> str:
+        run = self.run
+        assert run.release is not None
+        elapsed = max(run.steady - run.release.at.steady, 1e-9)
+        counts = run.status.operators[source]
+        load, wall = (ns * 1e-9 / elapsed for ns in (counts.cpu_ns, counts.wall_ns))
+        return held_up_by([name for name in process.nodes if name != source], read, sent, load, wall)
+
+    def _waits(self, source: str, last: int | None, stamp: int, seconds: float) -> None:
+        jump = "" if last is None else f", its stamps jump from {last} to {stamp}"
+        rate = "" if self.run.plan.rate in (None, 1.0) else f" at rate {self.run.plan.rate:g}"
+        text = f"source {source!r} waits {how_long(seconds)} for the clock{rate}{jump}: nothing comes until then"
+        self.run.event("clock_wait", text, operator=source, stamp=stamp, seconds=seconds)
+
+    def closing(self) -> None:
+        for source, behind in sorted(self.run.status.behind.items()):
+            if self._worst[source] > LATE:
+                self.run.note(
+                    f"source {source!r} was {behind:.1f} s behind the clock at the end, "
+                    f"{self._worst[source]:.1f} s at most"
+                )

@@ -1,0 +1,1 @@
+"""The worker processes of a verification, and how operators are divided among them."""

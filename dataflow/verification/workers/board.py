@@ -1,0 +1,91 @@
+"""The progress of a worker in memory that it shares with its parent, and that outlives its death.
+
+The worker writes a few integers before and after every step, without a system call; the parent reads them when it likes
+to: to show progress, to notice that there is none, and to name the operator and the call at which a worker died.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from dataflow.execution.recorded import RecordedRunner
+
+PHASES = ("start", "setup", "fire", "read", "close")
+_HEAD = 3
+_COUNTS = 6
+_WORD = 8
+
+
+class Counts(NamedTuple):
+    """Of one operator: firings and messages so far, CPU time, the stamp it has done, calls repeated, wall time (ns)."""
+
+    firings: int
+    emitted: int
+    cpu_ns: int
+    done: int
+    repeated: int
+    wall_ns: int
+
+
+class Place(NamedTuple):
+    """The step that a worker is at: the phase, and the operator whose turn it is (empty for none)."""
+
+    phase: str
+    operator: str
+
+
+class Board:
+    """The shared memory of one worker and its parent: who opens it by its descriptor sees what the other wrote.
+
+    Integers of 64 bits: phase, operator, steps, then `Counts` of each operator. A parent that reads while the worker
+    writes may see counts of two moments, which is good enough for a display.
+    """
+
+    def __init__(self, descriptor: int, operators: Sequence[str]) -> None:
+        self.operators = tuple(operators)
+        self._size = _WORD * (_HEAD + _COUNTS * len(self.operators))
+        if os.fstat(descriptor).st_size < self._size:
+            os.ftruncate(descriptor, self._size)
+        self._memory = mmap.mmap(descriptor, self._size)
+        self._cells = memoryview(self._memory).cast("q")
+        self._index = {name: k for k, name in enumerate(self.operators)}
+        self._phases = {name: k for k, name in enumerate(PHASES)}
+
+    def begins(self, phase: str, operator: str) -> None:
+        """Notes the step that comes next."""
+        cells = self._cells
+        cells[0] = self._phases[phase]
+        cells[1] = self._index.get(operator, -1)
+        cells[2] += 1
+
+    def stepped(self, runner: RecordedRunner) -> None:
+        """Notes what a runner has come to."""
+        at = _HEAD + _COUNTS * self._index[runner.node.name]
+        self._cells[at] = runner.firings
+        self._cells[at + 1] = runner.ports.emitted
+        self._cells[at + 2] = runner.work.cpu_ns
+        self._cells[at + 3] = runner.done
+        self._cells[at + 4] = runner.result.verified
+        self._cells[at + 5] = runner.work.wall_ns
+
+    @property
+    def steps(self) -> int:
+        """The number of steps so far: a worker in which it stands still makes no progress."""
+        return self._cells[2]
+
+    def place(self) -> Place:
+        """The step that the worker is at, or was at when it died."""
+        operator = self._cells[1]
+        return Place(PHASES[self._cells[0]], "" if operator < 0 else self.operators[operator])
+
+    def counts(self, operator: str) -> Counts:
+        at = _HEAD + _COUNTS * self._index[operator]
+        return Counts(*self._cells[at : at + _COUNTS])
+
+    def close(self) -> None:
+        """Lets go of the memory."""
+        self._cells.release()
+        self._memory.close()

@@ -1,0 +1,31 @@
+"""Thread limits also hold for a library that an operator imports in its `setup()`."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+
+import pytest
+from firing_operators import Collector, Echo, node
+
+from dataflow.execution import threads
+from dataflow.execution.runner import OperatorRunner
+
+
+def test_a_library_that_setup_loads_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "_limit", None)
+    monkeypatch.delitem(sys.modules, "cv2", raising=False)
+    limits: list[int] = []
+
+    def load(self: Echo) -> None:
+        monkeypatch.setitem(
+            sys.modules, "cv2", SimpleNamespace(setNumThreads=limits.append, setRNGSeed=lambda seed: None)
+        )
+
+    monkeypatch.setattr(Echo, "setup", load)
+    threads.limit_threads(3)
+    assert limits == []
+
+    OperatorRunner(node(Echo, {"x": ["t/s/x"]}), Collector(), static=frozenset()).setup()
+
+    assert limits == [3]
