@@ -134,7 +134,8 @@ def agents_near(graph: SceneGraph, truth: SceneGraph) -> set[int]:
 
 def figures_of(steps: list[Step]) -> Figures:
     """Runs recogniser and builder over the steps, and the builder alone, whose rules are the baseline."""
-    recognizer, ours, rules = ActivityRecognizer(), SceneGraphBuilder(), SceneGraphBuilder()
+    recognizer = ActivityRecognizer(labels="simulator")
+    ours, rules = SceneGraphBuilder(labels="simulator"), SceneGraphBuilder(labels="simulator")
     for each in (recognizer, ours, rules):
         each.setup()
     said: dict[str, list[dict[int, str]]] = {"ours": [], "rules": [], "network": []}

@@ -60,7 +60,7 @@ def plain(frame: Frame) -> set[int]:
 
 def scores(world: World) -> Iterator[dict[str, NodeScore]]:
     """Yields the figures of each image: boxes from sensors, boxes from true boxes and masks, the map."""
-    mapper, lifter = Mapper(), ObjectLifter()
+    mapper, lifter = Mapper(), ObjectLifter(labels="simulator")
     lifter.setup()
     for frame in world.frames:
         must = plain(frame)

@@ -66,7 +66,7 @@ class Figures:
 
 def mapped(world: World) -> tuple[list[SceneGraph], list[SceneGraph]]:
     """Returns the map, and the graph built on it, once a second."""
-    mapper, builder = Mapper(), SceneGraphBuilder()
+    mapper, builder = Mapper(), SceneGraphBuilder(labels="simulator")
     builder.setup()
     maps, graphs = [], []
     for k, frame in enumerate(world.frames):

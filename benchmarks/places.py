@@ -138,7 +138,7 @@ def with_head(weights: Path, file: Path) -> Path:
     """Weights of mobilenet_v2 may come without their last layer, which a description does not use."""
     import torch
 
-    from operators.training.backbone import current_names
+    from operators.learning.backbone import current_names
 
     state = dict(current_names(torch.load(weights, map_location="cpu", weights_only=True)))
     state.setdefault("classifier.1.weight", torch.zeros(1000, 1280))

@@ -32,13 +32,13 @@ from numpy.typing import NDArray  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
 from operators.detection.custom.folder import read_detection_data  # noqa: E402
+from operators.learning.backbone import current_names  # noqa: E402
+from operators.learning.loop import Settings, train  # noqa: E402
 from operators.recognition.dataset import ClassificationData, LabelledImage  # noqa: E402
 from operators.recognition.training import ClassifierTask  # noqa: E402
 from operators.segmentation.dataset import MaskedImage, SegmentationData  # noqa: E402
 from operators.segmentation.score import confusion, mean_iou  # noqa: E402
 from operators.segmentation.training import SegmenterTask  # noqa: E402
-from operators.training.backbone import current_names  # noqa: E402
-from operators.training.loop import Settings, train  # noqa: E402
 from operators.training.running import prepare  # noqa: E402
 
 CAMVID = ("sky", "building", "pole", "road", "pavement", "tree", "sign", "fence", "car", "pedestrian", "bicyclist")

@@ -21,9 +21,10 @@ from semantic_map import mapped, plainly_seen, seen
 from sensed_worlds import Frame, World, sensed
 
 from dataflow.messages import SceneGraph
+from operators.recognition.tracked_people import simulated_labels
 from operators.scene import SceneGraphBuilder
 from operators.scene.relations import FLOOR
-from operators.scene.scoring import MOVERS, boxes_of, ordered, score_nodes, triples
+from operators.scene.scoring import boxes_of, ordered, score_nodes, triples
 
 Causes = dict[str, Counter[str]]
 """Relations by cause and by what they hang on: a class, or the predicate where both nodes are mapped."""
@@ -32,7 +33,7 @@ Causes = dict[str, Counter[str]]
 def causes(world: World) -> Causes:
     """Returns what the relations of one world that are lost or false are made of; `right` are the others."""
     nodes = mapped(world, true=False)
-    builder = SceneGraphBuilder()
+    builder = SceneGraphBuilder(labels="simulator")
     builder.setup()
     whole, counts = seen(world).countable(), plainly_seen()
     at_end = set(score_nodes(nodes[-1], world.frames[-1].scene, whole).match.values())
@@ -41,7 +42,7 @@ def causes(world: World) -> Causes:
         graph = builder.process(node, frame.base)["graph"]
         counts.add(frame.objects)
         if k >= len(nodes) // 2 and k % max(1, round(len(nodes) / 50)) == 0:
-            _lost(found, graph, frame, whole, counts.must(frame.scene), at_end)
+            _lost(found, graph, frame, whole, counts.must(frame.scene, simulated_labels()), at_end)
             _false(found, graph, frame, whole)
     return found
 
@@ -58,7 +59,9 @@ def _lost(found: Causes, graph: SceneGraph, frame: Frame, whole: set[int], must:
             continue
         lacking = [i for i in (s, o) if i not in of.values()]
         causes = sorted(
-            (2 if names[i] in MOVERS else 1, names[i]) if i not in must else (4 if i in at_end else 3, names[i])
+            (2 if "agent" in simulated_labels().roles(names[i]) else 1, names[i])
+            if i not in must
+            else (4 if i in at_end else 3, names[i])
             for i in lacking
         )
         rank, name = causes[0] if causes else (5, p)

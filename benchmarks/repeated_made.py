@@ -123,8 +123,8 @@ def recognition(folder: Path) -> list[str]:
     """Part of graphs/recognition.yaml, with the network of `dataflow train classifier` before it has learned."""
     import torch
 
+    from operators.learning.export import export_network
     from operators.recognition.network import ClassifierNetwork, DeployedClassifier
-    from operators.training.export import export_network
 
     torch.manual_seed(7)
     file, facts = folder / "things.onnx", {"kind": "classifier", "classes": ["a", "b", "c"], "width": 64, "height": 64}

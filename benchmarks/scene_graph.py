@@ -24,6 +24,7 @@ from sensed_worlds import Frame, World, ids_in_view, sensed
 
 from dataflow.messages import Activity, SceneGraph
 from operators.recognition import activity_score
+from operators.recognition.tracked_people import simulated_labels
 from operators.scene import SceneGraphBuilder
 from operators.scene.scoring import PREDICATES, RelationScore, score_nodes
 
@@ -97,7 +98,7 @@ def goals(frames: list[Frame], graphs: list[SceneGraph]) -> dict[str, list[bool]
 
 def run(world: World, every: int, *, true: bool) -> dict[str, Any]:
     frames = world.frames if true else world.frames[::every]
-    builder = SceneGraphBuilder()
+    builder = SceneGraphBuilder(labels="simulator")
     builder.setup()
     figures: dict[str, Any] = {}
     if true:
@@ -114,7 +115,7 @@ def run(world: World, every: int, *, true: bool) -> dict[str, Any]:
         graphs.append(out["graph"])
         late = k >= len(frames) // 2
         counts.add(frame.objects)
-        must = counts.must(frame.scene)
+        must = counts.must(frame.scene, simulated_labels())
         score = score_nodes(out["graph"], frame.scene, must)
         of = {i: i for i in node.ids.tolist()} if true else score.match
         made.append((out["activities"], of))

@@ -29,7 +29,7 @@ from dataflow.messages import (
     Transforms,
 )
 from operators.cloud import CloudBuilder, PlaneSegmenter
-from operators.detection import CustomDetector, FocusDetector, Reclassifier
+from operators.detection import CustomDetector
 from operators.recognition import PostureRecognizer
 from operators.scene import ObjectLifter, SemanticMap
 from operators.segmentation import Segmenter
@@ -84,7 +84,11 @@ class Mapper:
     """Lifter, planes and map, wired as in the perception graph."""
 
     def __init__(self, **params: Any) -> None:
-        self.lifter, self.planes, self.known = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(**params)
+        self.lifter, self.planes, self.known = (
+            ObjectLifter(labels="simulator"),
+            PlaneSegmenter(**SEARCH),
+            SemanticMap(labels="simulator", **params),
+        )
         for operator in (self.lifter, self.planes, self.known):
             operator.setup()
 
@@ -124,7 +128,7 @@ class Mapped:
 
 def mapped(world: World) -> list[Mapped]:
     """Returns what is mapped after each frame."""
-    mapper, recognizer = Mapper(), PostureRecognizer()
+    mapper, recognizer = Mapper(), PostureRecognizer(labels="simulator")
     recognizer.setup()
     found = []
     for frame in world.frames:
@@ -152,14 +156,12 @@ def sense(kind: str, seed: int, route: Route) -> World:
             "min_pixels": 50,
         },
     )
-    builder, detector, focus, names, segmenter = (
+    builder, detector, segmenter = (
         CloudBuilder(stride=3, max_range=6.0),
         CustomDetector(score_threshold=0.1),
-        FocusDetector(),
-        Reclassifier(),
         Segmenter(),
     )
-    for operator in (robot, builder, detector, focus, names, segmenter):
+    for operator in (robot, builder, detector, segmenter):
         operator.setup()
     static: dict[str, Any] = dict(robot.static_outputs())
     frames = []
@@ -170,7 +172,7 @@ def sense(kind: str, seed: int, route: Route) -> World:
         assert isinstance(cloud, PointCloud)
         frames.append(
             Frame(
-                detections=names.process(m["image"], focus.process(m["image"], detector.process(m["image"]))),
+                detections=detector.process(m["image"]),
                 segmentation=segmenter.process(m["image"]),
                 cloud=cloud,
                 camera=m["ground_truth"],

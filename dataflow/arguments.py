@@ -83,7 +83,7 @@ def _given(
     try:
         bound = signature.bind(*args, **kwargs)
     except TypeError:
-        return  # the call itself says which argument is missing or unknown
+        return  # the call names the argument that is missing or unknown
     for name, value in bound.arguments.items():
         if name not in hints:
             continue

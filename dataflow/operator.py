@@ -114,7 +114,7 @@ class Operator:
     def __init__(self, **params: Any) -> None:
         """Raises `ParameterError` when a parameter is unknown, missing or out of its bounds."""
         if "spec" not in vars(type(self)):
-            raise TypeError(f"{type(self).__name__} is abstract: it declares no ports of its own")
+            raise TypeError(f"{type(self).__name__} is abstract: it declares no ports")
         self.params: pydantic.BaseModel = validate_parameters(type(self), params)
         for name in type(self.params).model_fields:
             setattr(self, name, getattr(self.params, name))
@@ -130,7 +130,7 @@ class Operator:
     @property
     def log(self) -> logging.Logger:
         """The logger of its class. In a run, lines from level info on are shown, recorded and kept with the operator's
-        name and the event time of the call; `dataflow logs` shows them. What is printed is, too."""
+        name and the event time of the call; `dataflow logs` shows them. So is printed output."""
         return logging.getLogger(f"{type(self).__module__}.{type(self).__qualname__}")
 
     def seed_rng(self, seed: SupportsInt) -> None:
@@ -195,6 +195,14 @@ class Operator:
         """Figures to show at the end of a run (metrics sinks); read after `finish()`."""
         return {}
 
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        """Returns whether the network that it uses with these parameters was trained on simulated data alone.
+
+        A run warns where such an operator takes what follows from a source that is not `simulated`.
+        """
+        return False
+
     def use_file(self, path: str | Path) -> Path:
         """Notes the content hash of a file that the operator reads, for the firing record of `setup()`.
 
@@ -216,6 +224,8 @@ class Source(Operator, abstract=True):
     """
 
     live: ClassVar[bool] = False
+    simulated: ClassVar[bool] = False
+    """Its messages are computed, not measured by a sensor."""
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         """Yields what is emitted at one stamp: a mapping from port to message. Stamps strictly increase."""

@@ -33,7 +33,7 @@ class ParameterError(ValueError):
 class SourceError(ValueError):
     """A file, folder or device that a source is to read, and cannot: names it, what is wrong and what would be right.
 
-    A command that it ends says this alone, without a traceback.
+    A command prints the message alone, without a traceback.
     """
 
 
@@ -42,7 +42,7 @@ class OutputError(ValueError):
 
 
 class In(Generic[T]):
-    """An input that triggers firings. Several are joined by stamp, or merged when the class says `merge=True`.
+    """An input that triggers firings. Several are joined by stamp, or merged with `merge=True`.
 
     With `many=True` (merged, or the only trigger) the key expression may match several streams; `process()` gets a
     dict from stream name to message, in sorted order, of those present.
@@ -226,7 +226,7 @@ class Context:
     """Holds what a firing is besides its messages: given to `process()` when it has a parameter named `context`.
 
     `stale` names the inputs whose message is marked stale, `late` those that hold a message that arrived late (live
-    runs only), `tick` says that the timer fired.
+    runs only), `tick` is True where the timer fired.
     """
 
     stamp: int

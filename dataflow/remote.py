@@ -1,7 +1,7 @@
 """Sources of messages that come from outside the graph: by `dataflow pub`, a script, an operator's desk.
 
 `use: dataflow.remote:Twist` is a source of Twist messages on its port `message`, and so for every type of
-`dataflow.messages`. For a type of one's own, or another name of the port, subclass `Remote`:
+`dataflow.messages`. For a custom type, or another name of the port, subclass `Remote`:
 
     class Goals(Remote):
         goal: Out[Goal] = Out(doc="where to go")

@@ -47,10 +47,10 @@ class _Collector:
         self.played.outputs[self.ports[stream]].append(entry.value)
 
     def frontier(self, stream: str, frontier: int) -> None:
-        """Nobody waits for it."""
+        """No consumer waits for it."""
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        """Nobody waits for it."""
+        """No consumer waits for it."""
 
     def record(self, record: FiringRecord) -> None:
         self.played.records.append(record)

@@ -1,4 +1,4 @@
-"""Text that somebody else wrote, made fit for a terminal."""
+"""Makes text from outside fit for a terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WITHIN_LINES = re.compile(r"[^\t\n]+")
 def visible(text: str) -> str:
     """`text` with every character that a terminal would obey instead of show as its escape, such as `\\x1b`.
 
-    Line breaks and tabs are among them, so that a name cannot pass for a line of its own.
+    Line breaks and tabs are among them, so that a name cannot pass for another line.
     """
     return _spelled(text, lambda c: c.encode("unicode_escape", "surrogatepass").decode("ascii"))
 

@@ -31,7 +31,7 @@ class Cameras:
                 raise ValueError(f"an image is in frame {image.frame!r}; {self._where} has {', '.join(self._ports)}")
             if port in found:
                 raise ValueError(
-                    f"two images of one stamp are in frame {image.frame!r}: cameras need frames of their own"
+                    f"two images of one stamp are in frame {image.frame!r}: each camera needs a separate frame"
                 )
             found[port] = image
         return found

@@ -53,7 +53,7 @@ def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] =
 def open_content(content: bytes, told: str) -> onnxruntime.InferenceSession:
     """Opens an ONNX model that is a part of a file, for one thread on the CPU.
 
-    Raises ModelError, which says where it was (`told`), for one that is no model.
+    Raises ModelError with its place (`told`) for one that is no model.
     """
     return _opened(content, told, "cpu")
 
@@ -72,7 +72,7 @@ def _opened(model: bytes | str, told: str, provider: Provider) -> onnxruntime.In
         session = onnxruntime.InferenceSession(model, options, providers=chosen)
     except Exception as error:  # onnxruntime's exception classes share no public base
         raise ModelError(f"{told} cannot be loaded as an ONNX model: {error}") from error
-    if _PROVIDERS[provider] not in session.get_providers():  # it says so in its log alone, and takes the next one
+    if _PROVIDERS[provider] not in session.get_providers():  # it only logs this, and takes the next one
         raise ModelError(
             f"onnxruntime's provider {provider!r} could not start: is there such a device, and are its driver and "
             f"libraries installed? On this machine provider: cpu runs {told}"

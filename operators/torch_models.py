@@ -1,6 +1,6 @@
 """Models of torchvision by name, with weights from its cache or from a file, on a device that is there.
 
-Nothing is downloaded. A checkpoint of one's own is a file of `torch.save`: a state dict, or a mapping with the state
+Nothing is downloaded. A custom checkpoint is a file of `torch.save`: a state dict, or a mapping with the state
 dict under `model` and the class names under `classes`, as `dataflow train torchvision` writes it.
 """
 
@@ -33,7 +33,7 @@ _NAMELESS = {"__background__", "N/A"}
 
 
 class WeightsError(ModelError):
-    """Weights that are missing or do not fit: says where they were looked for, and what would be right."""
+    """Weights are missing or do not fit; the message has the places searched, and what would be right."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Loaded:
     """A model in evaluation mode on its device.
 
     - `classes`: names by the model's own class ids, the background included where it has one.
-    - `transforms`: the preset of torchvision's own weights; None for a checkpoint of one's own.
+    - `transforms`: the preset of torchvision's own weights; None for a custom checkpoint.
     """
 
     model: nn.Module
@@ -133,7 +133,7 @@ def wanted_classes(names: Sequence[str], asked: Sequence[str], where: str) -> ND
         if name not in known:
             near = get_close_matches(name, known, 1)
             hint = f"did you mean {near[0]!r}? " if near else ""
-            raise ModelError(f"{where}: the model knows no {name!r}; {hint}it knows {', '.join(known)}")
+            raise ModelError(f"{where}: the model has no {name!r}; {hint}it has {', '.join(known)}")
     wanted = set(asked) or set(known)
     return np.array([name in wanted for name in names])
 
@@ -190,7 +190,7 @@ def family_of(name: str) -> Family:
 def cached_weights(name: str, weights: str) -> dict[str, Any]:
     """Returns the state dict of torchvision's weights (`default`, or a name such as `COCO_V1`) from its cache.
 
-    Raises WeightsError that says where it looked and how to get them.
+    Raises WeightsError with the places searched and how to get them.
     """
     return _cached(name, _choice(name, weights))
 
@@ -222,7 +222,7 @@ def _known(family: Family, name: str) -> None:
 
 
 def _cached(name: str, weights: Any) -> dict[str, Any]:
-    """The state dict of torchvision's weights from its cache; WeightsError that says where, and how to get them."""
+    """The state dict of torchvision's weights from its cache; WeightsError with the place, and how to get them."""
     import torch
 
     file = Path(torch.hub.get_dir()) / "checkpoints" / weights.url.rsplit("/", 1)[-1]
@@ -230,7 +230,7 @@ def _cached(name: str, weights: Any) -> dict[str, Any]:
         raise WeightsError(
             f"the weights {weights} of {name} are not on this machine (looked for {file}); get them with "
             f"`python -c \"from torchvision.models import get_model; get_model('{name}', weights='{weights.name}')\"` "
-            f"where there is a network, or give a checkpoint of your own in `checkpoint`"
+            f"where there is a network, or give a custom checkpoint in `checkpoint`"
         )
     state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
     return state

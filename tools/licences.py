@@ -15,7 +15,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PARTS = ("", "foxglove", "notebook", "sim", "torch", "train")
+PARTS = ("", "perception", "view", "bags", "foxglove", "notebook", "sim", "torch", "train")
 """The dependencies that users install: those of the package itself, and its extras but `dev`."""
 COPYLEFT = re.compile(r"\bA?GPL|(?<!Lesser )(?<!Library )General Public License", re.IGNORECASE)
 

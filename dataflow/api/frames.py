@@ -34,7 +34,7 @@ def pandas() -> Any:
 def frame(
     stamps: npt.NDArray[np.int64], seconds: npt.NDArray[np.float64], columns: Mapping[str, Column], *, asked: bool
 ) -> pd.DataFrame:
-    """A table of columns by time. Columns that nobody `asked` for by name are left out where they hold nothing."""
+    """A table of columns by time. Without `asked`, columns are left out where they hold nothing."""
     kept = {name: data for name, data in columns.items() if asked or not _is_empty(data)}
     return pandas().DataFrame({"stamp": stamps, "seconds": seconds, **flat(kept)}, index=time_index(stamps))
 

@@ -44,7 +44,7 @@ class HandedFeed:
             log.add("setup", NEVER + 1, time.time_ns(), outputs=outputs, detail={"handed": True})
 
     def check(self, messages: Mapping[str, Message], stamp: int) -> dict[str, Message]:
-        """The messages by full names of their streams. Raises `ValueError` and `TypeError` as `Session.put` says."""
+        """The messages by full names of their streams. Raises `ValueError` and `TypeError` as `Session.put` does."""
         if stamp <= self.last:
             raise ValueError(f"stamp {stamp} comes after {self.last}: stamps must increase")
         named = {self._named(name, message, self.streams): message for name, message in messages.items()}

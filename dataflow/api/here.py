@@ -17,7 +17,7 @@ from dataflow.verification.processes import Call
 
 
 def call_here(calls: Sequence[Call], *, threads: int, **watching: Any) -> list[Any]:
-    """The answers to `calls`, one after the other; nobody watches over them. Raises `RunFailed` as workers do."""
+    """The answers to `calls`, one after the other, unsupervised. Raises `RunFailed` as workers do."""
     with limited_threads(threads):
         return [_answer(call) for call in calls]
 

@@ -251,7 +251,7 @@ def _losses(drops: Mapping[tuple[str, str], int]) -> tuple[tuple[str, str, int],
 
 
 def config_of(graph: Graph, log: LogPlan | None, *, paranoid: bool) -> ProcessConfig:
-    """Returns what a process of its own would be told."""
+    """Returns the configuration that a separate process would get."""
     replay: dict[str, Any] | None = None
     if log is not None:
         span = {"start": log.start, "end": log.end}

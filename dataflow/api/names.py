@@ -9,7 +9,7 @@ from dataflow.graph.problems import did_you_mean
 
 
 class StreamNameError(KeyError):
-    """A name that means no stream, or several where one is wanted: says which there are."""
+    """A name matches no stream, or several where one is wanted; the message lists the candidates."""
 
     def __str__(self) -> str:
         return str(self.args[0])

@@ -16,6 +16,7 @@ from dataflow.arguments import checked
 from dataflow.graph.model import Graph
 from dataflow.recording import Event, Recorded, Recording
 from dataflow.recording.layout import RECORDING
+from dataflow.recording.part_folder import parts_in
 from dataflow.reexecution.recorded_run import resolved_graph
 
 
@@ -27,7 +28,7 @@ def open(path: str | Path) -> RecordedStreams:
     for a file that is no MCAP.
     """
     file = Path(path).expanduser()
-    if not file.is_file():
+    if not file.is_file() and not (file.is_dir() and parts_in(file)):
         raise FileNotFoundError(f"no recording {file}" + (": that is a folder" if file.is_dir() else ""))
     recording = Recording(file)
     infos = [info for info in recording.streams.values() if not info.static and "/@/" not in f"/{info.name}"]

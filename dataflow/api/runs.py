@@ -20,7 +20,6 @@ from dataflow.graph import Graph as ResolvedGraph
 from dataflow.graph.problems import did_you_mean
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign
-from dataflow.interop.playing import play
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.recording.layout import BAG, RUN
@@ -29,6 +28,7 @@ from dataflow.supervision import plan
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import RunReport
+from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.verification.report import VerifyReport
 
 NOTEBOOK = "__main__:"
@@ -114,6 +114,7 @@ def run(
     `GraphError`, and `RunFailed` with the operator that failed.
     """
     built = resolved(graph, settings)
+    warn_of_gap(built)
     file = None if record is None else Path(record)
     report = LocalRun(built, paranoid=paranoid).execute(
         record=file, metadata=metadata_of(built, "run"), overwrite=overwrite, watch=watch
@@ -140,29 +141,35 @@ def replay(
 
     Recorded streams replace the sources; everything else runs again. `start`, `end`: seconds from the first message;
     operators begin in the state that they had at `start`. A ROS bag (file or folder) or any MCAP plays into `graph`
-    too, and its other topics are in the recording as they are: `maps` says which topic stands in for which stream
+    too, and its other topics are in the recording as they are: `maps` assigns topics to streams
     (`{"/camera/image_raw": "camera/image"}`), where types leave a choice; `clock` whether headers or log times stamp
     it. Raises `ReplayError`, `GraphError`, `RunFailed`, and `MappingError` that lists the topics.
     """
     path = Path(recording)
     facts: dict[str, dict[str, str]] = {}
     played: set[str] | None = None
+    shift = 0
     if graph is not None and is_foreign(path):
+        from dataflow.interop.playing import play  # bags need libraries that no recording does
+
         built = resolved(graph, settings)
         words = [f"{topic}={stream}" for topic, stream in (maps or {}).items()]
         with play(path, built, words, clock) as bag:
             log = plan_replay(bag, built, start=start, end=end)
+            warn_of_gap(built, bag)
             facts, played = {BAG: bag.facts()}, {p.topic for p in bag.played.values()}
+            shift = bag.clock.shift
     else:
         with Recording(path) as opened:
             built = recorded_graph(opened) if graph is None else resolved(graph, settings)
             log = plan_replay(opened, built, start=start, end=end)
+            warn_of_gap(built, opened)
     file = None if record is None else Path(record)
     report = LocalRun(built, log=log, paranoid=paranoid).execute(
         record=file, metadata=facts | metadata_of(built, "replay"), overwrite=overwrite, watch=watch
     )
     if file is not None and played is not None:
-        keep_untouched(file, path, played, log.start, log.end)
+        keep_untouched(file, path, played, log.start, log.end, shift=shift)
     return RunResult(report, file)
 
 
@@ -177,7 +184,7 @@ def launch(
     watch: Watch | None = None,
     **options: Any,
 ) -> RunResult:
-    """Runs a graph in processes of its own, as `dataflow run` does, and returns when it is done.
+    """Runs a graph in separate processes, as `dataflow run` does, and returns when it is done.
 
     `live`: sources run by the clock. Further options are the fields of `RunPlan`: `placement`, `rate`, `view_file`.
     Raises `GraphError`, `RunFailed`, and `ValueError` for operators of a notebook, which other processes cannot find.
@@ -243,7 +250,7 @@ def _defined_here(graph: ResolvedGraph) -> list[str]:
 
 
 def metadata_of(graph: ResolvedGraph, mode: str) -> dict[str, dict[str, str]]:
-    """Returns what a recording made here says of itself; the thread settings are those of this process."""
+    """Returns the metadata of a recording made here; the thread settings are those of this process."""
     facts = {
         "mode": mode,
         "started": str(time.time_ns()),

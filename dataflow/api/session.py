@@ -18,6 +18,7 @@ from dataflow.firing.threads import limited_threads
 from dataflow.messages.base import Message
 from dataflow.process.runners import Runners
 from dataflow.supervision.report import RunFailed
+from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.sync import Entry
 
 Made = dict[str, tuple[Message, ...]]
@@ -53,6 +54,7 @@ class Session:
         set up.
         """
         self.graph = resolved(graph, settings)
+        warn_of_gap(self.graph)
         self._names = self._chosen(outputs)
         self._made: dict[str, list[Message]] = {}
         self._runners = Runners()
@@ -99,7 +101,7 @@ class Session:
     def put(self, stamp: int, messages: Mapping[str, Message]) -> Made:
         """Hands in the messages of one stamp, by stream, and returns what the graph makes of them.
 
-        A step without messages says that time has passed. Raises `ValueError` for a stamp that does not come after
+        A step without messages advances time. Raises `ValueError` for a stamp that does not come after
         the last one and for streams that are not the sources', `TypeError` for messages of another type, and
         `RunFailed` with the operator that failed, after which the session is closed.
         """

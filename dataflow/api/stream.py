@@ -44,7 +44,7 @@ class RecordedStream(Sequence[Message]):
     @property
     def message_type(self) -> type[Message]:
         """The class of its messages. Raises `RecordingError` where this program has none for them."""
-        self._index  # noqa: B018  (raises the error that says why there is none)
+        self._index  # noqa: B018  (raises the error with the reason)
         found = self.info.message_type
         assert found is not None
         return found

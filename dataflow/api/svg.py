@@ -13,7 +13,7 @@ _FILLS = {"source": "#dcefe0", "sink": "#f3e3d3", "middle": "#e3e9f5"}
 
 
 def graph_svg(graph: Graph) -> str:
-    """The drawing. Triggers are solid lines, `Sampled` inputs dashed, `Batch` inputs dotted; a line tells its stream
+    """The drawing. Triggers are solid lines, `Sampled` inputs dashed, `Batch` inputs dotted; a line shows its stream
     when it is pointed at."""
     places = _places(layers(graph))
     width = max((x for x, _ in places.values()), default=0) + _BOX[0] + 8

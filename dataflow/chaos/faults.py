@@ -14,7 +14,7 @@ from dataflow.sync import Firing
 Step = Mapping[str, Message]
 
 HANG = 3600.0
-"""Seconds that a planned hang lasts, unless somebody ends it."""
+"""Seconds that a planned hang lasts, unless it is ended."""
 
 
 class InjectedFault(RuntimeError):

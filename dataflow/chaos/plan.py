@@ -25,7 +25,7 @@ from dataflow.sync.stamps import parse_duration
 
 
 class ChaosError(ValueError):
-    """A fault plan that cannot be followed: says where (in a file: the line), and what would be right.
+    """A fault plan is invalid; the message names the place (in a file: the line), and what would be right.
 
     `where` leads to what is wrong in the plan: ("faults", 2, "operator").
     """
@@ -229,7 +229,7 @@ def _check_parameter(entry: _Param, node: Node, where: tuple[str | int, ...]) ->
 
 
 def _merged(plan: _Plan, seed: int) -> Iterator[Fault]:
-    """All entries' faults by time; each entry draws from a generator of its own, so that one does not move another."""
+    """All entries' faults by time; each entry draws from a separate generator, so that one does not move another."""
     import heapq
 
     entries = [_times(entry, random.Random(f"{seed} {k}")) for k, entry in enumerate(plan.faults)]

@@ -12,9 +12,10 @@ from rich.markup import escape
 
 from dataflow.cli import completion
 from dataflow.cli.arguments import FLAG
-from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, interrupted_by_user, wants_traceback
+from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, forget_notes, interrupted_by_user, wants_traceback
 from dataflow.cli.plugins import CommandGroup, renamed
 from dataflow.cli.standard_output import OutputFailed
+from dataflow.extras import missing_extra
 
 app = typer.Typer(
     name="dataflow",
@@ -46,7 +47,9 @@ def dataflow(
     show_traceback: Annotated[
         bool,
         typer.Option(
-            "--traceback", metavar=FLAG, help="Show where an error comes from. Environment: DATAFLOW_TRACEBACK=1."
+            "--traceback",
+            metavar=FLAG,
+            help="Show where an error comes from; also behind the command. Environment: DATAFLOW_TRACEBACK=1.",
         ),
     ] = False,
 ) -> None:
@@ -70,6 +73,7 @@ def dataflow(
       dataflow view run.mcap
       dataflow run --help
     """
+    forget_notes()
     if show_traceback:
         os.environ[TRACEBACK] = "1"
 
@@ -87,6 +91,8 @@ def call() -> None:
         if wants_traceback():
             err.print(escape(traceback.format_exc().rstrip()), soft_wrap=True)
             fail(f"internal error: {type(error).__name__}: {error}")
+        elif hint := missing_extra(error):
+            fail(f"{error}; {hint}")
         else:
             fail(f"internal error: {type(error).__name__}: {error} (where: run it again with {TRACEBACK}=1)")
         sys.exit(COULD_NOT_RUN)

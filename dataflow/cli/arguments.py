@@ -58,6 +58,12 @@ Clock = Annotated[
         help="Of a bag: stamp messages with the time in their headers, or with the time of their recording.",
     ),
 ]
+Strict = Annotated[
+    bool,
+    typer.Option(
+        "--strict", metavar=FLAG, help="Of a bag: fail at a message that cannot be read, instead of counting it."
+    ),
+]
 OutInstead = Annotated[
     Path | None, typer.Option("--out", "-o", metavar="PATH", help="Instead of the argument: what to write.")
 ]

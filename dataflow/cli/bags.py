@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import typer
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
 from dataflow.cli.arguments import span, window
 from dataflow.cli.execution import Outputs, execute
-from dataflow.cli.output import count, err, out, plural, print_json, say, seconds, size, table
+from dataflow.cli.output import DIFFERENT, count, err, out, plural, print_json, say, seconds, shown, size, table
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,14 +22,6 @@ if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.interop.playing import Matching
     from dataflow.interop.streams import BagStreams
-
-WORDS = {
-    "reordered": "put in order",
-    "repeated": "recorded twice, once left out",
-    "moved": "of an equal stamp, put 1 ns later",
-    "merged": "joined with others of their stamp",
-    "before_epoch": "before 1970, left out",
-}
 
 
 def replay_bag(
@@ -41,9 +34,11 @@ def replay_bag(
     outputs: Outputs,
     options: dict[str, Any],
     *,
+    strict: bool = False,
     began: float,
     json: bool,
     quiet: bool,
+    verbose: bool,
 ) -> None:
     """Replays a bag through a graph, and says what of it is played, by which clock, and what was repaired."""
     from dataflow.editing.untouched import keep_untouched
@@ -54,14 +49,14 @@ def replay_bag(
     from dataflow.supervision.run import replay
 
     matching = match(path, graph, maps)
-    with _counting(quiet) as watch, BagStreams(path, matching.played(), clock, watch=watch) as opened:
+    with _counting(quiet) as watch, BagStreams(path, matching.played(), clock, watch=watch, strict=strict) as opened:
         if not quiet:
             say_what_is_played(matching, opened)
         whole = span(opened, plan_replay(opened, graph).streams)
         begin, finish = window(whole, start, end, path)
         shown = None if whole is None else (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
         metadata = {BAG: opened.facts()}
-        execute(
+        report = execute(
             lambda watch: replay(opened, graph=graph, start=start, end=end, watch=watch, metadata=metadata, **options),
             graph,
             outputs,
@@ -69,32 +64,48 @@ def replay_bag(
             began=began,
             json=json,
             quiet=quiet,
+            verbose=verbose,
         )
         if outputs.record is not None:
-            kept = keep_untouched(outputs.record, path, {p.topic for p in opened.played.values()}, begin, finish)
+            played = {p.topic for p in opened.played.values()}
+            kept = keep_untouched(outputs.record, path, played, begin, finish, shift=opened.clock.shift)
             if kept and not quiet:
                 names = ", ".join(sorted(kept))
                 say(f"[dim]kept as they are: {plural(sum(kept.values()), 'message')} of {escape(names)}[/]")
+        if start is None and end is None:
+            _say_what_was_not_read(opened, {name: held for name, (held, _) in report.streams.items()})
+        if opened.account.short:
+            raise typer.Exit(DIFFERENT)
+
+
+def _say_what_was_not_read(opened: BagStreams, delivered: Mapping[str, int]) -> None:
+    """Of topics that came with fewer messages than the bag holds of them: how many, and why."""
+    missing = {
+        played.topic
+        for stream, played in opened.played.items()
+        if not played.static and delivered.get(stream, 0) < opened.streams[stream].count
+    }
+    opened.look_for_unread(missing)
+    for topic, unread in opened.account.unread.items():
+        say(
+            f"[yellow]{escape(topic)}: {plural(unread.count, 'message')} that cannot be read passed over, the first: "
+            f"{escape(unread.reason)}[/]"
+        )
 
 
 def say_what_is_played(matching: Matching, opened: BagStreams) -> None:
     """A line for each stream, one for the clock, one for each repair, on standard error."""
-    for note in opened.notes:
-        say(f"[yellow]{escape(note)}[/]")
+    for line in opened.account.lines():
+        say(f"[yellow]{escape(line)}[/]")
     names = {wanted.stream: wanted.name for wanted in matching.wanted}
     for stream, played in opened.played.items():
         info = opened.streams[stream]
         what = opened.static_notes.get(stream, "static" if played.static else plural(info.count, "message"))
         say(f"[dim]{escape(played.topic)} → {escape(names[stream])}: {played.type}, {what}[/]")
-        if left := opened.left_out(played.topic):
-            say(
-                f"[yellow]{escape(played.topic)}: fields without a place in {played.type}: {escape(', '.join(left))}[/]"
-            )
+        if lost := opened.losses(played.topic):
+            say(f"[yellow]{escape(played.topic)}: no place in {played.type} for {escape(', '.join(lost))}[/]")
     what = "header stamps" if opened.clock.kind == "header" else "log times"
     say(f"[dim]stamped with {what}: {escape(opened.clock.why)}[/]")
-    for topic, mended in opened.repairs.items():
-        for name, number in mended.facts().items():
-            say(f"[dim]{escape(topic)}: {plural(number, 'message')} {WORDS[name]}[/]")
 
 
 @contextmanager
@@ -110,6 +121,7 @@ def _counting(quiet: bool) -> Iterator[Callable[[int], None] | None]:
 
 def describe_bag(path: Path, *, json: bool) -> None:
     """Prints the topics of a bag: types, counts, rates, and what each can be played as."""
+    from dataflow.interop.bag import shortfalls
     from dataflow.interop.opening import open_bag
     from dataflow.interop.playing import readings_of
     from dataflow.interop.summary import summaries, total
@@ -118,9 +130,10 @@ def describe_bag(path: Path, *, json: bool) -> None:
     bag = open_bag(path)
     try:
         rows = summaries(bag, readings_of(bag))
-        kind, notes = bag.kind, bag.notes
+        kind, notes = bag.kind, (*bag.notes, *shortfalls(bag))
     finally:
         bag.close()
+    shown(notes)
     whole = total(rows)
     if json:
         facts = {"path": str(path), "format": kind, "notes": list(notes), "bytes": _bytes(path)}

@@ -14,6 +14,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
 from dataflow.cli.arguments import (
+    FLAG,
     AnyRecording,
     Clock,
     End,
@@ -22,17 +23,20 @@ from dataflow.cli.arguments import (
     Overwrite,
     Start,
     Streams,
+    Strict,
     Without,
     chosen_streams,
     existing_recording,
     named_once,
     output_file,
 )
-from dataflow.cli.output import count, err, fail, friendly_errors, out, plural, print_json, say, table
+from dataflow.cli.output import DIFFERENT, count, err, fail, friendly_errors, out, plural, print_json, say, shown, table
 
 if TYPE_CHECKING:
+    from dataflow.interop.account import Account
     from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
+    from dataflow.interop.playing import Wishes
 
 Format = Literal[
     "mcap",
@@ -76,8 +80,16 @@ def convert(
         str | None, typer.Option("--action", metavar="STREAM", help="Of lerobot: the stream that is the action.")
     ] = None,
     task: Annotated[str, typer.Option("--task", metavar="TEXT", help="Of lerobot: what is done.")] = "",
+    depth: Annotated[
+        list[str] | None,
+        typer.Option("--depth", metavar="TOPIC", help="16-bit grey images of this topic are depth, in millimetres."),
+    ] = None,
+    lossy: Annotated[
+        bool, typer.Option("--lossy", metavar=FLAG, help="Write values with fewer bits where the format has fewer.")
+    ] = False,
+    strict: Strict = False,
     overwrite: Overwrite = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", metavar=" ", help="Show no progress.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="Show no progress.")] = False,
     json: Json = False,
 ) -> None:
     """Convert a recording or a bag to another format.
@@ -90,9 +102,14 @@ def convert(
     (3.0), every image of the first camera is a frame, with the newest message of every other stream; images stay
     images, lossless, since no video encoder is among the dependencies.
 
+    All that has no place is said, and stands in --json and in the metadata: messages that cannot be read, fields, bits,
+    shapes. Where a format has fewer bits than a stream, the command refuses; --lossy writes it all the same, and into
+    mcap 16-bit images as images of 8 bits.
+
     Exit codes:
 
       0    everything was written, but for what is said to be left out
+      1    it was written, and the file holds fewer messages than it promises
       2    could not convert: a wrong option, a stream that the format needs and the recording lacks
 
     Examples:
@@ -127,23 +144,31 @@ def convert(
 
             with _complete(output) as place:
                 drawn = draw_recording(recording, Save(place), streams, without, start, end, clock)
+            account, done = _left_by_rrd(recording)
             if json:
-                print_json(drawn_as_json(drawn[0], output))
+                print_json(drawn_as_json(drawn[0], output) | {"left_out": done.left_out, "source": account.as_json()})
             else:
                 report(*drawn, output)
-                _tell_rrd(recording)
+                _print_left_out(done)
+            _fail_if_short(account)
             return
+        from dataflow.interop.playing import Wishes
+
+        wishes = Wishes(tuple(depth or ()), lossy=lossy, strict=strict)
         if not to.startswith("lerobot") and (action is not None or task):
             raise fail("--action and --task are of --to lerobot and lerobot-v3")
         with (
-            _opened(recording, streams, without, start, end, clock) as material,
+            _opened(recording, streams, without, start, end, clock, wishes) as material,
             _progress(quiet or json) as watch,
             _complete(output) as place,
         ):
-            done = _export(material, place, to, watch, action, task)
+            done = _export(material, place, to, watch, action, task, lossy=lossy)
         done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
+        shown([*material.account.notes, *material.account.short])
+    account = material.account
     if json:
-        print_json(done.as_json())
+        print_json(done.as_json() | {"source": account.as_json()})
+        _fail_if_short(account)
         return
     made = table("stream", "messages", right=("messages",))
     for name, number in done.written.items():
@@ -151,13 +176,16 @@ def convert(
     out.print(made)
     if done.attachments or done.metadata:
         out.print(f"carried over: {plural(done.attachments, 'attachment')}, {count(done.metadata)} metadata records")
+    for line in account.lines(lambda topic: topic.strip("/")):
+        say(f"[yellow]{escape(line)}[/]")
     _print_left_out(done)
-    shown = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
-    for file in shown:
+    files = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
+    for file in files:
         out.print(f"wrote {escape(file)}", soft_wrap=True)
+    _fail_if_short(account)
 
 
-def _tell_rrd(recording: Path) -> None:
+def _left_by_rrd(recording: Path) -> tuple[Account, Exported]:
     from dataflow.interop.export.extras import tell_left_out
     from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
@@ -165,12 +193,20 @@ def _tell_rrd(recording: Path) -> None:
     done = Exported()
     with Material(recording) as material:
         tell_left_out(material, "rrd", done)
-    _print_left_out(done)
+        return material.account, done
 
 
 def _print_left_out(done: Exported) -> None:
     for name, reason in done.left_out.items():
         say(f"[yellow]left out:[/] {escape(name)}: {escape(reason)}")
+    for name, losses in done.lost.items():
+        for what, number in losses.items():
+            say(f"[yellow]no place for:[/] {escape(name)}: {escape(what)} ({count(number)})")
+
+
+def _fail_if_short(account: Account) -> None:
+    if account.short:
+        raise typer.Exit(DIFFERENT)
 
 
 def _check_output(output: Path, to: str, overwrite: bool) -> None:
@@ -202,13 +238,16 @@ def _opened(
     start: float | None,
     end: float | None,
     clock: Literal["auto", "header", "log"],
+    wishes: Wishes,
 ) -> Iterator[Material]:
     from dataflow.interop.export.material import Material
     from dataflow.recording.cutting import cut_of
     from dataflow.recording.layout import RECORDING
 
     metadata: Mapping[str, Mapping[str, str]]
-    with Material(path, clock=clock) as whole:
+    with Material(path, clock=clock, wishes=wishes) as whole:
+        if not any(topic.count for topic in whole.bag.topics.values()) and whole.account.notes:
+            raise fail(f"{path} holds no message that can be read: {'; '.join(whole.account.notes)}")
         names = [*whole.streams, *(t.name for t in whole.untouched)]
         namespace, metadata = "", {}
         if not whole.foreign:
@@ -226,7 +265,7 @@ def _opened(
             say(f"[dim]stamps: {escape(whole.clock)}[/]")
     begin = None if start is None else first + round(start * 1e9)
     finish = None if end is None else first + round(end * 1e9)
-    with Material(path, chosen, clock, begin, finish) as material:
+    with Material(path, chosen, clock, begin, finish, wishes) as material:
         yield material
 
 
@@ -237,8 +276,10 @@ def _export(
     watch: Callable[[int], None] | None,
     action: str | None,
     task: str,
+    *,
+    lossy: bool,
 ) -> Exported:
-    from dataflow.interop.export.datasets import DATASETS
+    from dataflow.interop.export.datasets import DATASETS, tell_untaken
     from dataflow.interop.export.extras import tell_left_out
     from dataflow.interop.export.foxglove import export_foxglove
     from dataflow.interop.export.own import export_own
@@ -246,7 +287,7 @@ def _export(
     from dataflow.interop.export.ros2 import export_ros2
     from dataflow.interop.export.tables import export_csv, export_parquet
 
-    done = Exported(watch=watch)
+    done = Exported(lossy=lossy, watch=watch)
     match to:
         case "mcap":
             export_own(material, output, done)
@@ -266,6 +307,7 @@ def _export(
             export_parquet(material, output, done)
         case _:
             DATASETS[to](material, output, done)
+            tell_untaken(material, to, done)
     if to not in _MCAP:
         tell_left_out(material, to, done)
     return done

@@ -92,6 +92,8 @@ def opened_streams(path: Path, clock: Choice) -> Recording | BagStreams:
     with closing(open_bag(path)) as bag:
         streams = readable(bag, path, clock)
     say(f"[dim]stamps: {escape(streams.clock.kind)}: {escape(streams.clock.why)}[/]")
+    for line in streams.account.lines():
+        say(f"[yellow]{escape(line)}[/]")
     return streams
 
 
@@ -157,7 +159,7 @@ def report(sink: ViewerSink, complete: bool, file: Path | None = None) -> None:
     if drawn.dropped:
         parts.append(f"{drawn.dropped:,} skipped because the viewer was too slow")
     if drawn.passed:
-        parts.append(f"{drawn.passed:,} passed over")
+        parts.append(f"{drawn.passed:,} passed over: of images, as many a second as --every of `dataflow view` says")
     if drawn.failed:
         parts.append(f"{drawn.failed:,} could not be drawn")
     if isinstance(sink.target, Save):

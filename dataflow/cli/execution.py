@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +13,12 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli.arguments import output_file
-from dataflow.cli.output import INTERRUPTED, about_a_file, err, fail, out, print_json, say, size
+from dataflow.cli.output import DIFFERENT, INTERRUPTED, about_a_file, err, fail, out, print_json, say, size
+from dataflow.cli.storage import named, recording_file
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
+    from dataflow.recording.parts import Storage
     from dataflow.supervision.report import RunFailed, RunReport, Watch
 
 
@@ -28,13 +31,18 @@ class Outputs:
     live_view: str | None
     open_file: bool
     overwrite: bool
+    storage: Storage | None = None
 
 
-def checked_outputs(record: Path | None, view: str | None, open_view: bool, overwrite: bool) -> Outputs:
+def checked_outputs(
+    record: Path | None, view: str | None, open_view: bool, overwrite: bool, storage: Storage | None = None
+) -> Outputs:
     """Checks the options that name outputs; ends the command where they contradict each other or a file is there."""
     saves = view is not None and view.endswith(".rrd")
     if view is not None and view not in ("spawn", "serve") and not saves:
         raise fail(f"--view {view!r}: expected spawn, serve, or a file name that ends in .rrd")
+    if view is not None:
+        import_module("rerun")  # before a run begins whose viewer could not
     if open_view and not saves:
         raise fail("--open opens a saved file: it needs --view FILE.rrd")
     if view == "spawn":
@@ -42,11 +50,12 @@ def checked_outputs(record: Path | None, view: str | None, open_view: bool, over
 
         require_display()
     if record is not None:
-        output_file(record, ".mcap", overwrite=overwrite, option="--record")
+        splitting = None if storage is None else storage.splitting
+        record = recording_file(named(record), splitting, overwrite=overwrite, option="--record")
     view_file = Path(view) if view is not None and saves else None
     if view_file is not None:
         output_file(view_file, ".rrd", overwrite=overwrite, option="--view")
-    return Outputs(record, view_file, None if saves else view, open_view, overwrite)
+    return Outputs(record, view_file, None if saves else view, open_view, overwrite, storage)
 
 
 def plan_options(
@@ -60,7 +69,12 @@ def plan_options(
     timeout: float,
 ) -> dict[str, Any]:
     """Returns the fields of a `RunPlan` that the options give."""
+    stored = {}
+    if outputs.storage is not None:
+        on_failure = outputs.storage.on_failure or graph.record.on_failure
+        stored["storage"] = replace(outputs.storage, on_failure=on_failure)
     return {
+        **stored,
         "placement": _placement(graph, one_process, process_each, place),
         "record": outputs.record,
         "overwrite": outputs.overwrite,
@@ -96,19 +110,21 @@ def execute(
     began: float,
     json: bool,
     quiet: bool,
+    verbose: bool = False,
 ) -> RunReport:
-    """Runs it; ends the command where it was interrupted."""
+    """Runs it; ends the command where it was interrupted, or where its recording lacks something."""
     from dataflow.cli.progress import RunDisplay, shown
     from dataflow.cli.report import print_report, report_json
     from dataflow.cli.viewers import attached_viewer, open_saved
     from dataflow.supervision.report import RunFailed
 
-    before = {file: _written(file) for file in (outputs.record, outputs.view_file) if file is not None}
+    before = {file: _written(file) for file in _files_of(outputs)}
     display = RunDisplay(err, sources=[node.name for node in graph.sources()], span=shown_span)
     try:
         with attached_viewer(outputs.live_view), shown(err, display, quiet=quiet) as watch:
             report = start(watch)
     except RunFailed as failure:
+        before = dict.fromkeys(_files_of(outputs)) | before
         _say_what_is_left(before, "end" if failure.interrupted else "failure")
         if about_a_file(failure.details) and (parameter := _named_by(failure, graph)) is not None:
             failure.add_note(f"name another with --set {parameter}=...")
@@ -116,11 +132,13 @@ def execute(
     if json:
         print_json({**report_json(report), "total_s": time.monotonic() - began})
     else:
-        print_report(out, report, total=time.monotonic() - began)
+        print_report(out, report, total=time.monotonic() - began, verbose=verbose)
     if outputs.open_file and outputs.view_file is not None:
         open_saved(outputs.view_file)
     if report.interrupted:
         raise typer.Exit(INTERRUPTED)
+    if any(facts.get("lost") or facts.get("deaths") for facts in report.files.values()):
+        raise typer.Exit(DIFFERENT)
     return report
 
 
@@ -130,6 +148,14 @@ def _named_by(failure: RunFailed, graph: Graph) -> str | None:
     texts = {name: value for name, value in (node.params if node else {}).items() if isinstance(value, str) and value}
     named = [name for name, value in texts.items() if str(Path(value)) in str(failure)]
     return f"{failure.operator}.{max(named, key=lambda name: len(texts[name]))}" if named else None
+
+
+def _files_of(outputs: Outputs) -> list[Path]:
+    """The files that outputs name, and the parts that there are of a recording."""
+    from dataflow.recording.parts import parts_of
+
+    parts = [] if outputs.record is None else parts_of(outputs.record)
+    return [file for file in (outputs.record, *parts, outputs.view_file) if file is not None]
 
 
 def _written(file: Path) -> tuple[int, int] | None:

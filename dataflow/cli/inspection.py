@@ -144,5 +144,5 @@ def _print_operators(found: Catalogue) -> None:
         flow = f"{takes} → {makes}" if takes and makes else f"source of {makes}" if makes else f"sink of {takes}"
         out.print(Padding(Text(flow, style="dim"), (0, 0, 0, 4)))
         out.print(Padding(Text(spec.doc.partition("\n\n")[0].replace("\n", " ")), (0, 0, 0, 4)))
-    for failure in found.failures:
-        say(f"[red]failed to import[/] {escape(str(failure))}")
+    for line in found.failure_lines():
+        say(f"[red]{escape(line)}[/]")

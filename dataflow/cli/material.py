@@ -37,8 +37,8 @@ Word = str | None
 @contextmanager
 def opened_material(path: Path) -> Iterator[Origin]:
     """An MCAP file; other bags are answered with what makes one of them."""
-    from dataflow.recording.container import MAGIC
     from dataflow.recording.copying import Origin
+    from dataflow.recording.ending import MAGIC
 
     if path.is_dir():
         raise fail(f"{path} is a folder: name its .mcap file, or make one file of it: {converting(path)}")

@@ -20,7 +20,7 @@ from dataflow.cli.material import (
     print_edited,
     refuse_itself,
 )
-from dataflow.cli.output import count, fail, friendly_errors, out, plural, print_json, say, size, table
+from dataflow.cli.output import count, fail, friendly_errors, out, plural, print_json, say, shown, size, table
 
 
 def merge(
@@ -119,11 +119,19 @@ def recover(
     """
     from dataflow.cli.output import DIFFERENT
     from dataflow.editing.recover import recover as save
+    from dataflow.interop.opening import is_ros_bag
+    from dataflow.recording.index import NO_END
 
     with friendly_errors(), copying("recovering", quiet or json) as watch:
         existing(recording, "a recording")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
-        done = save(recording, output, compression=compression, overwrite=overwrite, watch=watch)
+        if is_ros_bag(recording):
+            from dataflow.editing.recover_bag import recover_bag
+
+            done = recover_bag(recording, output)
+        else:
+            done = save(recording, output, compression=compression, overwrite=overwrite, watch=watch)
+        shown([NO_END, *done.damage])
     if json:
         print_json(done.as_json())
     else:

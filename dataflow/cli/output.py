@@ -10,6 +10,7 @@ import sys
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -18,7 +19,7 @@ from rich.markup import escape
 from rich.segment import Segment
 from rich.text import Text
 
-from dataflow.text import visible_json, visible_lines
+from dataflow.text import visible, visible_json, visible_lines
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -61,8 +62,26 @@ out = _console(stderr=False)
 err = _console(stderr=True)
 
 
+_notes: dict[str, Path] = {}
+"""Notes of the files that the command has opened, and the file of each."""
+_said: list[str] = []
+
+
+def shown(notes: Iterable[str]) -> None:
+    """Notes of files that a command has printed in its own way."""
+    _said.extend(notes)
+
+
+def forget_notes() -> None:
+    """Begins a command: what another one in this process has opened and said is not its own."""
+    _notes.clear()
+    _said.clear()
+
+
 def print_json(value: Any) -> None:
-    """Prints one JSON document on standard output."""
+    """Prints one JSON document on standard output; an object also holds the notes of the files that were opened."""
+    if isinstance(value, dict) and _notes and "notes" not in value:
+        value = value | {"notes": list(_notes)}
     print(_json(value, indent=2))
 
 
@@ -94,6 +113,7 @@ def jsonable(value: Any) -> Any:
 
 def say(text: str) -> None:
     """A line about what happens, on standard error. `text` is markup."""
+    _said.append(text)
     err.print(text, soft_wrap=not err.is_terminal)
 
 
@@ -117,9 +137,19 @@ def own_traceback(text: str) -> str:
 
 @contextmanager
 def friendly_errors() -> Iterator[None]:
-    """Turns the errors that bad input causes into one clear message and an exit code; others pass."""
+    """Turns the errors that bad input causes into one clear message and an exit code; others pass.
+
+    What the opening of files brings to light is printed at the end, as far as the command has not said it.
+    """
+    from dataflow.recording.notices import listening
+
     try:
-        yield
+        with listening(_take):
+            yield
+        _say_notes()
+    except typer.Exit:
+        _say_notes()
+        raise
     except Exception as error:
         if interrupted_by_user(error):
             raise KeyboardInterrupt from None
@@ -133,6 +163,17 @@ def friendly_errors() -> Iterator[None]:
             err.print(escape(message[1:]), soft_wrap=True)
             raise typer.Exit(code) from None
         raise fail(message, details=details, code=code) from None
+
+
+def _take(file: Path, note: str) -> None:
+    _notes.setdefault(note, file)
+
+
+def _say_notes() -> None:
+    for note, file in sorted(_notes.items(), key=lambda item: -len(item[0])):
+        if not any(note in text or escape(note) in text for text in _said):
+            where = "" if note.startswith(file.name) else f"{file.name}: "
+            say(f"[yellow]{escape(where + note)}[/]")
 
 
 def interrupted_by_user(error: BaseException | None) -> bool:
@@ -200,11 +241,23 @@ def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) 
     from rich import box
     from rich.table import Table
 
-    made = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    class Rows(Table):
+        """Shows a line break in a cell as its escape: a name in somebody's file cannot pass for another row."""
+
+        def add_row(self, *cells: RenderableType | None, **more: Any) -> None:
+            super().add_row(*(_one_line(cell) for cell in cells), **more)
+
+    made = Rows(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
         number = column in right
         made.add_column(column, justify="right" if number else "left", no_wrap=number, overflow="fold")
     return made
+
+
+def _one_line(cell: RenderableType | None) -> RenderableType | None:
+    if isinstance(cell, str):
+        return visible(cell)
+    return Text(visible(cell.plain), style=cell.style) if isinstance(cell, Text) and "\n" in cell.plain else cell
 
 
 def count(number: float) -> str:

@@ -34,7 +34,7 @@ def set_(
     It changes between two firings; the value that the operator took is printed. The change stands in the recording at
     its place, and `verify` repeats it there. `dataflow param list` tells which parameters can change.
 
-    Exit codes: 0 changed; 1 refused (no such parameter, a value that it cannot take), or nobody answered; 2 no such
+    Exit codes: 0 changed; 1 refused (no such parameter, a value that it cannot take), or no answer; 2 no such
     graph or operator.
 
     Examples:
@@ -195,7 +195,7 @@ def load(
 
     Names are checked before anything is changed. It stops at the first value that is refused.
 
-    Exit codes: 0 all set; 1 refused, or nobody answered; 2 no such file, graph, operator or parameter.
+    Exit codes: 0 all set; 1 refused, or no answer; 2 no such file, graph, operator or parameter.
 
     Examples:
 
@@ -298,7 +298,7 @@ def _asked(
 def _say_who_is_missing(operators: list[str], values: dict[str, Any], timeout: float) -> None:
     missing = [op for op in operators if op not in values]
     if missing:
-        raise fail(f"nobody answered for {', '.join(missing)} within {timeout:g} s", code=DIFFERENT)
+        raise fail(f"no answer for {', '.join(missing)} within {timeout:g} s", code=DIFFERENT)
 
 
 def _declared(graph: Graph, operator: str, name: str) -> dict[str, str]:

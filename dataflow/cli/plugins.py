@@ -7,6 +7,7 @@ that does not load is listed with its error.
 
 from __future__ import annotations
 
+import os
 import traceback
 from collections.abc import Mapping
 from functools import cache
@@ -19,8 +20,9 @@ from typer.core import TyperGroup
 
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.commands import Commands, paragraphs
-from dataflow.cli.output import COULD_NOT_RUN, err, fail, say, wants_traceback
+from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, say, wants_traceback
 from dataflow.cli.values import take_plainly
+from dataflow.extras import missing_extra
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -91,7 +93,16 @@ class CommandGroup(TyperGroup):
         if args and self.get_command(ctx, args[0]) is None:
             for name in advertised():  # so that they are suggested too
                 self.get_command(ctx, name)
-        return super().resolve_command(ctx, args)
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command, _without_traceback(rest)
+
+
+def _without_traceback(words: list[str]) -> list[str]:
+    """The words of a command without `--traceback`, which may stand behind it too, where one types it."""
+    end = words.index("--") if "--" in words else len(words)
+    if "--traceback" in words[:end]:
+        os.environ[TRACEBACK] = "1"
+    return [*(word for word in words[:end] if word != "--traceback"), *words[end:]]
 
 
 def tidy(command: Any, ctx: Any) -> None:
@@ -152,6 +163,7 @@ def _command(entry: EntryPoint) -> Any:
 def _broken(entry: EntryPoint, error: Exception) -> Any:
     package = f" of package {entry.dist.name}" if entry.dist is not None else ""
     reason = f"{entry.value}{package}: {type(error).__name__}: {error}"
+    reason = "; ".join(filter(None, (reason, missing_extra(error))))
     app = typer.Typer(add_completion=False)
     trace = "".join(traceback.format_exception(error)).rstrip()
 

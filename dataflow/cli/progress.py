@@ -94,9 +94,15 @@ class RunDisplay:
         if self.began is None:
             return ""
         spent = time.monotonic() - self.began
+        left = self.left(total, completed)
+        return f"{seconds(spent)}, {left}" if left else seconds(spent)
+
+    def left(self, total: float | None, completed: float) -> str:
+        """An estimate of what is left, in words; nothing while there is none."""
+        spent = 0.0 if self.began is None else time.monotonic() - self.began
         if total is None or completed <= 0 or completed >= total or spent < 1.0:
-            return seconds(spent)
-        return f"{seconds(spent)}, {seconds(spent * (total - completed) / completed)} left"
+            return ""
+        return f"{seconds(spent * (total - completed) / completed)} left"
 
     def __rich__(self) -> RenderableType:
         if self.status is None or not self.status.operators:
@@ -198,7 +204,8 @@ def _line_printer(console: Console, display: RunDisplay, every: float = 5.0) -> 
         if now >= due or status.phase != phase:
             due, phase = now + every, status.phase
             spent = seconds(time.time() - status.started) if status.started else ""
-            note = waiting_for(status) or display.reached(status)
+            left = display.left(*display.fraction(status)) if status.phase not in ENDING else ""
+            note = waiting_for(status) or ", ".join(part for part in (display.reached(status), left) if part)
             console.print(Text(f"{status.phase:<8}  {spent:>8}  {note}".rstrip()), soft_wrap=True)
 
     return watch

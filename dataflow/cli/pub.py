@@ -53,7 +53,7 @@ def pub(
     `use: dataflow.remote:Twist`, or any other message type. What it was given is recorded, and replays, as what any
     other source gives. Lines that `dataflow echo --json` prints can be given again.
 
-    Exit codes: 0 given; 1 refused, or nobody answered; 2 no such graph or source, or fields that do not fit.
+    Exit codes: 0 given; 1 refused, or no answer; 2 no such graph or source, or fields that do not fit.
 
     Examples:
 

@@ -12,11 +12,11 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json, Overwrite, chosen_streams, output_file
+from dataflow.cli.arguments import FLAG, Json, Overwrite, chosen_streams
 from dataflow.cli.live import GraphName, Streams, Wait, running_graph, say_followed
 from dataflow.cli.material import Compression
 from dataflow.cli.output import count, err, fail, friendly_errors, out, plural, print_json, say, size, table
-from dataflow.cli.quantities import parsed_duration, parsed_size
+from dataflow.cli.storage import MODES, Readable, SplitEvery, SplitSize, named, recording_file, splitting_of
 
 if TYPE_CHECKING:
     from dataflow.client.recorder import Tally
@@ -29,13 +29,9 @@ def record(
         Path,
         typer.Option("--out", "-o", metavar="OUT.mcap", help="The file to write; NAME_000.mcap and so on if split."),
     ] = Path("recording.mcap"),
-    split_every: Annotated[
-        str | None,
-        typer.Option("--split-every", metavar="TIME", help="A new file after this event time: 60s, 5min."),
-    ] = None,
-    split_size: Annotated[
-        str | None, typer.Option("--split-size", metavar="SIZE", help="A new file after so many bytes: 500MB, 2GB.")
-    ] = None,
+    split_every: SplitEvery = None,
+    split_size: SplitSize = None,
+    readable: Readable = "owner",
     compression: Compression = "zstd",
     duration: Annotated[float | None, typer.Option("--seconds", metavar="SECONDS", help="Stop after so long.")] = None,
     graph: GraphName = None,
@@ -66,16 +62,15 @@ def record(
       dataflow record --split-size 500MB --seconds 600 -o drive.mcap
     """
     from dataflow.client.attach import graph_of
-    from dataflow.client.recorder import AttachedRecorder, Splitting, subscribed
+    from dataflow.client.recorder import AttachedRecorder, subscribed
     from dataflow.client.recorder import record as write
     from dataflow.reexecution.recorded_run import graph_metadata
 
     with friendly_errors():
-        every = None if split_every is None else parsed_duration("--split-every", split_every)
-        most = None if split_size is None else parsed_size("--split-size", split_size)
+        splitting = splitting_of(split_every, split_size)
         if duration is not None and not 0 < duration < 1e9:
             raise fail(f"--seconds {duration:g}: expected seconds, more than 0")
-        output_file(output, ".mcap", overwrite=overwrite or every is not None or most is not None, option="--out")
+        output = recording_file(named(output), splitting, overwrite=overwrite, option="--out")
         found = running_graph(graph, wait)
         if not quiet:
             say_followed(found)
@@ -83,7 +78,6 @@ def record(
         chosen = chosen_streams(streams, running.streams, running.namespace)
         about = {"mode": "recorded from outside", "started": str(time.time_ns())}
         metadata = {**graph_metadata(running), "dataflow:run": about}
-        splitting = Splitting(most, every)
         with (
             subscribed(found, chosen) as subscription,
             AttachedRecorder(
@@ -94,6 +88,7 @@ def record(
                 splitting=splitting,
                 compression=compression,
                 overwrite=overwrite,
+                mode=MODES[readable],
             ) as recorder,
             _shown(recorder.tally, quiet or json) as show,
         ):

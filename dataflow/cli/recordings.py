@@ -19,9 +19,11 @@ from dataflow.cli.output import (
     plural,
     print_json,
     seconds,
+    shown,
     size,
     table,
 )
+from dataflow.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -55,6 +57,7 @@ def info(
     from dataflow.cli.bags import describe_bag
     from dataflow.interop.opening import is_foreign
     from dataflow.recording import Recording
+    from dataflow.recording.index import NO_END
     from dataflow.recording.info import describe
     from dataflow.recording.layout import RECORDING
 
@@ -66,6 +69,7 @@ def info(
             return
     with friendly_errors(), Recording(recording) as opened:
         described = describe(opened)
+        shown([NO_END, *described.damage])
         computed = dict(opened.digests()) if digests else None
     if json:
         print_json(described.as_json() | ({} if computed is None else {"digests": computed}))
@@ -95,7 +99,7 @@ def _facts(described: Description) -> Table:
     grid.add_column(overflow="fold")
 
     def row(name: str, value: str, style: str = "") -> None:
-        grid.add_row(name, Text(value, style=style))
+        grid.add_row(name, Text(visible(value), style=style))
 
     made = described.metadata
     uncompressed = sum(s.bytes for s in described.streams)
@@ -221,7 +225,8 @@ def diff(
             raise fail(f"--tolerance {tolerance:g}: expected a number, 0 or more")
         spaces = {opened.metadata.get(RECORDING, {}).get("namespace", "") for opened in (first, second)}
         namespace = spaces.pop() if len(spaces) == 1 else ""
-        names = chosen_streams(streams, sorted({*first.streams, *second.streams}), namespace)
+        known = sorted({*first.streams, *second.streams})
+        names = chosen_streams(streams, known, namespace) if streams else None
         report = compare(first, second, streams=names, tolerance=tolerance)
     if json:
         print_json(report.as_json())

@@ -19,6 +19,7 @@ from dataflow.cli.arguments import (
     Network,
     Settings,
     Start,
+    Strict,
     existing_recording,
     find_modules_in,
     graph_file,
@@ -44,8 +45,10 @@ from dataflow.cli.run_options import (
     Replace,
     Step,
     Timeout,
+    Verbose,
     View,
 )
+from dataflow.cli.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -60,6 +63,7 @@ def replay(
     ] = None,
     maps: Map = None,
     clock: Clock = "auto",
+    strict: Strict = False,
     settings: Settings = None,
     path: ModuleFolders = None,
     start: Start = None,
@@ -78,6 +82,11 @@ def replay(
     place: Place = None,
     record: Record = None,
     compression: Compression = None,
+    split_every: SplitEvery = None,
+    split_size: SplitSize = None,
+    keep_disk: KeepDisk = None,
+    record_failure: OnFailure = None,
+    readable: Readable = "owner",
     view: View = None,
     open_view: Open = False,
     complete: Annotated[
@@ -90,6 +99,7 @@ def replay(
         ),
     ] = None,
     overwrite: Replace = False,
+    verbose: Verbose = False,
     json: Json = False,
 ) -> None:
     """Replay a recording through the graph that made it, or another one.
@@ -145,6 +155,7 @@ def replay(
             raise fail("--set changes a graph file: name it with --graph")
         if compression is not None and record is None:
             raise fail("--compression is of a recording: name one with --record")
+        storage = storage_of(record, split_every, split_size, keep_disk, record_failure, readable)
         packing = {} if compression is None else {"compression": compression}
         find_modules_in(path)
         early = None if complete is not None else stack.enter_context(early_nursery())
@@ -152,6 +163,7 @@ def replay(
         from dataflow.interop.opening import is_foreign, open_bag
         from dataflow.recording import Recording
         from dataflow.recording.cutting import cut_of
+        from dataflow.recording.index import NO_END
         from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
         from dataflow.supervision.replay import plan_replay
         from dataflow.supervision.run import replay as replay_recording
@@ -165,14 +177,15 @@ def replay(
             if complete is not None:
                 raise fail("--complete needs the firing records of a run, which bags do not hold")
             loaded = load_graph(graph_file(graph), settings=settings or ())
-            outputs = checked_outputs(record, view, open_view, overwrite)
+            outputs = checked_outputs(record, view, open_view, overwrite, storage)
             options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
             options |= {"early": early, "paused": step, "controls": keys(quiet or json), **packing}
+            if storage.splitting.splits:
+                raise fail("of a bag no split recording is made; split it afterwards: dataflow split FILE.mcap")
             if loop != 1:
                 raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
-            replay_bag(
-                recording, loaded, maps or (), clock, start, end, outputs, options, began=began, json=json, quiet=quiet
-            )
+            words = (recording, loaded, maps or (), clock, start, end, outputs, options)
+            replay_bag(*words, strict=strict, began=began, json=json, quiet=quiet, verbose=verbose)
             return
         with Recording(recording) as opened:
             if graph is None:
@@ -195,12 +208,12 @@ def replay(
             begin, finish = window(whole, start, end, recording)
             if opened.torn:
                 name = escape(str(recording))
-                say(f"[yellow]{name} has no proper end:[/] what its writer had not stored when it died is missing")
+                say(f"[yellow]{name} {escape(NO_END)}[/]")
             part = cut_of(opened.metadata)
             begin = part.start if begin is None and part is not None else begin
             if begin is not None:
                 _say_what_begins_fresh(opened, loaded, begin)
-        outputs = checked_outputs(record, view, open_view, overwrite)
+        outputs = checked_outputs(record, view, open_view, overwrite, storage)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         shown = None
         if whole is not None:
@@ -218,6 +231,7 @@ def replay(
                 began=began,
                 json=json,
                 quiet=quiet,
+                verbose=verbose,
             )
             return dict(report.streams)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,20 @@ from rich.text import Text
 from dataflow.cli.output import count, plural, seconds, size, table
 from dataflow.records.figures import figures
 from dataflow.supervision.report import RunReport
-from dataflow.sync import TICK
+from dataflow.sync import MISSES, TICK
+from dataflow.sync.stamps import format_stamp
 
 _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""
 
 
-def print_report(console: Console, report: RunReport, *, total: float | None = None) -> None:
-    """Prints operators, figures of metrics sinks side by side, losses, restarts, notes, files.
+SCORES = ("rmse", "precision", "recall", "f1", "iou", "accuracy", "error")
+"""Parts of the names of figures that say how good something is."""
+MOST_SCORES, MOST_LOSSES, MOST_KEPT = 3, 4, 5
+
+
+def print_report(console: Console, report: RunReport, *, total: float | None = None, verbose: bool = True) -> None:
+    """Prints what matters first: scores or rates, losses, files. `verbose`: then tables of operators, figures, losses.
 
     `total`: seconds that the whole command took, with starting and closing its processes.
     """
@@ -33,6 +40,18 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
         "" if total is None else f"; {seconds(total)} with start and end",
     )
     console.print(title)
+    for line in (_scores(report) or _rates(report), _losses_in_short(report) if report.wall else None, *_files(report)):
+        if line is not None:
+            console.print(line, soft_wrap=line.plain.startswith(WROTE))
+    for operator, times in report.restarts.items():
+        console.print(Text(f"{operator} was restarted {plural(times, 'time')}", style="yellow"))
+    for note in dict.fromkeys(report.notes):
+        console.print(Text(f"note: {note}", style="dim"))
+    if verbose:
+        _print_tables(console, report)
+
+
+def _print_tables(console: Console, report: RunReport) -> None:
     if report.wall:
         console.print(_operators(report))
     blocks = [
@@ -44,16 +63,115 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
         console.print(Columns(blocks, padding=(0, 3)))
     if any(report.drops.values()) or any(report.waits.values()):
         console.print(_losses(report))
-    for operator, times in report.restarts.items():
-        console.print(Text(f"{operator} was restarted {plural(times, 'time')}", style="yellow"))
-    for note in report.notes:
-        console.print(Text(f"note: {note}", style="dim"))
+
+
+def _scores(report: RunReport) -> Text | None:
+    """The first scores of each operator that sums some up; None where none does."""
+    found = []
+    for operator, summary in report.summaries.items():
+        scores = [
+            f"{name} {text}" for name, text in figures(summary).items() if any(part in name.split() for part in SCORES)
+        ]
+        if scores:
+            found.append(f"{operator}: {', '.join(scores[:MOST_SCORES])}")
+    return Text(f"scores  {'; '.join(found)}") if found else None
+
+
+def _rates(report: RunReport) -> Text | None:
+    """The rate of every source, and of the slowest operator behind them."""
+    rates = {name: rate for name in report.operators if (rate := _rate(report, name)) is not None}
+    sources = {name: rate for name, rate in rates.items() if name in report.sources}
+    others = {name: rate for name, rate in rates.items() if name not in report.sources}
+    if not rates:
+        return None
+    words = [f"{name} {rate:.1f} Hz" for name, rate in sources.items()]
+    if others:
+        slowest = min(others, key=lambda name: others[name])
+        words.append(f"{'slowest: ' if len(others) > 1 else ''}{slowest} {others[slowest]:.1f} Hz")
+    return Text(f"rates   {', '.join(words)}")
+
+
+def _rate(report: RunReport, operator: str) -> float | None:
+    """Firings per second of event time; None where there is no span of it."""
+    firings = report.operators[operator].firings
+    if report.first is None or report.last is None or report.last <= report.first or firings < 2:
+        return None
+    return (firings - 1) / ((report.last - report.first) * 1e-9)
+
+
+def _losses_in_short(report: RunReport) -> Text:
+    """Drops by input, the most first, and what no recording holds; waits and misses are in the table."""
+    found = [(n, operator, name, why) for operator, name, why, n in dropped(report)]
+    worst = [
+        f"{n:,} {_where(operator, name)} ({_meaning(name, why) or why})"
+        for n, operator, name, why in sorted(found)[::-1]
+    ]
+    words = []
+    if found:
+        more = f", and at {plural(len(worst) - MOST_LOSSES, 'more input')}" if len(worst) > MOST_LOSSES else ""
+        words.append(f"{plural(sum(n for n, *_ in found), 'message')} dropped: {', '.join(worst[:MOST_LOSSES])}{more}")
     for facts in report.files.values():
-        if facts:
-            line = f"wrote {facts['path']} ({plural(facts['messages'], 'message')}, {size(facts['bytes'])})"
-            console.print(Text(line), soft_wrap=True)
-            if facts.get("failed"):
-                console.print(Text(f"  {plural(facts['failed'], 'message')} could not be drawn", style="yellow"))
+        if lost := facts.get("lost"):
+            words.append(_not_recorded(lost))
+        if deaths := facts.get("deaths"):
+            words.append(
+                f"what the recorder, which died {plural(deaths, 'time')}, had not stored, and what came until the next "
+                "one began: the files before lie beside the last ones"
+            )
+    return Text(f"lost    {'; '.join(words) or 'nothing'}", style="yellow" if words else "")
+
+
+def dropped(report: RunReport) -> list[tuple[str, str, str, int]]:
+    """Returns (operator, input, reason, count) of what was dropped; a miss is none."""
+    return [(o, name, why, n) for o, drops in report.drops.items() for name, why, n in drops if why not in MISSES and n]
+
+
+def _not_recorded(lost: Mapping[str, Any]) -> str:
+    spans = [
+        f"{format_stamp(since)} to {'the end' if until is None else format_stamp(until)}"
+        for since, until in lost["spans"]
+    ]
+    when = f", from {' and from '.join(spans)}" if spans else ""
+    count_of = f"{plural(lost['messages'], 'message')} and {plural(lost['firings'], 'call')} not recorded"
+    return f"{count_of}{when} ({lost['reasons'][0]})" if lost["reasons"] else f"{count_of}{when}"
+
+
+WROTE = "wrote   "
+
+
+def _files(report: RunReport) -> list[Text]:
+    lines: list[Text] = []
+    for facts in report.files.values():
+        if "kept" in facts:
+            kept = facts["kept"]
+            lines += [
+                Text(f"kept    {one['path']} ({one['reasons'][0]['what']}, {size(one['bytes'])})")
+                for one in kept[:MOST_KEPT]
+            ]
+            if len(kept) > MOST_KEPT:
+                lines.append(Text(f"kept    {len(kept) - MOST_KEPT} more in {facts['path']}"))
+            if not kept:
+                lines.append(Text("kept    nothing: no trigger came"))
+        elif facts:
+            lines.append(Text(WROTE + _written(facts)))
+        if facts.get("failed"):
+            lines.append(Text(f"        {plural(facts['failed'], 'message')} could not be drawn", style="yellow"))
+    return lines
+
+
+def _written(facts: Mapping[str, Any]) -> str:
+    parts = facts.get("parts", ())
+    last = f" to {Path(parts[-1]).name}" if len(parts) > 1 else ""
+    words = [plural(facts["messages"], "message"), size(facts["bytes"])]
+    if len(parts) > 1:
+        words.insert(0, f"{len(parts)} files")
+    if facts.get("deleted"):
+        words.append(f"{plural(facts['deleted'], 'older file')} deleted")
+    return f"{facts['path']}{last} ({', '.join(words)})"
+
+
+def _where(operator: str, input_name: str) -> str:
+    return f"{operator}.{input_name}" if input_name else operator
 
 
 def _outcome(report: RunReport) -> tuple[str, str]:
@@ -67,23 +185,24 @@ def _operators(report: RunReport) -> Table:
     """A row for each operator; Hz is firings per second of event time, CPU that of its calls, wall s their
     wall time. What is nothing of all has no column."""
     timeouts, late = _total(report.waits, "timeout"), _total(report.waits, "late")
-    dropped = {name: counts.dropped for name, counts in report.operators.items()}
-    counted = {
+    lost: Counter[str] = Counter()
+    for operator, _, _, number in dropped(report):
+        lost[operator] += number
+    counted: dict[str, Mapping[str, int]] = {
         heading: numbers
-        for heading, numbers in (("dropped", dropped), ("timeouts", timeouts), ("late", late))
+        for heading, numbers in (("dropped", lost), ("timeouts", timeouts), ("late", late))
         if any(numbers.values())
     }
     numbers = ("firings", "out", "Hz", *counted, "CPU s", "ms each", "wall s")
     made = table("operator", *numbers, right=numbers)
     made.padding = (0, 0, 0, 0 if counted else 1)  # one that has all columns fits 80
     made.columns[0].min_width = 12
-    span = 0.0 if report.first is None or report.last is None else (report.last - report.first) * 1e-9
     for name, counts in report.operators.items():
         made.add_row(
             Text(name),
             count(counts.firings) if counts.firings else "",
             count(counts.emitted) if counts.emitted else "",
-            f"{(counts.firings - 1) / span:.1f}" if counts.firings > 1 and span > 0 else "",
+            "" if (rate := _rate(report, name)) is None else f"{rate:.1f}",
             *(Text(count(n) if (n := of.get(name, 0)) else "", style="yellow") for of in counted.values()),
             f"{counts.cpu_ns * 1e-9:,.2f}",
             f"{counts.cpu_ns * 1e-6 / counts.firings:,.2f}" if counts.firings else "",
@@ -132,7 +251,8 @@ def _losses(report: RunReport) -> Table:
     for operator in dict.fromkeys((*report.operators, *report.drops, *report.waits)):
         drops = report.drops.get(operator, ())
         for input_name, reason, number in drops:
-            _add(made, operator, input_name, f"dropped: {reason}", number, _meaning(input_name, reason))
+            what = reason if reason in MISSES else f"dropped: {reason}"
+            _add(made, operator, input_name, what, number, _meaning(input_name, reason))
         dropped_late = {input_name: n for input_name, reason, n in drops if reason == "late"}
         for input_name, what, number in report.waits.get(operator, ()):
             if what == "timeout":
@@ -149,8 +269,9 @@ def _meaning(input_name: str, reason: str) -> str:
 
 
 def _add(made: Table, operator: str, input_name: str, what: str, number: int, meaning: str) -> None:
-    where = f"{operator}.{input_name}" if input_name else operator
-    made.add_row(Text(where), Text(what, style="yellow"), count(number), Text(meaning, style="dim"))
+    made.add_row(
+        Text(_where(operator, input_name)), Text(what, style="yellow"), count(number), Text(meaning, style="dim")
+    )
 
 
 def timing(report: RunReport) -> str:
@@ -173,7 +294,7 @@ def report_json(report: RunReport) -> dict[str, Any]:
             name: {
                 "firings": c.firings,
                 "emitted": c.emitted,
-                "dropped": c.dropped,
+                "dropped": sum(n for operator, _, _, n in dropped(report) if operator == name),
                 "cpu_ms": c.cpu_ns * 1e-6,
                 "wall_ms": c.wall_ns * 1e-6,
             }

@@ -36,8 +36,10 @@ from dataflow.cli.run_options import (
     Replace,
     Step,
     Timeout,
+    Verbose,
     View,
 )
+from dataflow.cli.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
@@ -65,9 +67,15 @@ def run(
     place: Place = None,
     record: Record = None,
     compression: Compression = None,
+    split_every: SplitEvery = None,
+    split_size: SplitSize = None,
+    keep_disk: KeepDisk = None,
+    record_failure: OnFailure = None,
+    readable: Readable = "owner",
     view: View = None,
     open_view: Open = False,
     overwrite: Replace = False,
+    verbose: Verbose = False,
     json: Json = False,
 ) -> None:
     """Run a graph.
@@ -92,6 +100,7 @@ def run(
       dataflow run graphs/synthetic_rgbd.yaml --process-each --rate 1 --json
       dataflow run graphs/simulated_robot.yaml --rate 1 --step --view spawn
       dataflow run graphs/simulated_robot.yaml --live --record live.mcap
+      dataflow run robot.yaml --live --record "out/{time}.mcap" --keep-disk 20GB
       dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """
     began = time.monotonic()
@@ -114,9 +123,10 @@ def run(
         if live and step:
             raise fail("--step pauses what reads its sources; a live run cannot wait: devices go on by the clock")
         loaded = load_graph(file, settings=settings or (), live=live)
-        outputs = checked_outputs(record, view, open_view, overwrite)
-        options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         flight = loaded.record.flight is not None and record is None
+        storage = storage_of(record, split_every, split_size, keep_disk, record_failure, readable, flight=flight)
+        outputs = checked_outputs(record, view, open_view, overwrite, storage)
+        options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         controls = keys(quiet or json, live=live, flight=flight)
         options |= {"live": live, "paused": step, "controls": controls}
         if compression is not None:
@@ -138,4 +148,5 @@ def run(
             began=began,
             json=json,
             quiet=quiet,
+            verbose=verbose,
         )

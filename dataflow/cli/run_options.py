@@ -113,4 +113,8 @@ LogLevel = Annotated[
         "Environment: DATAFLOW_LOG_LEVEL.",
     ),
 ]
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", metavar=FLAG, help="Report every operator, every figure, every loss."),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]

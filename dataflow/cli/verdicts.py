@@ -30,6 +30,7 @@ STYLES = {
     "could not run": "bold red",
     "downstream": "yellow",
     "unverifiable": "yellow",
+    "not here": "bold red",
     "not wholly verified": "yellow",
 }
 FIELDS_SHOWN = 6
@@ -144,6 +145,9 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
     report = checked.report
     assert report is not None
     yield from _changed(s for s in report.stored if s.maker == judged.operator)
+    if judged.verdict == "not here":
+        yield f"{judged.operator}: it is not here ({report.absent[judged.operator]}): what it made is taken as recorded"
+        return
     v = next((v for v in report.operators if v.operator == judged.operator), None)
     if v is None:
         yield from _stand_in(next(s for s in report.stand_ins if s.operator == judged.operator))
@@ -170,6 +174,13 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
         )
     elif repeats and judged.verdict == "culprit":
         yield f"{v.operator}: run a second time, it differed alike: its code, its libraries or the machine changed"
+    if v.wrote:
+        yield f"{v.operator}: it changed the memory of {v.wrote}; messages are immutable: copy before writing"
+    elif judged.verdict == "culprit" and (mates := report.mates.get(v.operator)):
+        yield (
+            f"{v.operator}: in the run it shared a process with {', '.join(mates)}; what operators keep in a module or "
+            "set in a library reaches others of their process, and is not repeated: keep it in self"
+        )
     if report.start is not None and v.began == "start" and not v.unknown:
         yield f"{v.operator}: keeps state and the recording has no snapshot of it there: repeated from its beginning"
     yield from _left_out(v)
@@ -211,7 +222,12 @@ def _stand_in(s: StandIn) -> Iterator[str]:
 
 
 def _notes(report: VerifyReport) -> Iterator[str]:
-    """Returns what is to be known of the streams that were not made again."""
+    """Returns what is to be known of operators that share state, and of the streams that were not made again."""
+    for name, beside in report.shared.items():
+        yield (
+            f"{name}: it makes what was recorded, but in one process with {', '.join(beside)} not always: something "
+            "that they share changes it (the state of a module, a setting of a library, the memory of a message)"
+        )
     for stand_in in report.stand_ins:
         yield from _stand_in(stand_in)
         if stand_in.missing:

@@ -32,7 +32,7 @@ from dataflow.cli.output import (
     print_json,
     say,
 )
-from dataflow.cli.run_options import Quiet
+from dataflow.cli.run_options import Paranoid, Quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,6 +110,7 @@ def verify(
             help="Worker processes. Default: one for each core, fewer where little is to do.",
         ),
     ] = None,
+    paranoid: Paranoid = False,
     quiet: Quiet = False,
     one_process: Annotated[
         bool, typer.Option("--one-process", metavar=FLAG, help="Deprecated: means --jobs 1.")
@@ -131,7 +132,7 @@ def verify(
 
       0    identical, or within --tolerance, or as --baseline accepts
       1    different, not wholly verifiable, or nothing verified
-      2    could not run (of several recordings: at least one)
+      2    could not run (of several recordings: at least one), or an operator is not here any more
       130  interrupted with Ctrl-C
 
     Examples:
@@ -194,9 +195,11 @@ def verify(
                 "tolerance": tolerance,
                 "start": start,
                 "jobs": 1 if one_process else jobs,
+                "paranoid": paranoid,
             }
-            single = len(recordings) == 1 and not recordings[0].is_dir()
-            checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)
+            found = recordings_in(recordings)
+            single = len(recordings) == 1 and recordings[0] == found[0][0]
+            checked = _check(found, known, options, quiet=quiet, single=single)
             _report(checked, single=single, json=json, junit=junit)
             if known is not None:
                 _mind_baseline(known, checked, accept=accept, whole=not single)
@@ -278,7 +281,7 @@ def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, who
 
 
 def _exit_code(checked: list[Checked], accepted: Baseline | None) -> int:
-    if any(c.report is None for c in checked):
+    if any(c.report is None or c.report.absent for c in checked):
         return COULD_NOT_RUN
     if accepted is None or any(c.report is not None and (c.report.empty or c.report.changed) for c in checked):
         return 0 if all(c.passed for c in checked) else DIFFERENT

@@ -1,4 +1,4 @@
-"""Tools that follow a running graph from outside: viewers, `echo`, `hz`. They can hold nobody up."""
+"""Tools that follow a running graph from outside: viewers, `echo`, `hz`. They cannot delay the graph."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONNECT_WITHIN = 1.0
 
 
 class NotRunning(LookupError):
-    """There is no such running graph, or more than one could be meant: says which ones run."""
+    """No running graph matches, or several do; the message lists those that run."""
 
 
 def find_running(name: str | None, *, wait: float = 0.0) -> RunningGraph:

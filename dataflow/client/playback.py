@@ -31,7 +31,7 @@ class Steering:
 
         `paused`, `ended`, `speed` (None: as fast as it goes), `stamp`, the last one given, and `replay`, where a
         recording stands in for its sources: the `span` of stamps that is played, and the `first`, which `--start`
-        counts from. All processes with sources are asked and answer as one. Raises `NotRunning` where nobody answers,
+        counts from. All processes with sources answer as one. Raises `NotRunning` where no process answers,
         or the run is live.
         """
         request = {} if action is None else {"action": action, "steps": steps, "speed": speed}

@@ -28,7 +28,7 @@ class NoAnswer(LookupError):
 
 
 class Refused(ValueError):
-    """The process of an operator refuses a parameter: says why."""
+    """The process of an operator refuses a parameter; the message has the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ class Processes:
                 raise Refused(said["error"])
             return said["value"]
         raise NoAnswer(
-            f"nobody answered for {operator!r} within {timeout:g} s: it is being started again, hangs, or works on one "
+            f"no answer for {operator!r} within {timeout:g} s: it is being started again, hangs, or works on one "
             "firing for longer than that; the change is made when it comes to it"
         )
 
@@ -127,7 +127,7 @@ class Processes:
         raise NoAnswer(f"{operator!r} did not answer within {timeout:g} s: whether it has the message is not known")
 
     def _until(self, operator: str, request: Mapping[str, Any], timeout: float) -> Iterator[dict[str, Any]]:
-        """Answers to a request, which is repeated while nobody is there to take it."""
+        """Yields the answers to a request, which is repeated while no process takes it."""
         deadline = time.monotonic() + timeout
         payload = msgpack.packb(request)
         while (left := deadline - time.monotonic()) > 0:

@@ -1,7 +1,7 @@
 """A recorder from outside of a running graph: a plain subscriber, which takes what it is given and counts what it
 missed.
 
-It knows nothing of the operators' calls, so what it writes holds no firing records.
+It does not see the operators' calls, so its files hold no firing records.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from dataflow.messages.base import Message, MessageError
 from dataflow.recording import RecordingWriter
 from dataflow.recording.layout import ENDS
 from dataflow.recording.packing import Compression
+from dataflow.recording.parts import OWNER_ONLY, WHOLE, Splitting, part_path, parts_of
 from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
 from dataflow.transport.codec import TypeOf, decode
 from dataflow.transport.envelope import DecodeError
@@ -33,19 +34,6 @@ from dataflow.transport.registry import RunningGraph
 WAITING_BYTES = 512 * 2**20
 """Of messages that wait to be written: beyond it the oldest are let go, and counted as missed."""
 FLUSH_EVERY = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Splitting:
-    """Limits of one file: bytes, or event time (ns), after which a recording goes on in the next; None: no limit."""
-
-    size: int | None = None
-    every: int | None = None
-
-    @property
-    def splits(self) -> bool:
-        """Tells whether there may be more than one file."""
-        return self.size is not None or self.every is not None
 
 
 @dataclass(slots=True)
@@ -73,7 +61,7 @@ class Tally:
 class AttachedRecorder:
     """Writes envelopes of a graph's streams into one file, or into one after the other. A context manager.
 
-    `metadata` goes into each file. Static messages are written at the beginning of each. What is missing is known from
+    `metadata` goes into each file. Static messages are written at the beginning of each. Gaps are known from
     the numbers of messages, which have no gaps.
     """
 
@@ -84,14 +72,19 @@ class AttachedRecorder:
         streams: Sequence[str],
         *,
         metadata: Mapping[str, Mapping[str, str]],
-        splitting: Splitting = Splitting(),
+        splitting: Splitting = WHOLE,
         compression: Compression = "zstd",
         overwrite: bool = False,
+        mode: int = OWNER_ONLY,
         types: TypeOf | None = None,
     ) -> None:
         self._path, self._graph, self._streams = path, graph, frozenset(streams)
         self._metadata, self._splitting, self._overwrite = metadata, splitting, overwrite
         self._compression: Compression = compression
+        self._mode = mode
+        if overwrite and splitting.splits:
+            for old in parts_of(path):
+                old.unlink()
         self._types = types or types_of(graph)
         self._statics: dict[str, Envelope] = {}
         self._added: set[str] = set()
@@ -179,21 +172,19 @@ class AttachedRecorder:
     def _split_due(self, stamp: int) -> bool:
         if self._first is None:
             return False
-        size, every = self._splitting.size, self._splitting.every
-        return (size is not None and self._writer.saved_bytes >= size) or (
-            every is not None and stamp - self._first >= every
-        )
+        return self._splitting.due(self._writer.saved_bytes, stamp - self._first)
 
     def _open(self) -> RecordingWriter:
         path = self._path
         if self._splitting.splits:
-            path = path.with_name(f"{path.stem}_{len(self.tally.files):03}{path.suffix}")
+            path = part_path(path, len(self.tally.files))
         writer = RecordingWriter(
             path,
             metadata=self._metadata,
             namespace=self._graph.namespace,
             compression=self._compression,
             overwrite=self._overwrite,
+            mode=self._mode,
         )
         self.tally.files.append(str(path))
         self._added, self._first = set(), None
@@ -266,7 +257,7 @@ def record(
     goes_on: Iterator[bool],
     idle: float = 0.1,
 ) -> None:
-    """Writes what comes until `goes_on` says no; then what still waits. Raises `RecordingError`."""
+    """Writes what comes until `goes_on` returns False; then what still waits. Raises `RecordingError`."""
     due = time.monotonic() + FLUSH_EVERY
     for on in goes_on:
         payload = subscription.take(idle if on else 0.0)

@@ -9,7 +9,7 @@ from dataflow.client.attach import NotRunning
 from dataflow.client.playback import Steering
 
 ANSWER_WITHIN = 2.0
-"""Seconds that a bar waits for a replay; then it goes on showing what it knows."""
+"""Seconds that a bar waits for a replay; then it keeps showing the last state."""
 
 
 class ReplayBar:
@@ -57,7 +57,7 @@ class ReplayBar:
             return bool(self._standing["ended"])
 
     def refresh(self) -> None:
-        """Asks how the replay stands; keys in its terminal move it too. What is too busy to answer stands as it did."""
+        """Asks how the replay stands; keys in its terminal move it too. Without an answer, the last state stays."""
         try:
             self._take(self._steering.ask(None, timeout=ANSWER_WITHIN))
         except NotRunning:

@@ -15,7 +15,7 @@ ANSWER_WITHIN = 5.0
 
 
 def trigger(found: RunningGraph, text: str, *, timeout: float = ANSWER_WITHIN) -> None:
-    """Asks it. Raises `NotRunning` where the graph has no flight recorder, or nobody answers."""
+    """Asks it. Raises `NotRunning` where the graph has no flight recorder, or no process answers."""
     if graph_of(found).record.flight is None:
         raise NotRunning(f"graph {found.name!r} has no flight recorder: give it one with record: {{keep: 60s}}")
     request = msgpack.packb({"id": secrets.token_hex(8), "text": text})

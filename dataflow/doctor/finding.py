@@ -20,7 +20,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """`about` names what was looked at, `text` says what was found, `hint` what would mend it."""
+    """`about` names what was looked at, `text` the result, `hint` what would mend it."""
 
     group: str
     about: str

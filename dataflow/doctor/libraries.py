@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, requires, version
 
 from dataflow.doctor.finding import Finding, State
+from dataflow.extras import DISTRIBUTION, is_optional
 
 GROUP = "libraries"
-DISTRIBUTION = "robot-dataflow"
-FOR_DEVELOPERS = "dev"
-"""The extra that only those need who work on dataflow itself."""
+COLLECTIONS = ("all", "dev")
+"""Extras that only bring others together, or serve work on dataflow itself."""
 LOADED = (
     "zenoh",
     "rerun",
@@ -30,7 +30,6 @@ LOADED = (
     "torch",
 )
 """Modules with native code, which can be there and not load."""
-OPTIONAL = {"open3d": "sim", "torch": "train"}
 LOAD_WITHIN = 90.0
 
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(?:\[[\w,-]+\])?\s*(?P<bounds>[^;]*)(?:;\s*(?P<marker>.*))?")
@@ -78,7 +77,7 @@ def check_versions(declared: list[str], version_of: Callable[[str], str]) -> Ite
             continue
         found = _EXTRA.search(match["marker"] or "")
         extra = found[1] if found else ""
-        if extra == FOR_DEVELOPERS:
+        if extra in COLLECTIONS:
             continue
         name, bounds = match["name"], match["bounds"].strip(" ()")
         try:
@@ -141,12 +140,10 @@ def check_loading(found: Mapping[str, str]) -> Iterator[Finding]:
     """A finding for every module that does not load, and one for those that do."""
     loaded = [name for name, fault in found.items() if not fault]
     for name, fault in found.items():
-        if name == "onnxruntime providers" or not fault or (fault == "missing" and name in OPTIONAL):
+        if name == "onnxruntime providers" or not fault or (fault == "missing" and is_optional(name)):
             continue
-        state = State.WARNING if name in OPTIONAL else State.FAULT
-        yield Finding(
-            GROUP, name, state, f"does not load: {fault}", "install it again, with the libraries that it names"
-        )
+        hint = "install it again, with the libraries that it names"
+        yield Finding(GROUP, name, State.FAULT, f"does not load: {fault}", hint)
     if loaded:
         yield Finding(GROUP, "native code", State.OK, f"loads: {', '.join(loaded)}")
     if providers := found.get("onnxruntime providers"):

@@ -135,7 +135,7 @@ def check_clocks() -> Iterator[Finding]:
 
 
 def wall_clock() -> tuple[bool, float] | None:
-    """Tells whether the kernel's clock is synchronised, and its largest error (s); None where nobody knows."""
+    """Returns whether the kernel's clock is synchronised, and its largest error (s); None where unknown."""
     with contextlib.suppress(AttributeError, OSError):
         buffer = ctypes.create_string_buffer(512)  # struct timex, all zero: only read
         state = ctypes.CDLL(None, use_errno=True).adjtimex(buffer)

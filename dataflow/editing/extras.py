@@ -12,7 +12,7 @@ Items = list[tuple[str, Hashable]]
 
 
 def is_fact(origin: Origin, name: str) -> bool:
-    """Tells whether a metadata record of `origin` describes its run, not what somebody added to the file."""
+    """Returns whether a metadata record of `origin` describes its run, rather than being added later."""
     return origin.own and tells_of_run(name)
 
 
@@ -23,7 +23,7 @@ def take_over(
 
     What two files hold equally is taken once. Of one name and other content, the later file's is kept as `LABEL/NAME`,
     with the label of that file, or its stem where that is empty. So are records that describe a later file's run,
-    unless the files are parts of one (`joined`). What is renamed is noted.
+    unless the files are parts of one (`joined`). Renamed ones are noted.
     """
     called = [label or origin.path.stem for label, origin in zip(labels, origins, strict=True)]
     attached: list[Items] = [

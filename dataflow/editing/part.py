@@ -17,6 +17,7 @@ from dataflow.interop.bag import is_latched
 from dataflow.recording import Recording
 from dataflow.recording.copying import RUN_KINDS, Copy, Mask, Origin, framing, places
 from dataflow.recording.cutting import Cut, cut_of
+from dataflow.recording.index import NO_END
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, Kind
 from dataflow.recording.packing import Compression
 from dataflow.records.firing import CALLS, FiringRecord, consecutive, encode_batch
@@ -51,7 +52,7 @@ def write_part(
     overwrite: bool = False,
     watch: Watch = unwatched,
 ) -> Edited:
-    """Writes a part of `origin` into a file of its own. Raises `RecordingError`."""
+    """Writes a part of `origin` into a separate file. Raises `RecordingError`."""
     done = Edited(str(out))
     firings = _firings(origin, part, done)
     needed = {} if firings is None else firings.needed
@@ -70,7 +71,7 @@ def write_part(
             copy.frames(origin.namespace, framing(origin.path, kept_stamps(origin, kept)))
     done.bytes = out.stat().st_size
     if origin.file.torn:
-        done.notes.append(f"{origin.path} has no proper end: what its writer had not stored when it died is missing")
+        done.notes.append(f"{origin.path} {NO_END}")
     done.notes += [f"{origin.path}: {note}" for note in origin.file.damage]
     return done
 

@@ -1,4 +1,4 @@
-"""Recovers what can be read of a torn or damaged MCAP file, and says what is lost."""
+"""Recovers what can be read of a torn or damaged MCAP file, and reports the losses."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def recover(
 
 
 def _by_index(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[Loss]:
-    """The messages that an index tells of and that lie in chunks that cannot be read."""
+    """Yields the messages that an index lists in chunks that cannot be read."""
     for channel, mask in sorted(kept.items(), key=lambda item: origin.channels[item[0]].topic):
         if not mask.all():
             times = origin.entries(channel).times
@@ -110,7 +110,7 @@ def _by_index(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[Loss]:
 
 
 def _by_numbers(origin: Origin, kept: Mapping[int, Mask], saved: Path) -> Iterator[Loss]:
-    """The numbers that are missing in streams, up to the last one that is saved or that a firing record tells of."""
+    """The numbers that are missing in streams, up to the last one that is saved or that a firing record names."""
     found: dict[tuple[str, int], dict[int, int]] = {}
     streams = origin.of_kind(Kind.STREAM)
     for raw in places(origin, {c: m for c, m in kept.items() if c in streams}):
@@ -134,7 +134,7 @@ def _by_numbers(origin: Origin, kept: Mapping[int, Mask], saved: Path) -> Iterat
 
 
 def _told(path: Path) -> dict[tuple[str, int], int]:
-    """By stream and incarnation, the largest number that a firing record tells of."""
+    """By stream and incarnation, the largest number that a firing record names."""
     told: dict[tuple[str, int], int] = {}
     with Recording(path) as recording:
         outputs = outputs_of(graph_of(recording))

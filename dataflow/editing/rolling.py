@@ -16,6 +16,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording.copying import Copy, Mask, Origin, framing
 from dataflow.recording.cutting import Cut
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, OUTCOME, Kind
+from dataflow.recording.parts import OWNER_ONLY
 from dataflow.records.cuts import held_by
 from dataflow.records.firing import CALLS, FiringRecord
 
@@ -30,11 +31,12 @@ def keep_span(
     out: Path,
     *,
     metadata: Mapping[str, Mapping[str, str]],
+    mode: int = OWNER_ONLY,
 ) -> Edited:
     """Writes the span of a run whose messages lie in `files`, one after the other, and whose firing records are given.
 
-    Messages that several files hold are taken once; those that no firing record tells of yet, since it is on its way,
-    are left out. `metadata` is added to that of the files.
+    Messages that several files hold are taken once; those that no firing record names yet, since it is on its way,
+    are left out. `metadata` is added to that of the files; `mode`: permissions of the new file.
     """
     done = Edited(str(out))
     with ExitStack() as stack:
@@ -47,7 +49,7 @@ def keep_span(
         for name in (DIGESTS, ENDS, OUTCOME):
             written.pop(name, None)
         written[CUT] = Cut("what ran", part.start, part.end).metadata()
-        with Copy(out, origins[0]) as copy:
+        with Copy(out, origins[0], mode=mode) as copy:
             for name, values in {**written, **metadata}.items():
                 copy.writer.add_metadata(name, values)
             write_firings(copy, origins, chosen.records)
@@ -78,7 +80,7 @@ def _told(
 
 
 def _until(origin: Origin, masks: Mapping[int, Mask], told: Mapping[str, tuple[int, int]]) -> dict[int, Mask]:
-    """Of the messages of operators, those up to the last one that a record tells of."""
+    """Of the messages of operators, those up to the last one that a record names."""
     found = dict(masks)
     for channel in origin.of_kind(Kind.STREAM, Kind.COMPANION).values():
         stream, incarnation = origin.stream(channel), origin.incarnation(channel)

@@ -74,7 +74,7 @@ def records_of_span(
     """Chooses the records of the span from `start` to `end` (ns, inclusive; None: not cut there).
 
     `log`: the records of each operator; `outputs`: its streams in the order of its ports; `stored`: the streams that
-    the recording holds. What is not stored is made again, so its makers are repeated from where it is needed.
+    the recording holds. Other streams are made again, so their producers are repeated from where it is needed.
     """
     operators = {name: _operator(records, tuple(outputs.get(name, ())), end) for name, records in log.items()}
     makers = {stream: name for name, streams in outputs.items() for stream in streams}

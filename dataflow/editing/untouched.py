@@ -13,11 +13,18 @@ from dataflow.recording.copying import Copy, Origin
 
 
 def keep_untouched(
-    recording: Path, bag: Path, played: Collection[str], start: int | None = None, end: int | None = None
+    recording: Path,
+    bag: Path,
+    played: Collection[str],
+    start: int | None = None,
+    end: int | None = None,
+    *,
+    shift: int = 0,
 ) -> dict[str, int]:
     """Adds to a recording every topic of a bag but those in `played`, byte for byte; how many messages of each.
 
-    `start`, `end`: log times (ns) of the span. A topic whose name a stream has is left out.
+    `shift`: what is added to log times (ns), so that they are of the clock of what was played. `start`, `end`: of the
+    span, on that clock. A topic whose name a stream has is left out.
     """
     opened = open_bag(bag)
     try:
@@ -38,8 +45,8 @@ def keep_untouched(
                     channels[topic.name] = copy.writer.add_channel(topic.name, topic.encoding, schema, about)
                 written = dict.fromkeys(channels, 0)
                 for stored in opened.messages(list(channels)):
-                    if (start is None or stored.log_time >= start) and (end is None or stored.log_time <= end):
-                        time, number = stored.log_time, written[stored.topic]
+                    time, number = max(stored.log_time + shift, 0), written[stored.topic]
+                    if (start is None or time >= start) and (end is None or time <= end):
                         copy.writer.add_copied(channels[stored.topic], time, time, number, bytes(stored.data))
                         written[stored.topic] += 1
                 return written

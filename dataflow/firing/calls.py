@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.firing.failure import RAISED, InputMutated, OperatorFailure
+from dataflow.firing.failure import RAISED, OperatorFailure
+from dataflow.firing.loading import LOADS
 from dataflow.firing.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
 from dataflow.firing.shared_generators import AT_WORK
 from dataflow.firing.snapshots import pack_state, unpack_state
@@ -59,10 +60,11 @@ class Calls:
         AT_WORK.begun += 1
         try:
             seed = FiringSeed(self._seeded_by, firing.stamp)
-            seed_generators(seed)
+            seed_generators(seed, self.version)
             self.operator.seed_rng(seed)
             return outputs_of(self.operator, _call(self.operator, firing))
         finally:
+            LOADS.seed = None
             AT_WORK.ended += 1
 
     def reset(self, input: str, place: Place) -> None:
@@ -121,7 +123,7 @@ class Calls:
             self._seed(change_seed(self.seed, self.node.name, what, *place))
 
     def _seed(self, seed: int) -> None:
-        seed_generators(seed)
+        seed_generators(seed, self.version)
         self.operator.seed_rng(seed)
 
 
@@ -132,19 +134,6 @@ def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
         return {str(key): item if isinstance(item, str) else np.asarray(item).item() for key, item in found.items()}
     except Exception as error:
         raise OperatorFailure(name, "summary()", error) from error
-
-
-def changed_input(node: Node, firing: Firing) -> InputMutated | None:
-    """An error for the first input message whose memory is no longer what its digest says."""
-    for name, given in firing.inputs.items():
-        for entry in entries_of(given):
-            message: Message = entry.value
-            if message.compute_digest() != message.digest():
-                return InputMutated(
-                    f"{node.name} changed the memory of its input {name!r} "
-                    f"({message.SCHEMA} at stamp {message.stamp}); messages are immutable: copy before writing"
-                )
-    return None
 
 
 def entries_of(given: InputValue) -> Sequence[Entry]:

@@ -3,28 +3,53 @@
 from __future__ import annotations
 
 import traceback
+from pathlib import Path
+from types import TracebackType
 
 RAISED = BaseException
 """The errors that an operator may raise: it has no right to end its process, whatever it derives its errors from."""
 MOST_OF_A_TRACEBACK = 20_000
 """Characters of a traceback that are kept."""
+_ENGINE = Path(__file__).parent.parent
 
 
 class OperatorFailure(RuntimeError):
-    """An operator raised or broke its contract. Carries its name, the firing and the operator's own traceback."""
+    """An operator raised or broke its contract.
+
+    Carries its name, the firing, the operator's own traceback, and the file and line of its code that raised ("" and 0
+    where none did).
+    """
 
     def __init__(self, operator: str, when: str, error: BaseException) -> None:
         self.operator, self.when = operator, when
         self.summary = readable(error)
+        self.file, self.line = place_of(error.__traceback__)
         try:
             self.traceback = cut(_printable("".join(traceback.format_exception(error))), MOST_OF_A_TRACEBACK)
         except Exception:  # its own text cannot be made
             self.traceback = "".join(traceback.format_tb(error.__traceback__)) + self.summary
         super().__init__(f"operator {operator!r} failed in {when}: {self.summary}")
 
+    @property
+    def where(self) -> str:
+        """Returns such as "crashy.py:12"; "" where no code of an operator raised."""
+        return f"{Path(self.file).name}:{self.line}" if self.file else ""
+
+
+def place_of(trace: TracebackType | None) -> tuple[str, int]:
+    """Returns file and line of the innermost call of a traceback that lies in the operator's own folder: the line to
+    look at, rather than one of a library. "" and 0 where only the engine was at work."""
+    calls = [(Path(frame.f_code.co_filename), line) for frame, line in traceback.walk_tb(trace)]
+    outside = [(path, line) for path, line in calls if _ENGINE not in path.parents]
+    own = [(path, line) for path, line in outside if path.parent == outside[0][0].parent]
+    return (str(own[-1][0]), own[-1][1]) if own else ("", 0)
+
 
 class InputMutated(RuntimeError):
     """An operator changed the memory of a message it was given."""
+
+    def __init__(self, operator: str, what: str) -> None:
+        super().__init__(f"{operator} changed the memory of {what}; messages are immutable: copy before writing")
 
 
 class TooManyTicks(RuntimeError):

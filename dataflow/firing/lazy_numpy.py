@@ -82,6 +82,29 @@ def seed_lazily(seed: SupportsInt) -> None:
         np.random.seed(int(seed) & 0xFFFFFFFF)
 
 
+Held = tuple[bool, Any]
+"""True and the seed that is pending, or False and the state."""
+
+
+def held() -> Held:
+    """Returns what `give_back` brings back: what is pending, or the state; does not seed the generator."""
+    if mtrand._rand._bit_generator is _GENERATOR and _GENERATOR.lock.pending is not None:
+        return True, _GENERATOR.lock.pending
+    return False, (mtrand._rand._bit_generator, np.random.get_state(legacy=False))
+
+
+def give_back(held: Held) -> None:
+    """Makes the generator what it was when it was `held`."""
+    pending, value = held
+    if pending:
+        seed_lazily(value)
+        return
+    generator, state = value
+    if mtrand._rand._bit_generator is not generator:
+        mtrand.set_bit_generator(generator)
+    np.random.set_state(state)
+
+
 def peek() -> tuple[object, ...]:
     """Returns a value that differs after a draw, and does not seed the generator.
 

@@ -60,6 +60,26 @@ def peek() -> tuple[object, ...]:
     return _STATE.settled, _random.Random.getstate(_GENERATOR)
 
 
+Held = tuple[bool, Any]
+"""True and the seed that is pending, or False and the state."""
+
+
+def held() -> Held:
+    """Returns what `give_back` brings back: what is pending, or the state; does not seed the generator."""
+    if _GENERATOR.__class__ is _Pending:
+        return True, _STATE.seed
+    return False, random.getstate()
+
+
+def give_back(held: Held) -> None:
+    """Makes the generator what it was when it was `held`."""
+    pending, value = held
+    if not pending:
+        random.setstate(value)
+    elif _GENERATOR.__class__ is not _Pending:
+        seed_lazily(value)
+
+
 def _restore() -> random.Random:
     """Makes the generator an ordinary one again, in the state that it has."""
     if _GENERATOR.__class__ is _Pending:

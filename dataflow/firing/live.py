@@ -58,16 +58,8 @@ class LiveRunner(OperatorRunner):
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
         fault: Fault = lambda firing: None,
     ) -> None:
-        super().__init__(
-            node,
-            emitter,
-            static=static,
-            seed=seed,
-            paranoid=paranoid,
-            operator=operator,
-            lossy=True,
-            snapshots=snapshots,
-        )
+        more: dict[str, Any] = {"paranoid": paranoid, "operator": operator, "snapshots": snapshots}
+        super().__init__(node, emitter, static=static, seed=seed, lossy=True, **more)
         triggers = {
             stream: port.name
             for port in self.spec.triggers
@@ -171,26 +163,33 @@ class LiveRunner(OperatorRunner):
             if self.restarts.due_in() > 0:
                 return False
             self._start_again()
-        if self._told:
-            if super().step():
-                self._told = self.idle == NEVER
-                self._wake_again()
-                return True
-            self._told = self.node.every is not None
+        self._told = self._told or self.node.every is not None  # ticks may be left out since
         for _ in range(MOST_TRIED):
-            if self.ended:
+            if self.ended or not (self._told or self._admit_next()):
                 return False
-            taken = self.queue.take()
-            if taken is not None:
-                self._admit(*taken)
-            elif not self._give_up():
-                return False
-            if super().step():
-                self._told = self.idle == NEVER
-                self._wake_again()
+            if self._decide():
                 return True
-            self._told = self.node.every is not None
         self.wake()
+        return True
+
+    def _admit_next(self) -> bool:
+        """Tells the aligner what the queues hold, else that it need not wait any longer; False when neither is so."""
+        taken = self.queue.take()
+        if taken is None:
+            return self._give_up()
+        self._admit(*taken)
+        return True
+
+    def _decide(self) -> bool:
+        """Makes the next firing if it is decided.
+
+        What it emits and promises may come back to itself and decide another one: `_told` is cleared before.
+        """
+        self._told = False
+        if not super().step():
+            return False
+        self._told = self._told or self.idle == NEVER
+        self._wake_again()
         return True
 
     def _wake_again(self) -> None:

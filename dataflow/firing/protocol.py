@@ -15,8 +15,6 @@ from dataflow.sync import NEVER, Entry
 class Runner:
     """One operator with inputs, driven step by step on one thread."""
 
-    paranoid = False
-    """True when what an operator was given is digested again after each firing."""
     keeps_time = False
     """True when it may have something to do though nothing arrives (`next_due`)."""
 

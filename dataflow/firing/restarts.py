@@ -52,8 +52,8 @@ class Restarts:
 
 
 def close_quietly(operator: Operator) -> None:
-    """Closes an operator that has failed; what else goes wrong in it is printed, since the first failure is known."""
+    """Closes an operator that has failed, or of which only the calls before count; what goes wrong is printed."""
     try:
         operator.close()
     except Exception as error:
-        print(f"{type(operator).__name__}.close() after a failure: {type(error).__name__}: {error}", file=sys.stderr)
+        print(f"{type(operator).__name__}.close(): {type(error).__name__}: {error}", file=sys.stderr)

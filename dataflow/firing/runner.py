@@ -7,19 +7,22 @@ emitted goes to an `Emitter`. Runs, replays and tests (`dataflow.testing.play`) 
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Mapping
 from typing import Any
 
 from dataflow.firing.align import align_spec
-from dataflow.firing.calls import Calls, changed_input
-from dataflow.firing.failure import RAISED, OperatorFailure, TooManyTicks
+from dataflow.firing.calls import Calls
+from dataflow.firing.failure import RAISED, InputMutated, OperatorFailure, TooManyTicks
 from dataflow.firing.log import FiringLog, unlisted
+from dataflow.firing.memory import WATCHED, MemoryGuard
 from dataflow.firing.ports import Emitter
 from dataflow.firing.protocol import Runner
 from dataflow.graph.model import Node
+from dataflow.messages.base import Message
 from dataflow.operator import Operator
-from dataflow.records.firing import Emission, Kind
+from dataflow.records.firing import MAX_STATE_BYTES, Emission, Kind
 from dataflow.sync import FOREVER, NEVER, Drop, Entry, Firing, format_duration, format_stamp
 from dataflow.sync.single import make_aligner
 
@@ -56,7 +59,9 @@ class OperatorRunner(Runner):
         super().__init__(node, node.make() if operator is None else operator, emitter, lossy=lossy)
         self.paranoid, self.snapshots = paranoid, snapshots
         self._next_snapshot: int | None = None
+        self._left_out = 0
         self._warm: int | None = None
+        self._guard, self._watched = MemoryGuard(), FOREVER if paranoid else WATCHED
         self.idle = NEVER
         """The output frontier after the last step, where that left nothing to decide; else NEVER."""
         self.calls = Calls(node, self.operator, seed)
@@ -78,7 +83,8 @@ class OperatorRunner(Runner):
         if self._warm is not None:
             started = time.time_ns()
             state = self.calls.snapshot((self.records.incarnation, self._warm))
-            self.records.add("restore", self._warm, started, detail={"state": state, "before": self._warm})
+            kept = state if state is None or len(state) <= MAX_STATE_BYTES else None
+            self.records.add("restore", self._warm, started, detail={"state": kept, "before": self._warm})
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:
@@ -174,9 +180,10 @@ class OperatorRunner(Runner):
         started = time.time_ns()
         kind: Kind = firing.kind
         try:
-            messages = self.calls.process(firing)
-            if self.paranoid and (problem := changed_input(self.node, firing)) is not None:
-                raise problem
+            if self.firings < self._watched:
+                messages = self._call_watched(firing)
+            else:
+                messages = self.calls.process(firing)
             emissions = self.ports.prepare(messages, firing.stamp)
         except RAISED as error:
             failure = OperatorFailure(self.node.name, f"{kind} at stamp {firing.stamp}", error)
@@ -188,6 +195,18 @@ class OperatorRunner(Runner):
         if self.snapshots is not None and kind != "finish":
             self._snapshot_if_due(firing.stamp)
 
+    def _call_watched(self, firing: Firing) -> dict[str, Message]:
+        """Makes a call and looks whether it has written into its inputs: an error if `paranoid`, else printed."""
+        self._guard.take(self.node.name, firing)
+        messages = self.calls.process(firing)
+        if what := self._guard.changed(self.node.name):
+            problem = InputMutated(self.node.name, what)
+            if self.paranoid:
+                raise problem
+            print(f"warning: {problem}", file=sys.stderr)
+            self._watched = 0
+        return messages
+
     def _snapshot_if_due(self, stamp: int) -> None:
         """Records the operator's state, about every `snapshots` ns of event time; at the same firings in every run."""
         assert self.snapshots is not None
@@ -198,8 +217,19 @@ class OperatorRunner(Runner):
         self._next_snapshot = stamp + self.snapshots
         started = time.time_ns()
         state = self.calls.snapshot((self.records.incarnation, stamp))
-        if state is not None:
+        if state is None:
+            return
+        if len(state) <= MAX_STATE_BYTES:
             self.records.add("snapshot", stamp, started, detail={"state": state})
+            return
+        self._left_out += 1
+        self.records.add("snapshot", stamp, started, detail={"left_out": len(state)})
+        self.operator.log.warning(
+            "a snapshot of %d bytes is left out, at most %d are recorded; %d so far",
+            len(state),
+            MAX_STATE_BYTES,
+            self._left_out,
+        )
 
     def _record(
         self,

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import sys
+import threading
 from collections.abc import Mapping
-from typing import Any, Final, SupportsInt
+from typing import Final, SupportsInt
 
 import xxhash
 
 from dataflow.firing import lazy_numpy, lazy_random
+from dataflow.firing.libraries import seed_libraries
+from dataflow.firing.loading import LOADS
 
-VERSION: Final = 2
+VERSION: Final = 3
 """The scheme by which calls are seeded; recordings name it, and re-execution follows the one they name.
 
 1: `setup()`, `process()` and `finish()` are seeded. `on_reset()`, `on_parameter()`, `snapshot()`, `restore()` and
    `summary()` go on with what the call before has left. Recordings that name no version are of this one.
 2: each of these is seeded too, from what it is, its incarnation and its stamp.
+3: a library that a call loads is seeded in that call, and so are torch's generators on GPUs that it initialises; what
+   modules draw while they are loaded is taken back (`dataflow.firing.loading`).
 """
 
 FACT: Final = "seeding"
@@ -54,17 +58,17 @@ class FiringSeed:
         return xxhash.xxh3_64_intdigest(f"{self._of}{self._stamp}".encode()) & (2**63 - 1)
 
 
-def seed_generators(seed: SupportsInt) -> None:
-    """Seeds the global generators of Python, numpy and the libraries that are loaded.
+def seed_generators(seed: SupportsInt, version: int = VERSION) -> None:
+    """Seeds the global generators of Python, numpy and the libraries that are loaded, for a call that begins.
 
-    Those of Python and numpy are seeded when somebody draws from them.
+    Those of Python and numpy are seeded when something draws from them, those of a library that the call loads when it
+    is loaded. `LOADS.seed = None` ends the call.
     """
     lazy_random.seed_lazily(seed)
     lazy_numpy.seed_lazily(seed)
-    modules: dict[str, Any] = sys.modules  # a library that is not loaded is not loaded for this
-    if (torch := modules.get("torch")) is not None:
-        torch.default_generator.manual_seed(int(seed))
-    if (cv2 := modules.get("cv2")) is not None:
-        cv2.setRNGSeed(int(seed) & 0x7FFFFFFF)
-    if (open3d := modules.get("open3d")) is not None:
-        open3d.utility.random.seed(int(seed) & 0x7FFFFFFF)
+    seed_libraries(seed)
+    if version >= 3:
+        LOADS.seed, LOADS.thread = seed, threading.get_ident()
+
+
+LOADS.follow(seed_libraries)

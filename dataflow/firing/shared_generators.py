@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any
 
 from dataflow.firing import lazy_numpy, lazy_random
+from dataflow.firing.loading import LOADS
 
 
 class SharedGenerators(RuntimeError):
@@ -38,6 +39,7 @@ class AtWork:
         self.begun += 1
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        LOADS.seed = None
         self.ended += 1
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from dataflow.firing.calls import Calls
 from dataflow.firing.failure import OperatorFailure, readable
+from dataflow.firing.loading import LOADS
 from dataflow.firing.log import FiringLog
 from dataflow.firing.ports import Emitter, OutputPorts
 from dataflow.firing.seeding import change_seed, seed_generators
@@ -48,6 +49,7 @@ class SourceRunner:
         self.ended = False
         self.work = Work()
         """The time of reading `stream()`."""
+        self.first: int | None = None
         self.last = NEVER
         self._read = NEVER  # the stamp that was read last, on whichever thread
         self._steps: Iterator[Mapping[str, Message]] = iter(())
@@ -116,6 +118,9 @@ class SourceRunner:
                     return messages
         except BaseException as error:
             raise OperatorFailure(self.node.name, f"stream() after stamp {self._read}", error) from error
+        finally:
+            if not self._live:
+                LOADS.seed = None
         return None
 
     def _check_stamps(self, messages: Mapping[str, Message]) -> None:
@@ -144,6 +149,7 @@ class SourceRunner:
             error = OutputError(f"{self.node.name} yielded stamp {stamp} after {self.last}: stamps strictly increase")
             raise OperatorFailure(self.node.name, "stream()", error)
         self.last = stamp
+        self.first = stamp if self.first is None else self.first
         try:
             emissions = self.ports.prepare(step, stamp)
         except OutputError as error:

@@ -1,4 +1,4 @@
-"""Drawings in Foxglove's schemas of message types that have none of their own."""
+"""Drawings in Foxglove's schemas for message types without one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plays a recording under somebody's control: to and fro, paused, slower or faster."""
+"""Plays a recording under a user's control: to and fro, paused, slower or faster."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOK_BACK = (500_000_000, 5_000_000_000)
 
 
 class Clock:
-    """The place in a recording that is played, moved by whoever holds the controls. Thread-safe; times in ns.
+    """The place in a recording that is played, moved by the controls. Thread-safe; times in ns.
 
     It stands at the beginning, and after each jump, until what is there has been found. `now` is the wall clock in s.
     """

@@ -7,17 +7,18 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from dataflow.extras import missing_extra
 from dataflow.foxglove.drawing import Drawn, data_of, drawing_of, schema_of
 from dataflow.foxglove.topics import Topics
 from dataflow.messages import Message
 
 LOOPBACK = "127.0.0.1"
 BACKLOG = 256
-"""Messages that wait for a client that is slow; then its oldest are dropped. Nobody else waits."""
+"""Messages that wait for a client that is slow; then its oldest are dropped. Other clients do not wait."""
 
 
 class FoxgloveError(RuntimeError):
-    """The server cannot be started: says why, and what to do."""
+    """The server cannot be started; the message has the reason, and what to do."""
 
 
 class Controls(Protocol):
@@ -33,7 +34,7 @@ class Controls(Protocol):
 class FoxgloveServer:
     """Shows messages to every Foxglove that is connected; one that is slow misses some. A context manager.
 
-    Listens on this machine alone unless `host` says otherwise; `port` 0 takes a free one. With `controls` and the
+    Listens on this machine alone by default; `port` 0 takes a free one. With `controls` and the
     `span` of what they play (ns), Foxglove shows its playback bar. A panel that is opened later is given the newest
     message at once. Raises `FoxgloveError`.
     """
@@ -72,7 +73,7 @@ class FoxgloveServer:
         self.address = f"ws://{host}:{self._server.port}"
 
     def show(self, stream: str, message: Message) -> None:
-        """Sends a message, with the transforms that it implies, to whoever looks at its topic. One thread calls it."""
+        """Sends a message, with the transforms that it implies, to its topic's subscribers. One thread calls it."""
         for topic, shown in self._topics.of(stream, message):
             key = (topic, type(shown), drawing_of(shown))
             channel = self._channels.get(key) or self._open(key, shown)
@@ -158,5 +159,5 @@ def _sdk() -> Any:
         import foxglove
         import foxglove.websocket
     except ImportError as error:
-        raise FoxgloveError('foxglove-sdk is not installed; it comes with: pip install -e ".[foxglove]"') from error
+        raise FoxgloveError(f"foxglove-sdk is not installed; {missing_extra(error)}") from error
     return foxglove

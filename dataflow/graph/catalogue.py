@@ -17,6 +17,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from dataflow.extras import missing_extra
 from dataflow.graph.lookup import NotFound, find_operator, is_concrete, lost_exports, offered
 from dataflow.graph.model import current_path
 from dataflow.graph.problems import did_you_mean
@@ -36,9 +37,11 @@ class Failure:
 
     module: str
     reason: str
+    mend: str = ""
+    """How to install what is missing; "" where no extra brings it."""
 
     def __str__(self) -> str:
-        return f"{self.module}: {self.reason}"
+        return "; ".join(filter(None, (f"{self.module}: {self.reason}", self.mend)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +57,17 @@ class Catalogue:
             "operators": [Described(path, cls).to_json() for path, cls in self.operators.items()],
             "failures": [{"module": f.module, "reason": f.reason} for f in self.failures],
         }
+
+    def failure_lines(self) -> Iterator[str]:
+        """Yields a line for each failure; one for all operators that lack packages of the same extra."""
+        lacking: dict[str, list[str]] = {}
+        for failure in self.failures:
+            if failure.mend:
+                lacking.setdefault(failure.mend, []).append(failure.module.rpartition(":")[2])
+            else:
+                yield f"failed to import {failure}"
+        for mend, names in lacking.items():
+            yield f"{len(names)} not listed, since packages are missing; {mend}: {', '.join(names)}"
 
 
 def discover(packages: Iterable[str] | None = None, named: str | None = None) -> Catalogue:
@@ -109,7 +123,7 @@ def _import(name: str, failures: list[Failure]) -> Any:
     try:
         return importlib.import_module(name)
     except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
-        failures.append(Failure(name, f"{type(error).__name__}: {error}"))
+        failures.append(Failure(name, f"{type(error).__name__}: {error}", missing_extra(error)))
         return None
 
 
@@ -164,7 +178,7 @@ def find(catalogue: Catalogue, name: str) -> Described:
         raise LookupError(f"{found.message}; {found.hint}" if found.hint else found.message)
     names = [path.partition(":")[2] for path in operators]
     hint = did_you_mean(name, names, "operators")
-    failed = "".join(f"; failed to import {failure}" for failure in catalogue.failures)
+    failed = "".join(f"; {line}" for line in catalogue.failure_lines())
     raise LookupError(f"no operator {name!r}: {hint}{failed}")
 
 
@@ -277,7 +291,7 @@ def table(catalogue: Catalogue) -> RenderableType:
         listed.add_row(Text(path, "cyan"), Text(takes or "-"), Text(makes or "-"), Text(spec.doc.partition("\n")[0]))
     if not catalogue.failures:
         return listed
-    return Group(listed, *(Text(f"failed to import {failure}", "red") for failure in catalogue.failures))
+    return Group(listed, *(Text(line, "red") for line in catalogue.failure_lines()))
 
 
 def page(described: Described) -> RenderableType:

@@ -31,7 +31,7 @@ class Pattern:
 class Absence:
     """Says why something is not there: `reason` for people, and the prefix of the operators that do without it.
 
-    Whoever stands inside (`"perception/"`) was written for that; a file that leaves an input out may not name what
+    Operators below it (`"perception/"`) were written for that; a file that leaves an input out may not name what
     would have been made of it.
     """
 
@@ -135,7 +135,7 @@ class Scope:
 
 @dataclass(slots=True)
 class Wired:
-    """A draft with the streams of its inputs; `places` says where each came from."""
+    """A draft with the streams of its inputs; `places` holds where each was written."""
 
     draft: Draft
     inputs: dict[str, tuple[str, ...]]

@@ -1,4 +1,4 @@
-"""Reads what a graph says of its flight recorder: `record: {keep: 60s, after: 10s, when: [...]}`."""
+"""Reads the flight recorder's section of a graph: `record: {keep: 60s, after: 10s, when: [...]}`."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ def _load(
 
 
 def _reader(folder: Path) -> Callable[[str], str]:
-    """Reads no more of a file than tells that it is too long, and no device or pipe.
+    """Reads a file up to the limit of its size, and no device or pipe.
 
     Modules are sought beside every file that is read.
     """

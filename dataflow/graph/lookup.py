@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
 
+from dataflow.extras import missing_extra
 from dataflow.graph.model import current_path
 from dataflow.graph.problems import did_you_mean, nearest
 from dataflow.graph.search import looked_in
@@ -24,6 +25,8 @@ class NotFound:
 
     message: str
     hint: str = ""
+    deleted: bool = False
+    """True where a module or a class is not there, false where it is there and cannot be used."""
 
 
 def find_operator(use: str) -> type[Operator] | NotFound:
@@ -44,11 +47,12 @@ def find_operator(use: str) -> type[Operator] | NotFound:
     try:
         found = getattr(module, name, None)
     except (Exception, SystemExit) as error:  # a package may import what it offers only now
-        return NotFound(f"{use!r} fails to import: {type(error).__name__}: {error}", _where(error, module_name))
+        return NotFound(f"{use!r} fails to import: {type(error).__name__}: {error}", _mend(error, module_name))
     if found is None:
         return NotFound(
             f"module {module_name!r} has no operator {name!r}",
             did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
+            deleted=True,
         )
     if not (isinstance(found, type) and issubclass(found, Operator)):
         what = f"the class {name}" if isinstance(found, type) else f"a {type(found).__name__}"
@@ -58,7 +62,7 @@ def find_operator(use: str) -> type[Operator] | NotFound:
         )
     if not is_concrete(found):
         return NotFound(
-            f"{use!r} is abstract: it declares no ports of its own",
+            f"{use!r} is abstract: it declares no ports",
             did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
         )
     return found
@@ -77,11 +81,12 @@ def import_module(name: str) -> ModuleType | NotFound:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         if error.name != name:
-            return NotFound(f"module {name!r} needs {error.name!r}, which is not installed", _where(error, name))
+            return NotFound(f"module {name!r} needs {error.name!r}, which is not installed", _mend(error, name))
         if parent and not hasattr(sys.modules[parent], "__path__"):
-            return NotFound(f"no module {name!r}: {parent!r} is a single module", "")
+            return NotFound(f"no module {name!r}: {parent!r} is a single module", deleted=True)
         looked = "" if parent else f"{looked_in()}; --path DIR names another folder"
-        return NotFound(f"no module {name!r}", "\n".join(filter(None, (_nearest_module(last, parent), looked))))
+        hint = "\n".join(filter(None, (_nearest_module(last, parent), looked)))
+        return NotFound(f"no module {name!r}", hint, deleted=True)
     except (Exception, SystemExit) as error:  # the module's own code may fail in any way
         return NotFound(f"module {name!r} fails to import: {type(error).__name__}: {error}", _where(error, name))
 
@@ -105,17 +110,17 @@ def offered(module: ModuleType, named: str | None = None) -> Iterator[tuple[str,
                 yield name, value
 
 
-def lost_exports(module: ModuleType) -> Iterator[tuple[str, str]]:
-    """Yields what a module exports (`module:name`) and fails to import, and why."""
+def lost_exports(module: ModuleType) -> Iterator[tuple[str, str, str]]:
+    """Yields what a module exports (`module:name`) and fails to import, why, and how to install what is missing."""
     for name in getattr(module, "__all__", ()):
         try:
             getattr(module, name)
         except (Exception, SystemExit) as error:
-            yield f"{module.__name__}:{name}", f"{type(error).__name__}: {error}"
+            yield f"{module.__name__}:{name}", f"{type(error).__name__}: {error}", missing_extra(error)
 
 
 def is_concrete(cls: type[Operator]) -> bool:
-    """True when the class declares ports of its own, so that it can be made."""
+    """Returns whether the class itself declares ports, so that it can be instantiated."""
     return cls not in (Operator, Source) and "spec" in vars(cls)
 
 
@@ -127,6 +132,11 @@ def _nearest_module(name: str, parent: str) -> str:
         return did_you_mean(name, candidates, f"modules in {parent!r}").replace("mean '", f"mean '{parent}.")
     near = nearest(name, candidates)
     return "" if near is None else f"did you mean {near!r}?"
+
+
+def _mend(error: BaseException, module: str) -> str:
+    """Returns the extra that installs what is missing, else where the error was raised."""
+    return missing_extra(error) or _where(error, module)
 
 
 def _where(error: BaseException, module: str) -> str:

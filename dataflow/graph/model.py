@@ -1,7 +1,7 @@
 """The resolved graph: what a graph file means once every name, stream, parameter and policy in it is settled.
 
 Everything here is plain data that travels between processes as JSON (`Graph.to_json`, `Graph.from_json`); a node's
-operator class is imported only when somebody asks for it, so a process imports its own operators and no others.
+operator class is imported at its first use, so a process imports its own operators and no others.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from dataflow.extras import missing_extra
 from dataflow.graph.sections import (
     Network,
     Record,
@@ -47,7 +48,7 @@ def current_placement(placement: Any) -> Any:
 
 
 class OperatorImportError(ImportError):
-    """An operator that cannot be had from its import path: says which part of the path fails and why."""
+    """An operator cannot be imported from its path; the message names the part that fails, and why."""
 
 
 MOVED = "MOVED_OPERATORS"
@@ -74,11 +75,19 @@ def import_operator(use: str) -> type[Operator]:
         module_name, _, name = current_path(use).partition(":")
         module = sys.modules.get(module_name) or importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
-        raise OperatorImportError(f"cannot import {module_name!r}: {type(error).__name__}: {error}") from error
-    found = getattr(module, name, None)
+        raise _failed(module_name, error) from error
+    try:
+        found = getattr(module, name, None)
+    except (Exception, SystemExit) as error:  # a package may import what it offers only now
+        raise _failed(use, error) from error
     if not (isinstance(found, type) and issubclass(found, Operator)):
         raise OperatorImportError(f"module {module_name!r} has no operator {name!r}")
     return found
+
+
+def _failed(what: str, error: BaseException) -> OperatorImportError:
+    reason = f"cannot import {what!r}: {type(error).__name__}: {error}"
+    return OperatorImportError("; ".join(filter(None, (reason, missing_extra(error)))))
 
 
 @dataclass(frozen=True, slots=True)

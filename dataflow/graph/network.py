@@ -72,6 +72,6 @@ def _zenoh_part(table: Table, key: str, path: str, fields: Fields) -> dict[str, 
         told = _ZENOH_MESSAGE.search(str(error))
         message, _, expected = (told[1] if told else str(error)).partition(", expected one of ")
         field = re.search(r"unknown field `(\w+)`", message)
-        hint = did_you_mean(field[1] if field else "", re.findall(r"`(\w+)`", expected), "Zenoh knows")
+        hint = did_you_mean(field[1] if field else "", re.findall(r"`(\w+)`", expected), "Zenoh has")
         fields.problems.add(part.place, f"{key}: Zenoh refuses it: {message}", hint if expected else "")
     return values

@@ -12,9 +12,9 @@ from dataflow.graph.tree import Leaf, Table, Tree
 from dataflow.operator import InputPort, OperatorSpec
 
 QUEUE_SIZE = 16
-"""Undecided messages on each trigger stream, unless the graph says otherwise."""
+"""Undecided messages on each trigger stream, by default."""
 JOIN_WAIT = 100_000_000
-"""Time (ns) that a join or merge fed by devices waits for each input, unless the graph says otherwise."""
+"""Time (ns) that a join or merge fed by devices waits for each input, by default."""
 
 _QUEUES: Mapping[str, QueuePolicy] = {"newest": "newest", "oldest": "oldest", "block": "block"}
 _STALE: Mapping[str, StalePolicy] = {"use": "use", "drop": "drop"}

@@ -15,7 +15,7 @@ from dataflow.graph.order import fed_by_devices, in_order, refuse_stuck_cycles
 from dataflow.graph.policies import live_policy, sync_every, sync_tolerance
 from dataflow.graph.presence import said
 from dataflow.graph.problems import Problems, did_you_mean
-from dataflow.graph.sections import PANELS, Record, View
+from dataflow.graph.sections import ON_FAILURE, PANELS, Record, View
 from dataflow.graph.streams import Streams
 from dataflow.graph.tree import Leaf, Tree
 from dataflow.operator import InputPort, is_source
@@ -178,7 +178,7 @@ class Resolver:
         self.problems.add(
             draft.inputs_place,
             f"{draft.name}: {spec.name} ticks every {format_duration(every)}, but every wired input is static or "
-            "'before': nothing says when ticks begin and end",
+            "'before': the beginning and the end of ticks are unknown",
             "wire an input to a stream that is neither",
         )
 
@@ -230,7 +230,7 @@ class Resolver:
         if isinstance(tree, Leaf):
             self.fields.wrong(tree, "record", "'all' or a mapping with 'topics' or 'exclude'")
             return Record(everything)
-        table = self.fields.table(tree, "record", ("topics", "exclude", "snapshots", *FLIGHT_KEYS))
+        table = self.fields.table(tree, "record", ("topics", "exclude", "snapshots", "on_failure", *FLIGHT_KEYS))
         if table is None:
             return Record(everything)
         kept = set(everything if table.get("topics") is None else self.topics(table.get("topics"), "record"))
@@ -243,7 +243,9 @@ class Resolver:
         flight = read_flight(table, self.fields, [draft.name for draft in drafts], self.topics)
         if flight is not None and snapshots is None:
             snapshots = max(flight.keep // 6, 1_000_000_000)
-        return Record(tuple(sorted(kept)), thin=len(kept) < len(everything), snapshots=snapshots, flight=flight)
+        on_failure = self.fields.choice(table.get("on_failure"), "on_failure", ON_FAILURE)
+        thin = len(kept) < len(everything)
+        return Record(tuple(sorted(kept)), thin, snapshots, flight, on_failure)
 
     def view(self, tree: Tree | None) -> View:
         table = self.fields.table(tree, "view", ("hide", "panels", "layout", "keep", "every"))

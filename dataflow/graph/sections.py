@@ -44,14 +44,18 @@ class Record:
     """Choice of the streams that a recording holds. `thin`: not all of them; firing records are always written.
 
     `snapshots`: nanoseconds of event time between two snapshots of an operator's state; None for none. `flight`: the
-    flight recorder of runs that are not recorded whole; None for none.
+    flight recorder of runs that are not recorded whole; None for none. `on_failure`: whether a run goes on without a
+    recorder that fails ("go_on") or ends ("end"); None: a live run goes on, any other ends.
     """
 
     streams: tuple[str, ...]
     thin: bool = False
     snapshots: int | None = None
     flight: Flight | None = None
+    on_failure: Literal["go_on", "end"] | None = None
 
+
+ON_FAILURE: Mapping[str, Literal["go_on", "end"]] = {"go_on": "go_on", "end": "end"}
 
 PANELS = ("world", "cameras", "scene", "map", "text", "scores", "plots", "status", "log")
 """Parts of the viewer's window that a graph may choose."""
@@ -94,8 +98,9 @@ class Network:
 
 
 def record_to_json(record: Record) -> dict[str, Any]:
-    """Without a flight recorder, that is what it was before there were any."""
-    return {name: value for name, value in asdict(record).items() if name != "flight" or value is not None}
+    """Leaves out what the graph does not say and older recordings did not hold."""
+    later = ("flight", "on_failure")
+    return {name: value for name, value in asdict(record).items() if name not in later or value is not None}
 
 
 def record_from_json(data: Mapping[str, Any]) -> Record:

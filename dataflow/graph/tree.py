@@ -72,7 +72,7 @@ def at(tree: Tree, path: tuple[str | int, ...]) -> Tree:
 
 
 def moved(tree: Tree, place: Place) -> Tree:
-    """The tree as if all of it stood at `place`, which then tells where each value was given."""
+    """The tree as if all of it stood at `place`, which then records where each value was given."""
     here = replace(place, given=tree.place.given or tree.place)
     match tree:
         case Leaf():

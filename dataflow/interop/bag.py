@@ -54,6 +54,8 @@ class Bag(Protocol):
     """Format for people, such as `ROS 2 bag (sqlite3)`."""
     notes: tuple[str, ...]
     """Damage and oddities of the file, for people."""
+    promised: Mapping[str, int]
+    """Messages by topic that the file's metadata, statistics or index say there are; empty where nothing says so."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -64,6 +66,16 @@ class Bag(Protocol):
 
     def close(self) -> None:
         """Closes the files. Idempotent."""
+
+
+def shortfalls(bag: Bag) -> list[str]:
+    """Says of which topics a bag holds fewer messages than its metadata promise."""
+    found = []
+    for name, promised in sorted(bag.promised.items()):
+        held = sum(t.count for t in bag.topics.values() if t.name == name or t.name.startswith(f"{name} ("))
+        if held < promised:
+            found.append(f"topic {name}: {promised:,} messages are promised, {held:,} are there")
+    return found
 
 
 def is_static(topic: str) -> bool:

@@ -20,6 +20,8 @@ BACK = 5_000_000_000
 """A header that goes back by more (ns) tells of a clock that was set, or of a log that was played again."""
 APART = 1_000_000_000
 """Topics whose headers differ from log time by amounts farther apart (ns) have clocks of their own."""
+SOME = 10
+"""A topic of which more than one in so many headers carries no time is stamped by the log, and all others with it."""
 NEAR = 1_000_000_000
 """Headers that differ from log time by less (ns, in the middle) are of the recorder's own clock."""
 
@@ -49,9 +51,10 @@ class Clock:
     kind: Literal["header", "log"]
     why: str
     shift: int = 0
+    notes: tuple[str, ...] = ()
 
     def stamps(self, times: Times) -> I64:
-        """The stamps of a topic's entries, not repaired yet."""
+        """The stamps of a topic's entries, not repaired yet; by the log where a header carries none."""
         if self.kind == "log":
             return times.log
         logged = times.log + self.shift
@@ -59,14 +62,15 @@ class Clock:
             return logged
         if times.latched and bool((np.abs(times.header - logged) > APART).any()):
             return logged
-        return times.header
+        return np.where(times.header > 0, times.header, logged)
 
 
 def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     """Returns the one clock for all topics that are used together.
 
-    Header stamps, unless one is missing (zero or negative), goes back by more than 5 s, most of them repeat, or the
-    topics' headers are of different clocks: then log times, for all.
+    Header stamps, unless more than a tenth of a topic's are missing (zero or negative), one goes back by more than 5 s,
+    most of them repeat, or the topics' headers are of different clocks: then log times, for all. Fewer that are missing
+    are placed by the log.
     """
     if wanted == "log":
         return Clock("log", "asked for")
@@ -74,8 +78,14 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     offsets = {t.topic: _offset(t) for t in with_header if not t.latched}
     typical = int(np.median(list(offsets.values()))) if offsets else 0
     shift = 0 if abs(typical) <= NEAR else -typical
+    missing = {t.topic: (int((t.header <= 0).sum()), len(t.header)) for t in with_header if t.header is not None}
+    notes = tuple(
+        f"{topic}: {unset:,} of {count:,} headers carry no time; those messages are placed by log time"
+        for topic, (unset, count) in missing.items()
+        if unset and not next(t.latched for t in with_header if t.topic == topic)
+    )
     if wanted == "header":
-        return Clock("header", "asked for", shift)
+        return Clock("header", "asked for", shift, notes)
     if not with_header:
         return Clock("log", "no message carries a time of its own")
     for times in with_header:
@@ -83,11 +93,12 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
         if times.latched:
             continue
         count = len(times.header)
-        if unset := int((times.header <= 0).sum()):
+        set_ = times.header[times.header > 0]
+        if (unset := int((times.header <= 0).sum())) * SOME > count:
             return Clock("log", f"{unset:,} of {count:,} headers of {times.topic} carry no time")
-        if not times.shares and count > 2 * (distinct := len(np.unique(times.header))):
+        if not times.shares and count > 2 * (distinct := len(np.unique(set_))):
             return Clock("log", f"{count:,} headers of {times.topic} carry only {distinct:,} different times")
-        back = int(-np.diff(times.header).min(initial=0))
+        back = int(-np.diff(set_).min(initial=0))
         if back > BACK:
             return Clock("log", f"the headers of {times.topic} go back by {back * 1e-9:.1f} s")
     if offsets and max(offsets.values()) - min(offsets.values()) > APART:
@@ -97,13 +108,14 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     why = "when it was measured"
     if shift:
         why += f"; it runs {abs(typical) * 1e-9:.3f} s {'behind' if typical > 0 else 'ahead of'} the recorder's clock"
-    return Clock("header", why, shift)
+    return Clock("header", why, shift, notes)
 
 
 def _offset(times: Times) -> int:
     """By how much the log is behind the headers of a topic, in the middle."""
     assert times.header is not None
-    return int(np.median(times.log - times.header))
+    given = times.header > 0
+    return int(np.median((times.log - times.header)[given if given.any() else slice(None)]))
 
 
 @dataclass(frozen=True, slots=True)

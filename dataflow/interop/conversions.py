@@ -7,8 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.messages import CompressedDepth, CompressedImage, DepthImage, Image, Message, Odometry, Pose
+from dataflow.messages import (
+    CompressedDepth,
+    CompressedImage,
+    DepthImage,
+    Image,
+    Image16,
+    Measurement,
+    Message,
+    Number,
+    Odometry,
+    Pose,
+    RangeReading,
+)
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.pixels import as_depth
 
 
 def image_of(message: CompressedImage) -> Image:
@@ -16,9 +29,7 @@ def image_of(message: CompressedImage) -> Image:
     pixels = _decoded(message.data, message.format)
     if pixels.dtype != np.uint8:
         pixels = (pixels >> 8).astype(np.uint8)
-    if pixels.ndim == 3:
-        pixels = np.ascontiguousarray(pixels[..., 2::-1])
-    return Image(stamp=message.stamp, frame=message.frame, data=pixels)
+    return Image(stamp=message.stamp, frame=message.frame, data=_rgb(pixels))
 
 
 def depth_of(message: CompressedDepth) -> DepthImage:
@@ -32,6 +43,42 @@ def depth_of(message: CompressedDepth) -> DepthImage:
         away = units[known] - message.offset
         metres[known] = np.where(away > 0, message.scale / np.where(away > 0, away, 1), 0)
     return DepthImage(stamp=message.stamp, frame=message.frame, data=metres)
+
+
+def image16_of(message: CompressedImage) -> Image16:
+    """Decodes a PNG of 16 bits; raises `RecordingError` for one of 8."""
+    pixels = _decoded(message.data, message.format)
+    if pixels.dtype != np.uint16:
+        raise RecordingError(f"a {message.format} image of 8 bits is no Image16")
+    return Image16(stamp=message.stamp, frame=message.frame, data=_rgb(pixels))
+
+
+def upper_bits(message: Image16) -> Image:
+    """The upper 8 of 16 bits."""
+    return Image(stamp=message.stamp, frame=message.frame, data=(message.data >> 8).astype(np.uint8))
+
+
+def depth_in_millimetres(message: Image16) -> DepthImage:
+    """Depth that a device sends as grey values, in millimetres; 0 stays no return."""
+    if message.data.ndim != 2:
+        raise RecordingError("an image of three channels is no depth")
+    metres = as_depth("16UC1", message.data)
+    return DepthImage(stamp=message.stamp, frame=message.frame, data=metres)
+
+
+def depth_of_grey(message: CompressedImage) -> DepthImage:
+    """Decodes a PNG of 16-bit grey values, which are millimetres."""
+    return depth_in_millimetres(image16_of(message))
+
+
+def number_of(message: Measurement) -> Number:
+    """The value and its unit."""
+    return Number(stamp=message.stamp, value=message.value, unit=message.unit)
+
+
+def distance_of(message: RangeReading) -> Number:
+    """The distance alone, metres."""
+    return Number(stamp=message.stamp, value=message.range, unit="m")
 
 
 def pose_of(message: Odometry) -> Pose:
@@ -67,12 +114,33 @@ def _decoded(data: Any, format_: str) -> Any:
     return pixels
 
 
+def _rgb(pixels: Any) -> Any:
+    return np.ascontiguousarray(pixels[..., 2::-1]) if pixels.ndim == 3 else pixels
+
+
 CONVERSIONS: dict[tuple[type[Message], type[Message]], Callable[[Any], Message]] = {
     (CompressedImage, Image): image_of,
     (CompressedDepth, DepthImage): depth_of,
+    (CompressedImage, Image16): image16_of,
+    (CompressedImage, DepthImage): depth_of_grey,
+    (Image16, Image): upper_bits,
+    (Image16, DepthImage): depth_in_millimetres,
+    (Measurement, Number): number_of,
+    (RangeReading, Number): distance_of,
     (Odometry, Pose): pose_of,
     (Pose, Odometry): odometry_of,
 }
+
+
+TOLD = {(CompressedImage, Image16), (CompressedImage, DepthImage), (Image16, DepthImage)}
+"""Conversions that are right for what some devices send only: done where somebody asks for them by name."""
+NARROWING = {(Image16, Image): "16 bits become 8", (Odometry, Pose): "velocities", (RangeReading, Number): "limits"}
+"""By conversion, the content that it does not carry over."""
+
+
+def proposed(read_as: type[Message]) -> tuple[type[Message], ...]:
+    """The types that a topic read as `read_as` is played as without being told to, that one first."""
+    return tuple(to for to in offers(read_as) if (read_as, to) not in TOLD)
 
 
 def offers(read_as: type[Message]) -> tuple[type[Message], ...]:

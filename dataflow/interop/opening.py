@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
-from dataflow.interop.bag import Bag, BagError
+from dataflow.interop.bag import Bag, BagError, shortfalls
 from dataflow.interop.mcap_bag import McapBag
-from dataflow.recording.container import MAGIC
+from dataflow.interop.unpacking import Unpacked, unpack
+from dataflow.recording.ending import MAGIC
 from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RECORDING
+from dataflow.recording.notices import notice
+from dataflow.recording.part_folder import parts_in
 
 ROS1_MAGIC = b"#ROSBAG V"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 SQLITE_MAGIC = b"SQLite format 3\x00"
 WRITER = b"robot-dataflow/"
 """Our library in the header of an MCAP; what others made of one of our files may name theirs."""
@@ -20,6 +23,13 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 def open_bag(path: Path) -> Bag:
+    """Opens a bag, and announces what is unusual about it (`notices`). Raises as `bag_at`."""
+    bag = bag_at(path)
+    notice(path, [*bag.notes, *shortfalls(bag)])
+    return bag
+
+
+def bag_at(path: Path) -> Bag:
     """Opens a ROS 1 bag, a ROS 2 bag (folder, .db3 or .mcap) or any other MCAP file.
 
     Raises `BagError` that says what else is there, `RecordingError` for a damaged MCAP file.
@@ -32,7 +42,9 @@ def open_bag(path: Path) -> Bag:
     if head.startswith(ROS1_MAGIC):
         return _ros_bag(_with_suffix(path, ".bag"))
     if head.startswith(SQLITE_MAGIC):
-        return _ros_bag(_with_suffix(path, ".db3"))
+        return _of_files(path, ".db3", [path])
+    if head.startswith(ZSTD_MAGIC):
+        return _of_files(path, Path(path.stem).suffix, [path])
     begins = f"it begins with {head[:8].hex(' ')}" if head else "it is empty"
     raise BagError(
         f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag) and "
@@ -43,7 +55,8 @@ def open_bag(path: Path) -> Bag:
 def is_foreign(path: Path) -> bool:
     """Tells whether a file or folder is a recording of another program: anything but an MCAP that this one wrote."""
     if path.is_dir():
-        return True
+        parts = parts_in(path)
+        return not parts or is_foreign(parts[0])
     with path.open("rb") as opened:
         head = opened.read(HEAD_BYTES)
     if not head.startswith(MAGIC):
@@ -55,6 +68,11 @@ def is_foreign(path: Path) -> bool:
         return not any(name == RECORDING for name, _ in file.metadata)
     finally:
         file.close()
+
+
+def is_ros_bag(path: Path) -> bool:
+    """Tells whether a file is a ROS 1 bag or a database of a ROS 2 bag, whole or not."""
+    return path.is_file() and _head(path).startswith((ROS1_MAGIC, SQLITE_MAGIC))
 
 
 def _ros_bag(path: Path) -> Bag:
@@ -75,25 +93,39 @@ def _with_suffix(path: Path, suffix: str) -> Path:
 
 
 def _open_folder(path: Path) -> Bag:
-    files = {suffix: sorted(path.glob(f"*{suffix}"), key=_natural) for suffix in BAG_SUFFIXES}
-    if (path / "metadata.yaml").is_file():
-        compressed = sorted(path.glob("*.zstd"))
-        if files[".mcap"] and not compressed:
-            return McapBag(path, files[".mcap"])
-        return _ros_bag(path)
-    if files[".mcap"]:
-        return McapBag(path, files[".mcap"])
-    for suffix in (".db3", ".bag"):
-        if len(files[suffix]) == 1:
-            return _ros_bag(files[suffix][0])
-        if files[suffix]:
-            raise BagError(
-                f"{path} holds {len(files[suffix])} {suffix} files and no metadata.yaml that says how they belong "
-                "together; name one of them, or restore the file (`ros2 bag reindex`)"
-            )
+    from dataflow.interop.ros2_folder import METADATA, bag_files, read_folder  # reading YAML takes long to import
+
+    folder = read_folder(path)
+    files = {suffix: bag_files(path, suffix, folder) for suffix in BAG_SUFFIXES}
+    kinds = [suffix for suffix in (".mcap", ".db3") if files[suffix]]
+    if len(kinds) > 1:
+        first, second = (", ".join(file.name for file in files[kind]) for kind in kinds)
+        raise BagError(f"{path} holds bags of two kinds, {first} and {second}; name one of them")
+    if kinds:
+        bag = _of_files(path, kinds[0], files[kinds[0]], compressed=folder.message_compression)
+        bag.promised = {**bag.promised, **folder.promised}
+        bag.notes = (*folder.notes, *bag.notes)
+        return bag
+    if len(files[".bag"]) == 1:
+        return _ros_bag(files[".bag"][0])
+    if files[".bag"]:
+        raise BagError(f"{path} holds {len(files['.bag'])} .bag files, which are recordings of their own; name one")
+    if folder.named:
+        raise BagError(
+            f"{path}: {METADATA} names {', '.join(folder.named)}, and the folder holds no .mcap or .db3 file"
+        )
     raise BagError(f"{path} is a folder without a bag: it holds no metadata.yaml, .mcap, .db3 or .bag file")
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sorts bag_2 before bag_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+def _of_files(path: Path, suffix: str, files: list[Path], *, compressed: bool = False) -> Bag:
+    """Opens MCAP files or databases as one bag; those compressed as files are unpacked for as long as it is open."""
+    from dataflow.interop.db3_bag import Db3Bag
+
+    plain, unpacked = unpack(files)
+    try:
+        bag: Bag = (McapBag if suffix == ".mcap" else Db3Bag)(path, plain, compressed=compressed)
+    except BaseException:
+        if unpacked is not None:
+            unpacked.cleanup()
+        raise
+    return bag if unpacked is None else Unpacked(bag, unpacked)

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataflow.graph.model import Graph
-from dataflow.interop.bag import Bag, is_static
+from dataflow.interop.bag import Bag, BagError, is_static
 from dataflow.interop.clocks import Choice
-from dataflow.interop.conversions import offers
+from dataflow.interop.conversions import offers, proposed
 from dataflow.interop.mapping import MappingError, Offered, Proposal, Wanted, parse_map, propose
 from dataflow.interop.opening import open_bag
 from dataflow.interop.streams import BagStreams, Played
 from dataflow.interop.topics import Reading
-from dataflow.messages import Transforms
+from dataflow.messages import CompressedDepth, DepthImage, Image, Image16, Message, Transforms
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,9 @@ def match(path: Path, graph: Graph, words: Sequence[str]) -> Matching:
     for reading in readings:
         if reading.topic.name in given.values() and not reading.playable:
             raise MappingError(f"{path}: topic {reading.topic.name} cannot be played: {reading.reason}")
-    offered = [Offered(r.topic.name, _types(r), r.topic.count) for r in readings if r.playable]
+    offered = [
+        Offered(r.topic.name, _types(r, r.topic.name in given.values()), r.topic.count) for r in readings if r.playable
+    ]
     return Matching(path, wanted, readings, propose(wanted, offered, given))
 
 
@@ -95,19 +97,57 @@ def play(
     return BagStreams(path, match(path, graph, words).played(), clock, watch=watch)
 
 
-def readable(bag: Bag, path: Path, clock: Choice = "auto", topics: Collection[str] | None = None) -> BagStreams:
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """Wishes for the reading of a bag: `depth`, topics that are depth although their messages do not say so; `lossy`,
+    whether 16-bit images become 8-bit ones; `strict`, whether a message that cannot be read is an error."""
+
+    depth: tuple[str, ...] = ()
+    lossy: bool = False
+    strict: bool = False
+
+
+PLAIN = Wishes()
+
+
+def readable(
+    bag: Bag,
+    path: Path,
+    clock: Choice = "auto",
+    topics: Collection[str] | None = None,
+    wishes: Wishes = PLAIN,
+    *,
+    accounting: bool = False,
+) -> BagStreams:
     """Opens all topics of a bag, or some, that a message type fits, each under its own name.
 
     Topics called `tf_static` are static: all their transforms as one message. Raises `BagError`.
     """
+    for name in wishes.depth:
+        if name not in bag.topics:
+            raise BagError(f"{path} has no topic {name!r}; it has {', '.join(bag.topics) or 'none'}")
     found = [r for r in readings_of(bag, topics) if r.playable and r.topic.count]
     played = {
-        r.topic.name: Played(r.topic.name, r.read_as.SCHEMA, r.read_as is Transforms and is_static(r.topic.name))
+        r.topic.name: Played(
+            r.topic.name, _wished(r, wishes).SCHEMA, r.read_as is Transforms and is_static(r.topic.name)
+        )
         for r in found
         if r.read_as is not None
     }
-    return BagStreams(path, played, clock)
+    return BagStreams(path, played, clock, strict=wishes.strict, accounting=accounting)
 
 
-def _types(reading: Reading) -> tuple[str, ...]:
-    return () if reading.read_as is None else tuple(t.SCHEMA for t in offers(reading.read_as))
+def _wished(reading: Reading, wishes: Wishes) -> type[Message]:
+    assert reading.read_as is not None
+    if reading.topic.name in wishes.depth and reading.read_as not in (DepthImage, CompressedDepth):
+        if DepthImage not in offers(reading.read_as):
+            raise BagError(f"topic {reading.topic.name} is read as {reading.read_as.SCHEMA}, which cannot be depth")
+        return DepthImage
+    return Image if wishes.lossy and reading.read_as is Image16 else reading.read_as
+
+
+def _types(reading: Reading, told: bool = False) -> tuple[str, ...]:
+    """The types that a topic can be played as; `told`: those too that somebody has to ask for."""
+    if reading.read_as is None:
+        return ()
+    return tuple(t.SCHEMA for t in (offers if told else proposed)(reading.read_as))

@@ -1,4 +1,4 @@
-"""ROS 1 bags and ROS 2 bags with sqlite3 storage, through the `rosbags` library."""
+"""ROS 1 bags, through the `rosbags` library."""
 
 from __future__ import annotations
 
@@ -7,67 +7,52 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag1, ConnectionExtRosbag2, MessageDefinitionFormat
-from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag1 import ReaderError as Reader1Error
-from rosbags.rosbag2 import Reader as Reader2
-from rosbags.rosbag2 import ReaderError as Reader2Error
+from rosbags.interfaces import Connection, ConnectionExtRosbag1
+from rosbags.rosbag1 import Reader, ReaderError
 
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
+from dataflow.interop.channels import join
 from dataflow.recording.codecs import SchemaText
-
-_FORMATS = {
-    MessageDefinitionFormat.MSG: "ros2msg",
-    MessageDefinitionFormat.IDL: "ros2idl",
-    MessageDefinitionFormat.NONE: "",
-}
-TRANSIENT_LOCAL = 1
 
 
 class RosBag:
-    """Reads one ROS 1 bag file, or one ROS 2 bag with sqlite3 storage (a folder with its metadata, or a .db3 file)."""
+    """Reads one ROS 1 bag file."""
+
+    kind = "ROS 1 bag"
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._ros1 = path.suffix == ".bag"
         self._reader: Any = None
         try:
-            reader: Any = Reader1(path) if self._ros1 else Reader2(path)
+            reader: Any = Reader(path)
             reader.open()
             self._reader = reader
-        except (Reader1Error, Reader2Error, AssertionError, UnicodeDecodeError) as error:
-            raise BagError(f"{path}: {_reason(error)}") from error
+        except (ReaderError, AssertionError, UnicodeDecodeError) as error:
+            raise BagError(f"{path}: {_reason(path, error)}") from error
         except OSError:
             raise
-        except Exception as error:  # sqlite and yaml raise errors of their own
-            raise BagError(f"{path} cannot be opened as a bag: {type(error).__name__}: {error}") from error
-        self.kind = "ROS 1 bag" if self._ros1 else "ROS 2 bag (sqlite3)"
-        self.notes: tuple[str, ...] = ()
-        grouped: dict[str, list[Connection]] = {}
-        for connection in reader.connections:
-            grouped.setdefault(connection.topic, []).append(connection)
-        times = self._times() if self._ros1 else {}
-        self.topics: Mapping[str, Topic] = {
-            name: self._topic(name, connections, times) for name, connections in sorted(grouped.items())
-        }
+        except Exception as error:  # the library raises whatever broken bytes make it raise
+            raise BagError(
+                f"{path} cannot be opened as a bag: {type(error).__name__}: {error}; {_saved(path)}"
+            ) from error
+        times = self._times()
+        joined = join((c.id, self._topic(c, times.get(c.id))) for c in reader.connections)
+        self.topics, self._owner = joined.topics, joined.owner
+        self.notes: tuple[str, ...] = joined.notes
+        self.promised: Mapping[str, int] = {}
 
-    def _topic(self, name: str, connections: list[Connection], times: dict[int, tuple[int, int]]) -> Topic:
-        types = {(c.msgtype, c.msgdef.data) for c in connections}
-        if len({kind for kind, _ in types}) > 1:
-            named = ", ".join(sorted({kind for kind, _ in types}))
-            raise BagError(f"{self.path}: topic {name!r} is recorded with several types: {named}")
-        first = connections[0]
-        encoding = "ros1msg" if self._ros1 else _FORMATS[first.msgdef.format]
-        spans = [times[c.id] for c in connections if c.id in times]
+    def _topic(self, connection: Connection, span: tuple[int, int] | None) -> Topic:
+        assert isinstance(connection.ext, ConnectionExtRosbag1)
+        first, last = span or (None, None)
         return Topic(
-            name,
-            "ros1" if self._ros1 else "cdr",
-            SchemaText(first.msgtype, encoding, first.msgdef.data.encode()),
-            sum(c.msgcount for c in connections),
-            min((a for a, _ in spans), default=None),
-            max((b for _, b in spans), default=None),
+            connection.topic,
+            "ros1",
+            SchemaText(connection.msgtype, "ros1msg", connection.msgdef.data.encode()),
+            connection.msgcount,
+            first,
+            last,
             None,
-            is_latched(name) or any(_latched(c) for c in connections),
+            is_latched(connection.topic) or bool(connection.ext.latching),
             {},
         )
 
@@ -77,15 +62,16 @@ class RosBag:
 
     def messages(self, topics: Collection[str]) -> Iterator[Stored]:
         """Every message of some topics, in the order of log times."""
-        chosen = [c for c in self._reader.connections if c.topic in topics]
+        chosen = [c for c in self._reader.connections if self._owner[c.id] in topics]
         if not chosen:
             return
         counters = {name: count() for name in topics}
         try:
             for connection, log_time, data in self._reader.messages(connections=chosen):
-                yield Stored(connection.topic, next(counters[connection.topic]), log_time, data)
-        except (Reader1Error, Reader2Error) as error:
-            raise BagError(f"{self.path}: {_reason(error)}") from error
+                name = self._owner[connection.id]
+                yield Stored(name, next(counters[name]), log_time, data)
+        except (ReaderError, AssertionError) as error:
+            raise BagError(f"{self.path}: {_reason(self.path, error)}") from error
 
     def close(self) -> None:
         """Closes the files. Idempotent."""
@@ -94,16 +80,12 @@ class RosBag:
             self._reader = None
 
 
-def _latched(connection: Connection) -> bool:
-    ext = connection.ext
-    if isinstance(ext, ConnectionExtRosbag1):
-        return bool(ext.latching)
-    assert isinstance(ext, ConnectionExtRosbag2)
-    return any(getattr(qos.durability, "value", qos.durability) == TRANSIENT_LOCAL for qos in ext.offered_qos_profiles)
-
-
-def _reason(error: Exception) -> str:
+def _reason(path: Path, error: Exception) -> str:
     text = str(error) or type(error).__name__
     if "not indexed" in text:
-        return "the bag has no index, since its recorder was killed; `rosbag reindex` makes one"
+        return f"the bag has no index, since its recorder was killed; {_saved(path)}"
     return text.rstrip(".")
+
+
+def _saved(path: Path) -> str:
+    return f"`dataflow recover {path} -o OUT.mcap` saves the messages that can be read"

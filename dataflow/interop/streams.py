@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
-from dataflow.interop.bag import Bag, BagError, Stored
+from dataflow.interop.account import Account, Unread
+from dataflow.interop.bag import Bag, BagError, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
-from dataflow.interop.conversions import convert, offers
+from dataflow.interop.conversions import NARROWING, convert, offers
 from dataflow.interop.found import Found
 from dataflow.interop.opening import open_bag
 from dataflow.interop.ranking import Ranking, within
 from dataflow.interop.topics import Reading
-from dataflow.messages import CameraInfo, Message, MessageError, Transforms, message_type
+from dataflow.interop.transform_sets import joined, places_of
+from dataflow.messages import Message, MessageError, Transforms, message_type
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
 
 MAX_HELD = 1 << 30
@@ -50,14 +52,22 @@ class BagStreams:
         clock: Choice = "auto",
         *,
         watch: Callable[[int], None] | None = None,
+        strict: bool = False,
+        accounting: bool = False,
     ) -> None:
+        """`strict`: a message that cannot be read is an error; else it is passed over and counted in `account`.
+        `accounting`: what messages do not carry over is counted there too."""
         self.path, self.played = Path(path), dict(sorted(played.items()))
+        self._strict, self._accounting = strict, accounting
         self._bag: Bag = open_bag(self.path)
         self._closed = False
         try:
+            self.account = Account(list(self._bag.notes), shortfalls(self._bag))
             self._readings = {p.topic: self._reading(p) for p in self.played.values()}
+            self._unstamped: dict[str, Unread] = {}
             self._moving = sorted({p.topic for p in self.played.values() if not p.static})
             self._found = self._scan(watch)
+            self._unstamped = {topic: Unread(u.count, u.reason) for topic, u in self.account.unread.items()}
             times = [found.times(self._bag.topics[t], self._readings[t].merges) for t, found in self._found.items()]
             self.clock: Clock = choose_clock(times, clock)
             self.repairs: Mapping[str, Repair] = {
@@ -68,6 +78,8 @@ class BagStreams:
                 )
                 for t in times
             }
+            self.account.repaired = {name: mended.facts() for name, mended in self.repairs.items() if mended.facts()}
+            self.account.notes += self.clock.notes
             self.static_notes: dict[str, str] = {}
             self._static = {stream: self._static_message(stream) for stream, p in self.played.items() if p.static}
             self.streams: Mapping[str, StreamInfo] = {stream: self._info(stream) for stream in self.played}
@@ -83,16 +95,22 @@ class BagStreams:
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes of what in the file is damaged or unusual, for people."""
-        return self._bag.notes
+        return (*self.account.notes, *self.account.short)
 
-    def left_out(self, topic: str) -> tuple[str, ...]:
-        """Fields of a topic's messages that have no place here."""
-        return self._readings[topic].left_out
+    def losses(self, topic: str) -> tuple[str, ...]:
+        """Names the content of a topic's first message that has no place here."""
+        return self._readings[topic].losses
+
+    def look_for_unread(self, topics: Collection[str]) -> None:
+        """Reads all messages of topics, so that `account` counts those that cannot be read."""
+        streams = [stream for stream, played in self.played.items() if played.topic in topics and not played.static]
+        for _ in self._merged(streams, None, None) if streams else ():
+            pass
 
     def opening(self) -> Mapping[str, Any] | None:
         """Plain values with which `recorded_streams` gives the same streams in another process."""
         played = {stream: [p.topic, p.type, p.static] for stream, p in self.played.items()}
-        return {"played": played, "clock": self.clock.kind}
+        return {"played": played, "clock": self.clock.kind, "strict": self._strict}
 
     def facts(self) -> dict[str, str]:
         """Returns the metadata that a recording made of this bag has of it."""
@@ -103,6 +121,7 @@ class BagStreams:
             "clock": f"{self.clock.kind}: {self.clock.why}",
             "topics": json.dumps({stream: p.topic for stream, p in self.played.items()}, ensure_ascii=False),
             "repaired": json.dumps({name: found for name, found in repairs.items() if found}, ensure_ascii=False),
+            "notes": "\n".join([*self.account.notes, *self.account.short]),
         }
 
     def messages(
@@ -162,7 +181,8 @@ class BagStreams:
             try:
                 stamps = reader.stamps(stored.data)
             except (RecordingError, MessageError) as error:
-                raise self._unreadable(stored, error) from error
+                self._pass_over(stored, error)
+                continue
             found[stored.topic].add(stored, stamps)
             if watch is not None and not seen % 1000:
                 watch(seen)
@@ -170,35 +190,53 @@ class BagStreams:
 
     def _static_message(self, stream: str) -> Message:
         """The one message of a static stream: the transforms of all, or the first, and whether others differ."""
-        played, reading = self.played[stream], self._readings[self.played[stream].topic]
-        assert reading.reader is not None
+        played = self.played[stream]
         first: Message | None = None
         differing = count = 0
+        given: dict[str, bytes] = {}
+        changed: dict[str, int] = {}
         for stored in self._bag.messages([played.topic]):
             count += 1
-            try:
-                for part in range(max(1, len(reading.reader.stamps(stored.data)))):
-                    read = reading.reader.read(stored.data, part, max(stored.log_time, 0))
-                    message = convert(read, message_type(played.type))
-                    if first is None:
-                        first = message
-                    elif isinstance(first, Transforms):
-                        assert isinstance(message, Transforms)
-                        first = joined(first, message)
-                    elif message.replace(stamp=first.stamp).digest() != first.digest():
-                        differing += 1
-            except (RecordingError, MessageError) as error:
-                raise self._unreadable(stored, error) from error
-        assert first is not None, "a playable topic has messages"
-        if isinstance(first, CameraInfo) and differing:
-            self.static_notes[stream] = f"the first of {count:,}; {differing:,} differ from it"
-        elif count > 1:
-            self.static_notes[stream] = (
-                f"{count:,} messages as one"
-                if not differing
-                else (f"the first of {count:,}; {differing:,} differ from it")
-            )
+            for message in self._parts(played, stored):
+                if isinstance(message, Transforms):
+                    for child, place in places_of(message):
+                        if given.setdefault(child, place) != place:
+                            changed[child] = changed.get(child, 0) + 1
+                            given[child] = place
+                if first is None:
+                    first = message
+                elif isinstance(first, Transforms):
+                    assert isinstance(message, Transforms)
+                    first = joined(first, message)
+                elif message.replace(stamp=first.stamp).digest() != first.digest():
+                    differing += 1
+        if first is None:
+            raise BagError(f"{self.path}: topic {played.topic!r}: none of its {count:,} messages can be read")
+        told = f"the first of {count:,}; {differing:,} differ from it" if differing else f"{count:,} messages as one"
+        if changed:
+            told += f"; differs on the way: {', '.join(sorted(changed))} (the last place holds from the beginning)"
+        if count > 1:
+            self.static_notes[stream] = told
+        if differing or changed:
+            self.account.static[played.topic] = told
         return first
+
+    def _parts(self, played: Played, stored: Stored) -> list[Message]:
+        """All parts of a message as the type that is played; none where it cannot be read."""
+        reader = self._readings[played.topic].reader
+        assert reader is not None
+        losses: list[str] | None = [] if self._accounting else None
+        try:
+            parts = range(max(1, len(reader.stamps(stored.data))))
+            stamp = max(stored.log_time, 0)
+            read = [reader.read(stored.data, part, stamp, losses) for part in parts]
+            made = [convert(message, message_type(played.type)) for message in read]
+        except (RecordingError, MessageError) as error:
+            self._pass_over(stored, error)
+            return []
+        if losses:
+            self.account.lose(played.topic, losses)
+        return made
 
     def _info(self, stream: str) -> StreamInfo:
         played = self.played[stream]
@@ -227,6 +265,10 @@ class BagStreams:
         waiting: list[tuple[int, int, int, Stored]] = []
         held = due = 0
         pending: _Pending | None = None
+        self.account.unread = dict(self._unstamped)
+        self.account.lost = {topic: lost for topic, lost in self.account.lost.items() if topic not in plan.topics}
+        behind: dict[str, int] = {}
+        """By stream, messages that were passed over: numbers have no gaps."""
         for stored in self._bag.messages(plan.topics):
             for rank, part in plan.ranks(stored):
                 heapq.heappush(waiting, (rank, part, stored.number, stored))
@@ -242,6 +284,10 @@ class BagStreams:
                 due += 1
                 stream, stamp, seq = plan.place(rank)
                 message = self._read(stream, ready, part, stamp)
+                if message is None:
+                    behind[stream] = behind.get(stream, 0) + 1
+                    continue
+                seq -= behind.get(stream, 0)
                 if pending is not None and (pending.stream, pending.message.stamp) == (stream, stamp):
                     assert isinstance(pending.message, Transforms)
                     assert isinstance(message, Transforms)
@@ -253,17 +299,33 @@ class BagStreams:
         if pending is not None:
             yield pending.done()
 
-    def _read(self, stream: str, stored: Stored, part: int, stamp: int) -> Message:
+    def _read(self, stream: str, stored: Stored, part: int, stamp: int) -> Message | None:
+        """The message as the type that is played; None for one that cannot be read."""
         played = self.played[stream]
         reader = self._readings[played.topic].reader
         assert reader is not None
+        losses: list[str] | None = [] if self._accounting else None
+        wanted = message_type(played.type)
         try:
-            return convert(reader.read(stored.data, part, stamp), message_type(played.type))
+            read = reader.read(stored.data, part, stamp, losses)
+            message = convert(read, wanted)
         except (RecordingError, MessageError) as error:
-            raise self._unreadable(stored, error) from error
+            self._pass_over(stored, error)
+            return None
+        if losses is not None:
+            if (lost := NARROWING.get((type(read), wanted))) is not None:
+                losses.append(lost)
+            if losses:
+                self.account.lose(played.topic, losses)
+        return message
 
-    def _unreadable(self, stored: Stored, error: Exception) -> BagError:
-        return BagError(f"{self.path}: topic {stored.topic!r}, message {stored.number} at {stored.log_time}: {error}")
+    def _pass_over(self, stored: Stored, error: Exception) -> None:
+        """Counts a message that cannot be read; raises `BagError` where that is not allowed."""
+        if self._strict:
+            raise BagError(
+                f"{self.path}: topic {stored.topic!r}, message {stored.number} at {stored.log_time}: {error}"
+            ) from error
+        self.account.pass_over(stored.topic, f"number {stored.number} at {stored.log_time}: {error}")
 
 
 @dataclass(slots=True)
@@ -281,17 +343,4 @@ def recorded_streams(path: Path, opening: Mapping[str, Any] | None) -> Recording
     if opening is None:
         return Recording(path)
     played = {stream: Played(*values) for stream, values in opening["played"].items()}
-    return BagStreams(path, played, opening["clock"])
-
-
-def joined(a: Transforms, b: Transforms) -> Transforms:
-    """The transforms of two sets, stamped like the first; of those that place one frame the later counts."""
-    rows = {child: (a, i) for i, child in enumerate(a.child_frames)}
-    rows |= {child: (b, i) for i, child in enumerate(b.child_frames)}
-    return Transforms(
-        stamp=a.stamp,
-        frames=tuple(m.frames[i] for m, i in rows.values()),
-        child_frames=tuple(rows),
-        translations=np.array([m.translations[i] for m, i in rows.values()]).reshape(-1, 3),
-        rotations=np.array([m.rotations[i] for m, i in rows.values()]).reshape(-1, 4),
-    )
+    return BagStreams(path, played, opening["clock"], strict=opening["strict"])

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from dataflow.interop.bag import Bag
-from dataflow.interop.conversions import offers
+from dataflow.interop.conversions import proposed
 from dataflow.interop.topics import Reading
 
 
@@ -62,12 +62,12 @@ def _summary(reading: Reading, times: dict[str, tuple[int, int]]) -> TopicSummar
     topic = reading.topic
     first, last = times.get(topic.name, (topic.first, topic.last))
     span = 0 if first is None or last is None else last - first
-    read_as = () if reading.read_as is None else tuple(t.SCHEMA for t in offers(reading.read_as))
+    read_as = () if reading.read_as is None else tuple(t.SCHEMA for t in proposed(reading.read_as))
     notes = ["latched"] if topic.latched else []
     if not reading.playable and topic.count:
         notes.append(reading.reason.removeprefix(f"{topic.schema.name} "))
-    if reading.left_out:
-        notes.append(f"without {', '.join(reading.left_out)}")
+    if reading.losses:
+        notes.append(f"without {', '.join(reading.losses)}")
     return TopicSummary(
         topic.name,
         topic.schema.name,

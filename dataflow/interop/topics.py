@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from functools import partial
+from itertools import islice
 from typing import Any, Protocol
 
 from dataflow.interop.bag import Bag, Topic
 from dataflow.interop.ros import CONVERSIONS, TRANSFORM_SETS, Convert
-from dataflow.interop.ros.clouds import left_out
+from dataflow.interop.ros.clouds import point_cloud
 from dataflow.interop.ros.objects import array_stamp
 from dataflow.interop.ros.poses import transforms
+from dataflow.interop.ros.sensors import number
 from dataflow.interop.ros.values import time_ns
+from dataflow.interop.seen import Seen
 from dataflow.interop.typestores import RosType, ros_type
 from dataflow.messages import Message, MessageError, Transforms
 from dataflow.recording.errors import RecordingError
@@ -21,6 +25,10 @@ Data = bytes | memoryview
 
 _CDR_TIME = (struct.Struct("<iI"), struct.Struct(">iI"))
 _ROS1_TIME = struct.Struct("<II")
+UNIT = "unit"
+"""Of a channel's metadata: the unit of its numbers, which ROS has no place for."""
+FIRST = 100
+"""Messages of which one has to be readable."""
 _STAMPED_FIRST = {"rcl_interfaces/msg/Log"}
 """Types that begin with a bare time."""
 
@@ -31,16 +39,19 @@ class TopicReader(Protocol):
     def stamps(self, data: Data) -> tuple[int, ...]:
         """The times that a message carries (ns), one for each part; empty where its type carries none."""
 
-    def read(self, data: Data, part: int, stamp: int) -> Message:
-        """A part of a message, stamped with `stamp`. Raises `RecordingError` and `MessageError`."""
+    def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
+        """A part of a message, stamped with `stamp`. Raises `RecordingError` and `MessageError`.
+
+        What it does not carry over is added to `losses`.
+        """
 
 
 class RosReader:
     """Reads messages of a ROS type whose times stand at the beginning, in a header, or nowhere."""
 
-    def __init__(self, kind: RosType, ros1: bool) -> None:
+    def __init__(self, kind: RosType, ros1: bool, convert: Convert) -> None:
         self._kind, self._ros1 = kind, ros1
-        self._convert = CONVERSIONS[kind.name][1]
+        self._convert = convert
         self._stamped = kind.has_header or kind.name in _STAMPED_FIRST
 
     def stamps(self, data: Data) -> tuple[int, ...]:
@@ -56,9 +67,9 @@ class RosReader:
             raise RecordingError(f"a {self._kind.name} of {len(data)} bytes is too short") from None
         return (seconds * 10**9 + nanoseconds,)
 
-    def read(self, data: Data, part: int, stamp: int) -> Message:
+    def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
         """The message."""
-        return _converted(self._convert, self._kind, data, stamp)
+        return _converted(self._convert, self._kind, data, stamp, losses)
 
 
 class TransformSetReader:
@@ -71,11 +82,12 @@ class TransformSetReader:
         """The times of its transforms, each once."""
         return _stamps_of(self._kind.parse(data).transforms)
 
-    def read(self, data: Data, part: int, stamp: int) -> Message:
+    def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
         """The transforms of the part's time."""
         rows = self._kind.parse(data).transforms
         times = _stamps_of(rows)
-        return transforms([row for row in rows if time_ns(row.header.stamp) == times[part]] if times else [], stamp)
+        chosen = [row for row in rows if time_ns(row.header.stamp) == times[part]] if times else []
+        return transforms(chosen if losses is None else [Seen(row, losses) for row in chosen], stamp)
 
 
 def _stamps_of(rows: Any) -> tuple[int, ...]:
@@ -94,14 +106,20 @@ class MarkerArrayReader:
         found = array_stamp(self._kind.parse(data))
         return () if found is None else (found,)
 
-    def read(self, data: Data, part: int, stamp: int) -> Message:
+    def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
         """The message."""
-        return _converted(self._convert, self._kind, data, stamp)
+        return _converted(self._convert, self._kind, data, stamp, losses)
 
 
-def _converted(convert: Convert, kind: RosType, data: Data, stamp: int) -> Message:
+def _converted(convert: Convert, kind: RosType, data: Data, stamp: int, losses: list[str] | None) -> Message:
+    parsed = kind.parse(data)
     try:
-        return convert(kind.parse(data), stamp)
+        if losses is None:
+            return convert(parsed, stamp)
+        seen = Seen(parsed)
+        made = convert(seen, stamp)
+        losses += seen.unread()
+        return made
     except (ValueError, TypeError, AttributeError, IndexError) as error:
         if isinstance(error, MessageError):
             raise
@@ -119,7 +137,7 @@ class ForeignReader:
         carried = self._decode(bytes(data), -1).stamp
         return () if carried == -1 else (carried,)
 
-    def read(self, data: Data, part: int, stamp: int) -> Message:
+    def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
         """The message."""
         return self._decode(bytes(data), stamp).replace(stamp=stamp)
 
@@ -144,13 +162,26 @@ def _ros_reader(topic: Topic) -> TopicReader:
         return TransformSetReader(kind)
     if name == "visualization_msgs/msg/MarkerArray":
         return MarkerArrayReader(kind)
-    return RosReader(kind, topic.encoding == "ros1")
+    convert = CONVERSIONS[name][1]
+    if convert is point_cloud and topic.count > 1 and topic.first is not None and topic.last is not None:
+        convert = partial(point_cloud, period=(topic.last - topic.first) * 1e-9 / (topic.count - 1))
+    elif convert is number and (unit := topic.channel.get(UNIT)):
+        convert = partial(number, unit=unit)
+    return RosReader(kind, topic.encoding == "ros1", convert)
+
+
+def is_known(topic: Topic) -> bool:
+    """Tells whether a topic's type has a counterpart here."""
+    if topic.encoding in ("cdr", "ros1"):
+        return ros_type(topic.schema.name) in CONVERSIONS
+    return foreign_decoder(topic.encoding, topic.schema) is not None
 
 
 class Reading:
     """A topic as it can be played: how its messages are read, and the type that the first one becomes.
 
     `reason`: why it cannot be played; `read_as`: None then, and for a topic without messages of a kind that tells.
+    `losses`: what a message of this type does not carry over, as far as the first one that can be read shows.
     """
 
     def __init__(self, bag: Bag, topic: Topic) -> None:
@@ -158,16 +189,14 @@ class Reading:
         self.reader: TopicReader | None = None
         self.read_as: type[Message] | None = None
         self.reason = ""
-        self.left_out: tuple[str, ...] = ()
+        self.losses: tuple[str, ...] = ()
         try:
             self.reader = reader_of(topic)
-            first = next(iter(bag.messages([topic.name])), None) if topic.count else None
-            if first is None:
+            if not topic.count:
                 self.read_as = CONVERSIONS.get(ros_type(topic.schema.name), (None, None))[0]
                 self.reason = "it holds no messages"
             else:
-                self.read_as = type(self._message(first.data, first.log_time))
-                self.left_out = self._left_out(first.data)
+                self._look_at(bag)
         except (RecordingError, MessageError) as error:
             self.reader, self.reason = None, str(error)
 
@@ -181,11 +210,21 @@ class Reading:
         """Tells whether messages of one stamp become one."""
         return self.read_as is Transforms
 
-    def _message(self, data: Data, log_time: int) -> Message:
+    def _look_at(self, bag: Bag) -> None:
+        """Reads messages until one can be read; a topic of which the first 100 cannot is unreadable."""
         assert self.reader is not None
-        return self.reader.read(data, 0, max(log_time, 0))
-
-    def _left_out(self, data: Data) -> tuple[str, ...]:
-        if ros_type(self.topic.schema.name) != "sensor_msgs/msg/PointCloud2":
-            return ()
-        return left_out(RosType(self.topic.schema.name, self.topic.encoding, self.topic.schema).parse(data))
+        refused: Exception | None = None
+        tried = 0
+        for stored in islice(bag.messages([self.topic.name]), FIRST):
+            tried += 1
+            losses: list[str] = []
+            try:
+                self.read_as = type(self.reader.read(stored.data, 0, max(stored.log_time, 0), losses))
+            except (RecordingError, MessageError) as error:
+                refused = refused or error
+                continue
+            self.losses = tuple(dict.fromkeys(losses))
+            return
+        if refused is None:
+            raise RecordingError(f"{self.topic.count:,} messages are promised, and none is there")
+        raise refused if tried == 1 else type(refused)(f"{refused}; none of the first {tried} messages can be read")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -25,16 +24,22 @@ def ros_type(name: str) -> str:
 
 
 class RosType:
-    """One ROS message type, as a bag defines it. Raises `RecordingError` where its definition cannot be read."""
+    """One ROS message type, as a bag defines it. Raises `RecordingError` where its definition cannot be read.
+
+    A bag without definitions (sqlite3 before Iron) is of one of several distributions: the definition counts that
+    fits the messages.
+    """
 
     def __init__(self, name: str, encoding: str, schema: SchemaText) -> None:
         self.name = ros_type(name)
-        self._store = _store(self.name, encoding, schema)
-        if self.name not in self._store.fielddefs:
+        self._ros1 = encoding == "ros1"
+        self._stores = [store for store in _stores(self.name, encoding, schema) if self.name in store.fielddefs]
+        if not self._stores:
             raise RecordingError(f"the definition of {self.name} is not in the bag, and the type is not known here")
-        self._parse: Callable[[Any, str], Any] = (
-            self._store.deserialize_ros1 if encoding == "ros1" else self._store.deserialize_cdr
-        )
+
+    @property
+    def _store(self) -> Typestore:
+        return self._stores[0]
 
     @property
     def has_header(self) -> bool:
@@ -58,30 +63,68 @@ class RosType:
         try:
             return bytes(_as_ros2(self._store).ros1_to_cdr(data, self.name))
         except Exception as error:  # the library's parsers raise whatever broken bytes make them raise
-            raise RecordingError(f"not a {self.name}: {type(error).__name__}: {error}") from error
+            raise RecordingError(f"not a {self.name}: {_shortly(error)}") from error
 
     def parse(self, data: bytes | memoryview) -> Any:
         """Returns the message as an object; raises `RecordingError`."""
-        try:
-            return self._parse(data, self.name)
-        except Exception as error:  # the library's parsers raise whatever broken bytes make them raise
-            raise RecordingError(f"not a {self.name}: {type(error).__name__}: {error}") from error
+        failed: Exception | None = None
+        for store in self._stores:
+            try:
+                read = store.deserialize_ros1 if self._ros1 else store.deserialize_cdr
+                message = read(data, self.name)
+            except Exception as error:  # the library's parsers raise whatever broken bytes make them raise
+                failed = failed or error
+                continue
+            if store is not self._stores[0]:
+                self._stores = [store, *(other for other in self._stores if other is not store)]
+            return message
+        assert failed is not None
+        raise RecordingError(f"not a {self.name}: {_shortly(failed)}") from failed
+
+
+def _shortly(error: Exception) -> str:
+    text = str(error)
+    return f"{type(error).__name__}: {text}" if text else "its bytes do not fit the definition"
+
+
+def same_layout(encoding: str, a: SchemaText, b: SchemaText) -> bool:
+    """Tells whether two definitions, whatever their comments and constants, say the same of the bytes."""
+    try:
+        one, other = (_stores(ros_type(s.name), encoding, s)[0] for s in (a, b))
+        return bool(_layout(one, ros_type(a.name)) == _layout(other, ros_type(b.name)))
+    except (RecordingError, KeyError):
+        return False
+
+
+def _layout(store: Typestore, name: str) -> Any:
+    """The fields of a type, those of the types that it holds in place of their names."""
+
+    def of(description: Any) -> Any:
+        node, what = int(description[0]), description[1]
+        if node == 1:
+            return what
+        if node == 2:
+            return _layout(store, what)
+        return node, of(what[0]), what[1]
+
+    return [(field, of(description)) for field, description in store.fielddefs[name][1]]
 
 
 @cache
-def _store(name: str, encoding: str, schema: SchemaText) -> Typestore:
+def _stores(name: str, encoding: str, schema: SchemaText) -> tuple[Typestore, ...]:
+    """The definitions that may be meant, likeliest first."""
     text = schema.data.decode("utf-8", "replace")
     if not text.strip() and schema.encoding in ("", "ros2msg", "ros1msg"):
         if encoding == "ros1" or schema.encoding == "ros1msg":
-            return get_typestore(Stores.ROS1_NOETIC)
-        return get_typestore(Stores.LATEST)
+            return (get_typestore(Stores.ROS1_NOETIC),)
+        return tuple(get_typestore(s) for s in (Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.LATEST))
     store = get_typestore(Stores.EMPTY)
     try:
         store.register(_types(name, schema.encoding, text))
     except TypesysError as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise RecordingError(f"the definition of {name} in the bag cannot be read ({first})") from error
-    return store
+    return (store,)
 
 
 @cache

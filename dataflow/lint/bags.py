@@ -6,11 +6,13 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from dataflow.interop.bag import Bag
+from dataflow.interop.bag import Bag, is_static, shortfalls
 from dataflow.interop.playing import readings_of
-from dataflow.interop.topics import Reading
+from dataflow.interop.topics import Reading, is_known
+from dataflow.interop.transform_sets import places_of
+from dataflow.lint.finding import Finding
 from dataflow.lint.material import Stamps, StreamFacts
-from dataflow.messages import Message, MessageError
+from dataflow.messages import Message, MessageError, Transforms
 from dataflow.recording import RecordingError
 
 
@@ -31,6 +33,49 @@ class BagMaterial:
             )
             for name, reading in self._readings.items()
         }
+
+    def file_findings(self, *, whole: bool) -> Iterator[Finding]:
+        """Notes of the file, messages that are missing or cannot be read, and what has no place here."""
+        for note in self._bag.notes:
+            yield Finding("file", "", "warning", note)
+        for text in shortfalls(self._bag):
+            yield Finding("missing", "", "error", text)
+        for name, reading in self._readings.items():
+            if reading.topic.count and reading.reader is None and is_known(reading.topic):
+                yield Finding("unreadable", name, "warning", reading.reason)
+            if reading.losses:
+                yield Finding("no place", name, "note", ", ".join(reading.losses))
+        if whole:
+            yield from self._read_all()
+
+    def _read_all(self) -> Iterator[Finding]:
+        """Reads every message once."""
+        readable = {name: r for name, r in self._readings.items() if r.reader is not None and r.topic.count}
+        places: dict[tuple[str, str], bytes] = {}
+        changed: dict[tuple[str, str], tuple[int, int]] = {}
+        unread: dict[str, tuple[int, int, str]] = {}
+        for stored in self._bag.messages(list(readable)) if readable else ():
+            reading = readable[stored.topic]
+            assert reading.reader is not None
+            try:
+                parts = range(max(1, len(reading.reader.stamps(stored.data))))
+                read = [reading.reader.read(stored.data, part, max(stored.log_time, 0)) for part in parts]
+            except (MessageError, RecordingError) as error:
+                number, first, reason = unread.get(stored.topic, (0, stored.log_time, str(error)))
+                unread[stored.topic] = number + 1, first, reason
+                continue
+            for message in read if is_static(stored.topic) else ():
+                for child, place in places_of(message) if isinstance(message, Transforms) else ():
+                    key = (stored.topic, child)
+                    if places.setdefault(key, place) != place:
+                        changed[key] = changed.get(key, (0, stored.log_time))[0] + 1, stored.log_time
+                        places[key] = place
+        for topic, (number, first, reason) in unread.items():
+            text = f"{number:,} messages cannot be read, the first: {reason}"
+            yield Finding("unreadable", topic, "error", text, first, {"messages": number})
+        for (topic, child), (number, at) in changed.items():
+            text = f"the place of {child} changes {number:,} times, and static transforms hold from the beginning"
+            yield Finding("static", topic, "warning", text, at)
 
     def stamps(self, stream: str) -> Stamps:
         """In the order of recording; of a message with several times, such as a set of transforms, the latest."""

@@ -11,6 +11,7 @@ from dataflow.lint.contract import Contract, StreamTerms, means
 from dataflow.lint.finding import Finding
 from dataflow.lint.frames import FrameTree, check_frames
 from dataflow.lint.material import Material
+from dataflow.lint.quantities import check_quantities
 from dataflow.lint.timing import Timing, check_ends, check_gaps, check_order, timing_of
 from dataflow.lint.turning import READERS, Turning, turning_of
 
@@ -61,17 +62,22 @@ def lint(material: Material, contract: Contract | None = None, *, clocks: bool =
     """Looks at everything. `clocks` False leaves the clocks out, for which images have to be decoded."""
     terms = contract or Contract()
     report = Report()
+    report.findings += material.file_findings(whole=clocks)
     for name, facts in material.streams.items():
         if facts.count and not facts.static:
             stamps = material.stamps(name)
             timing = timing_of(stamps)
-            assert timing is not None
+            if timing is None:
+                text = f"{facts.count:,} messages are promised, and none is there"
+                report.findings.append(Finding("missing", name, "error", text))
+                continue
             report.timings[name] = timing
             wanted = terms.terms_of(name, material.namespace)
             if facts.type != "Transforms":  # several may publish transforms on one topic, each by its own clock
                 report.findings += check_order(name, stamps)
             report.findings += check_gaps(name, stamps, timing, None if wanted is None else wanted.max_gap)
     report.findings += check_ends(report.timings)
+    report.findings += check_quantities(material, report.timings)
     tree = _frames_of(material)
     report.findings += check_frames(tree, terms.frames.root, terms.frames.required)
     report.root = tree.roots()[0] if tree.parents else None

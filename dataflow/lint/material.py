@@ -9,8 +9,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.lint.finding import Finding
 from dataflow.messages import Message
 from dataflow.recording import Recording
+from dataflow.recording.index import NO_END
 from dataflow.recording.layout import RECORDING, Kind
 
 Stamps = npt.NDArray[np.int64]
@@ -34,6 +36,10 @@ class Material(Protocol):
 
     @property
     def streams(self) -> Mapping[str, StreamFacts]: ...
+
+    def file_findings(self, *, whole: bool) -> Iterator[Finding]:
+        """Damage of the file, and what of its messages cannot be read; `whole`: all of them are looked at."""
+        ...
 
     def stamps(self, stream: str) -> Stamps:
         """The timestamps (ns) of a stream in the order in which it was written."""
@@ -60,6 +66,13 @@ class RecordedMaterial:
             for name, info in recording.streams.items()
             if "/@/" not in f"/{name}"
         }
+
+    def file_findings(self, *, whole: bool) -> Iterator[Finding]:
+        """Damage."""
+        if self._recording.torn:
+            yield Finding("file", "", "warning", NO_END)
+        for note in self._recording.damage:
+            yield Finding("file", "", "warning", note)
 
     def stamps(self, stream: str) -> Stamps:
         """Our own recordings: from the index. Others: of the messages, else the log times."""

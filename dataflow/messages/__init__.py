@@ -5,15 +5,15 @@ from dataflow.messages.camera import CameraInfo
 from dataflow.messages.clouds import Clusters, PointCloud
 from dataflow.messages.detection import Boxes3D, Detections2D
 from dataflow.messages.diagnostics import Diagnostics, Level
-from dataflow.messages.images import CompressedDepth, CompressedImage, DepthImage, Image, RelativeDepth
+from dataflow.messages.images import CompressedDepth, CompressedImage, DepthImage, Image, Image16, RelativeDepth
 from dataflow.messages.inertial import Imu, MagneticField
 from dataflow.messages.mapping import Mesh, OccupancyGrid, Planes
 from dataflow.messages.poses import NavSatFix, Odometry, ParticleSet, Path, Pose, Transforms, Twist
-from dataflow.messages.ranging import LaserScan, RadarScan
+from dataflow.messages.ranging import LaserScan, RadarScan, RangeReading
 from dataflow.messages.scene import Activity, Classification, FeatureVector, SceneGraph
 from dataflow.messages.segmentation import SegmentationMap
 from dataflow.messages.tracking import LandmarkSightings, Tracks, TrackState
-from dataflow.messages.values import Alarm, Number, Switch, Text
+from dataflow.messages.values import Alarm, Measurement, Number, Switch, Text
 from dataflow.messages.wheels import JointState, WheelTicks
 
 __all__ = [
@@ -30,12 +30,14 @@ __all__ = [
     "Diagnostics",
     "FeatureVector",
     "Image",
+    "Image16",
     "Imu",
     "JointState",
     "LandmarkSightings",
     "LaserScan",
     "Level",
     "MagneticField",
+    "Measurement",
     "Mesh",
     "Message",
     "MessageError",
@@ -49,6 +51,7 @@ __all__ = [
     "PointCloud",
     "Pose",
     "RadarScan",
+    "RangeReading",
     "RelativeDepth",
     "SceneGraph",
     "SegmentationMap",

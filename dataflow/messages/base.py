@@ -82,7 +82,7 @@ def type_path(message: type[Message]) -> str:
 
 
 def is_built_in(message: type[Message]) -> bool:
-    """Tells whether the class is one of `dataflow.messages`, which every process knows."""
+    """Returns whether the class is one of `dataflow.messages`, which every process has."""
     return message is Message or message.__module__.startswith("dataflow.messages.")
 
 
@@ -161,7 +161,7 @@ class Message(_Declared):
     def __init__(self, *, stamp: int, **values: Any) -> None:
         """Constructs a message from values of any accepted form. Raises `MessageError`.
 
-        A class whose messages are constructed gets a constructor of its own, which comes here with what does not fit.
+        A class whose messages are constructed gets a compiled constructor, which falls back on this one.
         """
         cls = type(self)
         if cls._made is None:
@@ -188,7 +188,7 @@ class Message(_Declared):
 
     @classmethod
     def _compile(cls) -> Compiled:
-        """Makes the functions of the class; its constructor too, unless somebody has written one."""
+        """Makes the functions of the class; its constructor too, unless the class defines one."""
         validates = cls.validate is not Message.validate
         cls._made = made = compile_class(
             cls, cls.SCHEMA, cls.SCALARS, cls.ARRAYS, Message.__init__, validates=validates
@@ -209,7 +209,7 @@ class Message(_Declared):
     def from_parts(cls, stamp: int, header: Sequence[Scalar | None], arrays: Sequence[npt.NDArray[Any] | None]) -> Self:
         """A message around already frozen arrays, in declaration order, without copying them: the decoder's way in.
 
-        The arrays must be views of memory that nobody writes to. Everything is validated as in the constructor.
+        The arrays must be views of memory that does not change. Everything is validated as in the constructor.
         """
         self = cls.__new__(cls)
         if (cls._made or cls._compile()).adopt(self, stamp, header, arrays):
@@ -259,7 +259,7 @@ class Message(_Declared):
         return cached
 
     def compute_digest(self) -> bytes:
-        """The digest computed afresh: a difference from `digest()` means that somebody changed frozen memory."""
+        """The digest computed afresh: a difference from `digest()` means that frozen memory was changed."""
         return (self._made or self._compile()).digest(self)
 
     def replace(self, **changes: Any) -> Self:

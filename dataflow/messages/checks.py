@@ -44,7 +44,7 @@ def unit_vectors(message: Message, name: str, data: npt.NDArray[Any]) -> None:
 
 
 def within(message: Message, low: float, high: float, *names: str, nan: bool = False) -> None:
-    """Values lie in [low, high]; NaN only where `nan` says that it has a meaning. Scalars and arrays."""
+    """Values lie in [low, high]; NaN only with `nan`. Scalars and arrays."""
     for name in names:
         data = field(message, name)
         if data is None:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, F64, I32, I64, U8, U16
-from dataflow.messages.base import Message, array, scalar
+from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import within_length
 from dataflow.messages.pictures import Picture
 
@@ -24,6 +24,21 @@ class PointCloud(Message):
         "float32", "N", "when each point was measured, relative to the stamp", unit="s", default=None
     )
     normals: F32 | None = array("float32", "N 3", "unit surface normals; NaN where not estimated", default=None)
+    precise: F64 | None = array(
+        "float64",
+        "N 3",
+        "the points as they were measured, where `points` cannot hold them (map coordinates)",
+        unit="m",
+        default=None,
+        added=True,
+    )
+    columns: int | None = scalar(
+        "int", "points of a row, of an organised cloud: row by row; None for others", default=None, added=True
+    )
+
+    def validate(self) -> None:
+        if self.columns is not None and (self.columns < 1 or len(self.points) % self.columns):
+            raise MessageError(f"PointCloud.columns must divide its {len(self.points)} points, got {self.columns}")
 
     @property
     def count(self) -> int:

@@ -28,6 +28,7 @@ def digest_text(
     names["_stamp_bytes"] = struct.Struct("<q").pack
     names["_int_bytes"], names["_float_bytes"] = struct.Struct("<cq").pack, struct.Struct("<cd").pack
     head = ["_prefix", "_stamp_bytes(_state['stamp'])"]
+    later = []
     for spec in scalars:
         value = f"_state[{spec.name!r}]"
         canonical = {
@@ -37,7 +38,11 @@ def digest_text(
             "str": f"(_text({value}) if _len({value}) <= _short else _long_text({value}))",
             "strs": f"(_words({value}) if {value} else _no_words)",
         }[spec.kind]
+        if spec.added:
+            later.append(f"(b'' if {value} is None else {spec.name.encode()!r} + {canonical})")
+            continue
         head.append(f"(b'n' if {value} is None else {canonical})" if spec.optional else canonical)
+    head += later
     text = ["def _digest(_self):", "    _state = _self.__dict__"]
     if not arrays:
         return [*text, f"    return _digest_of(_join(({', '.join(head)})))"]
@@ -47,8 +52,9 @@ def digest_text(
         text += [
             f"    _a = _state[{held.name!r}]",
             "    if _a is None:",
-            "        _parts.append(b'\\x00')",
+            "        _parts.append(b'\\x00')" if not held.added else "        pass",
             "    else:",
+            *([f"        _parts.append({held.name.encode()!r})"] if held.added else []),
             f"        _parts += ({_by_dtype(names, k, held, '_a', _dtype_bytes, '_dtype({})')}, _shape(_a.shape))",
             "        if _a.nbytes <= _small:",
             "            _parts.append(_a.tobytes())",
@@ -106,7 +112,7 @@ def _dtype_bytes(dtype: np.dtype[Any]) -> bytes:
     return b"\x01" + dtype.str.encode()
 
 
-@lru_cache(maxsize=128)  # compressed images have a length of their own each
+@lru_cache(maxsize=128)  # compressed images differ in length
 def _shape_bytes(shape: tuple[int, ...]) -> bytes:
     return struct.pack(f"<B{len(shape)}q", len(shape), *shape)
 

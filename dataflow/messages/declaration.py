@@ -7,7 +7,7 @@ import json
 import keyword
 import types
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, ClassVar
 
@@ -98,7 +98,7 @@ class Declaration:
 
 
 class GenericMessage(Message):
-    """A message of a type that this program knows by its declaration alone.
+    """A message of a type that is known by its declaration alone.
 
     It has the fields of the type, encodes to the same bytes and has the same digest; the type's own checks, properties
     and methods are in the module that declares it, which was not imported.
@@ -163,6 +163,8 @@ def field_text(field: Field) -> str:
 
 def _field_to_json(field: Field) -> dict[str, Any]:
     values: dict[str, Any] = {"name": field.name, "doc": field.doc, "optional": field.optional}
+    if field.added:
+        values["added"] = True
     if isinstance(field, ArrayField):
         shapes = [list(shape) for shape in field.shapes]
         return values | {"dtypes": [d.name for d in field.dtypes], "shapes": shapes, "unit": field.unit}
@@ -177,15 +179,16 @@ def _field_from_json(values: Any) -> Field:
     usable = name.isidentifier() and not name.startswith("_") and not keyword.iskeyword(name)
     if not usable or name in (*TAKEN, "DECLARATION") or hasattr(GenericMessage, name):
         raise ValueError(f"{name!r} cannot name a field")
-    if not isinstance(optional, bool):
-        raise TypeError(f"field {name!r}: optional is {optional!r}")
+    added = values.get("added", False)
+    if not isinstance(optional, bool) or not isinstance(added, bool):
+        raise TypeError(f"field {name!r}: optional is {optional!r}, added is {added!r}")
     if "kind" in values:
-        return _scalar_from_json(name, doc, optional, values)
+        return replace(_scalar_from_json(name, doc, optional, values), added=added)
     dtypes = tuple(little_endian(_one_of(name, d, DTYPES)) for d in values["dtypes"])
     shapes = tuple(tuple(_extent(name, extent) for extent in shape) for shape in values["shapes"])
     if not dtypes or not shapes or any(len(shape) > MAX_DIMENSIONS for shape in shapes):
         raise ValueError(f"field {name!r} has dtypes {values['dtypes']} and shapes {values['shapes']}")
-    return ArrayField(name, dtypes, shapes, doc, _text(values["unit"]), optional)
+    return ArrayField(name, dtypes, shapes, doc, _text(values["unit"]), optional, added)
 
 
 def _scalar_from_json(name: str, doc: str, optional: bool, values: Mapping[str, Any]) -> ScalarField:

@@ -15,7 +15,7 @@ class Level(IntEnum):
     OK = 0
     """works"""
     WARN = 1
-    """works, and somebody should look"""
+    """works, and needs attention"""
     ERROR = 2
     """does not work"""
     STALE = 3

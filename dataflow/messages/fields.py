@@ -37,6 +37,8 @@ class ScalarField:
     optional: bool
     default: Any
     choices: tuple[str, ...]
+    added: bool = False
+    """The type got it after recordings of it were made: None counts in no digest, so theirs stay."""
 
     @property
     def required(self) -> bool:
@@ -44,7 +46,7 @@ class ScalarField:
 
 
 def little_endian(dtype: str) -> np.dtype[Any]:
-    """The dtype of that name, little-endian: the one object that numpy has for it, so that `is` tells it."""
+    """The dtype of that name, little-endian: numpy's single object for it, so that `is` compares it."""
     return np.dtype(np.dtype(dtype).newbyteorder("<").str)
 
 
@@ -63,6 +65,8 @@ class ArrayField:
     doc: str
     unit: str
     optional: bool
+    added: bool = False
+    """As of a scalar."""
 
     @property
     def required(self) -> bool:
@@ -85,14 +89,18 @@ def scalar(
     default: Any = MISSING,
     optional: bool = False,
     choices: Sequence[str] = (),
+    added: bool = False,
 ) -> Any:
-    """Declares a header field of a message. `default=None` makes it optional: it may be None."""
+    """Declares a header field of a message. `default=None` makes it optional: it may be None.
+
+    `added`: a built-in type got the field after recordings of it were made; its default is None.
+    """
     optional = optional or default is None
     if default is not MISSING and default is not None:
         given, default = default, canonical_scalar(kind, default)
         if default is None or (choices and default not in choices):
             raise MessageError(f"default {given!r} is not a {_PYTHON_NAME[kind]}{f' of {choices}' if choices else ''}")
-    return ScalarField("", kind, doc, optional, default, tuple(choices))
+    return ScalarField("", kind, doc, optional, default, tuple(choices), added)
 
 
 def array(
@@ -103,10 +111,11 @@ def array(
     unit: str = "",
     default: None = MISSING,
     optional: bool = False,
+    added: bool = False,
 ) -> Any:
     """Declares an array field. `dtype` and `shape` list alternatives with `|`: `array("uint8", "H W 3|H W", ...)`.
 
-    `default=None` makes it optional: it may be None.
+    `default=None` makes it optional: it may be None. `added`: as of `scalar`.
 
     Symbols begin with a capital letter; `N` in two fields of one message means the same extent.
     """
@@ -117,7 +126,7 @@ def array(
         if not SYMBOL.fullmatch(extent):
             raise MessageError(f"array shape {shape!r}: {extent!r} is neither a number nor a capitalised symbol")
     dtypes = tuple(little_endian(d.strip()) for d in dtype.split("|"))
-    return ArrayField("", dtypes, shapes, doc, unit, optional or default is None)
+    return ArrayField("", dtypes, shapes, doc, unit, optional or default is None, added)
 
 
 def canonical_stamp(schema: str, stamp: Any) -> int:

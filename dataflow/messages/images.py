@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from dataflow.messages import pictures
-from dataflow.messages.arrays import F32, U8
+from dataflow.messages.arrays import F32, U8, U16
 from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import finite, not_empty, positive
 from dataflow.messages.pictures import Picture
@@ -38,6 +40,30 @@ class Image(Message):
 
     def _picture(self) -> Picture | None:
         return pictures.of_pixels(self.data)
+
+
+class Image16(Message):
+    """A colour or grey image of 16 bits a channel, of thermal and scientific cameras; values in the camera's own
+    scale."""
+
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    data: U16 = array("uint16", "H W 3|H W", "RGB pixels, or one grey channel; row 0 is the top; at least one pixel")
+
+    def validate(self) -> None:
+        not_empty(self, "data")
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.data.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.data.shape[1])
+
+    def _picture(self) -> Picture | None:
+        return pictures.of_pixels((self.data >> 8).astype(np.uint8))
 
 
 class CompressedImage(Message):
@@ -84,7 +110,7 @@ class DepthImage(Message):
 
 
 class RelativeDepth(Message):
-    """Nearness per pixel: inverse depth up to an unknown factor and constant, as one image alone tells it."""
+    """Nearness per pixel: inverse depth up to an unknown factor and constant, as estimated from one image."""
 
     frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
     data: F32 = array(

@@ -19,7 +19,7 @@ _room: Room | None = None
 
 
 def make_large_arrays_in(room: Room | None) -> None:
-    """Has the large arrays of this process's messages made where `room` says; None: in memory of its own."""
+    """Allocates the large arrays of this process's messages in `room`; None: in private memory."""
     global _room
     _room = room
 

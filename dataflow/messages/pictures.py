@@ -35,7 +35,7 @@ def of_nearness(nearness: npt.NDArray[np.floating[Any]]) -> Picture:
 
 
 def of_classes(classes: npt.NDArray[np.integer[Any]]) -> Picture:
-    """Class ids (H, W): each in a colour of its own, the same everywhere: hues a golden angle apart."""
+    """Class ids (H, W): each in one colour, the same everywhere: hues a golden angle apart."""
     ids = _thin(classes).astype(np.float64)
     phase = 2 * np.pi * ((ids * 0.6180339887) % 1.0)[..., None] + np.array([0.0, 2.0943951, 4.1887902])
     return of_pixels((127.5 + 110.0 * np.cos(phase)).astype(np.uint8))

@@ -51,6 +51,18 @@ class LaserScan(Message):
         return np.column_stack([r * np.cos(a), r * np.sin(a), np.zeros_like(r)])
 
 
+class RangeReading(Message):
+    """One distance along the x axis of an ultrasonic or infrared sensor, of what is nearest in its cone."""
+
+    frame: str = scalar("str", "frame of the sensor (x along its axis)")
+    range: float = scalar("float", "distance, metres; -inf: nearer than it can measure, inf: nothing in reach")
+    range_min: float = scalar("float", "nearest range that counts, metres", default=0.0)
+    range_max: float = scalar("float", "farthest range that counts, metres; may be infinite", default=float("inf"))
+    field_of_view: float = scalar("float", "opening angle of the cone, radians; 0 where not known", default=0.0)
+    radiation: str = scalar("str", "what it sends out", default="ultrasound", choices=("ultrasound", "infrared"))
+    variance: float | None = scalar("float", "of the range, square metres; None where not known", default=None)
+
+
 class RadarScan(Message):
     """Detections of one radar cycle, in polar coordinates about the sensor."""
 

@@ -1,23 +1,19 @@
-"""Scene graphs for people: of hundreds of relations the few that are worth telling, as data and in words."""
+"""Scene graphs for people: of hundreds of relations the few that are worth telling, as data and in words.
+
+What a node is follows from ids, relations and activities, not from the names of classes: ids up to 0 are places (room,
+floor, walls, table tops) and the robot itself, as SceneGraphBuilder numbers them; agents are the nodes that act.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from dataflow.messages.scene import Activity, SceneGraph
 
-AGENTS = frozenset(("person", "human", "pedestrian", "robot", "ball", "dog", "cat", "car", "bicycle"))
-"""Classes of nodes that act or move."""
-
-PEOPLE = frozenset(("person", "human", "pedestrian"))
-
-PLACES = frozenset(("room", "floor", "ground", "ceiling", "wall", "building", "place"))
-"""Classes of nodes that the others are in; they are drawn as outlines."""
-
-TOPS = frozenset(("tabletop",))
-"""Classes of surfaces that are part of a thing, which is told in their place."""
+ACTING = frozenset(("sitting_on", "holding", "facing", "approaching", "reaching_for", "heads_for"))
+"""Predicates whose subject acts."""
 
 CARRYING = ("part_of", "sitting_on", "in", "on", "held_by")
 """Predicates that say what carries a node; of equal scores, the first counts."""
@@ -27,6 +23,9 @@ HEADS_FOR = "heads_for"
 
 SURROUNDINGS = frozenset(("near", "left_of", "right_of", "in_front_of", "behind"))
 """Predicates that hold between so many nodes that they say little."""
+
+FLOOR = 0
+"""The id of the floor; places and the robot itself have lower ones."""
 
 LEAST = 0.5
 """Score from which a relation is told; of an intention any."""
@@ -50,12 +49,18 @@ class SceneSummary:
     - `children`: by node, the nodes that it carries.
     - `telling`: the others, those of agents first, then by score.
     - `intentions`: where agents may be going, likeliest first.
+    - `agents`: the nodes that have an activity or are the subject of an `ACTING` predicate.
+    - `places`: the nodes that others are in, or that only part them: room, floor, walls; not a top that carries things.
+    - `tops`: surfaces that are part of a thing, which is told in their place.
     """
 
     carriers: Mapping[int, Told]
     children: Mapping[int, Sequence[int]]
     telling: tuple[Told, ...]
     intentions: tuple[Told, ...]
+    agents: frozenset[int] = frozenset()
+    places: frozenset[int] = frozenset()
+    tops: frozenset[int] = frozenset()
 
     def carried(self, node: int) -> tuple[int, ...]:
         """The nodes that `node` carries, by index."""
@@ -67,13 +72,17 @@ def class_names(graph: SceneGraph) -> tuple[str, ...]:
     return tuple(graph.class_names[c] if graph.class_names else str(c) for c in graph.class_ids.tolist())
 
 
-def summarize(graph: SceneGraph, most: int = 24) -> SceneSummary:
+def summarize(graph: SceneGraph, activities: Activity | None = None, most: int = 24) -> SceneSummary:
     """Chooses what to tell of a graph: who carries what, intentions, and at most `most` other relations.
 
     `SURROUNDINGS` are left out, then the commonest predicates until few enough are left; an agent has its strongest
     relation of each kind (it faces one thing, not five).
     """
-    classes = class_names(graph)
+    ids, doers = graph.ids.tolist(), doing(activities)
+    agents = frozenset(k for k, i in enumerate(ids) if i in doers) | {
+        s for s, p, _ in graph.relations() if p in ACTING and ids[s] > 0
+    }
+    tops = frozenset(s for s, p, o in graph.relations() if p == "part_of" and ids[s] <= 0 < ids[o])
     scores = [1.0] * len(graph.subjects) if graph.relation_scores is None else graph.relation_scores.tolist()
     every = [
         Told(s, p, o, score)
@@ -81,7 +90,7 @@ def summarize(graph: SceneGraph, most: int = 24) -> SceneSummary:
         if s != o and p not in SURROUNDINGS
     ]
     carrying = [r for r in every if r.predicate in CARRYING and r.score >= LEAST]
-    carriers = _carriers(carrying, [c in TOPS for c in classes])
+    carriers = _carriers(carrying, tops)
     intentions = sorted((r for r in every if r.predicate == HEADS_FOR), key=lambda r: (r.subject, -r.score))
     rest = [r for r in every if r.predicate not in CARRYING and r.predicate != HEADS_FOR and r.score >= LEAST]
     counts = Counter(r.predicate for r in rest)
@@ -89,23 +98,25 @@ def summarize(graph: SceneGraph, most: int = 24) -> SceneSummary:
         commonest = counts.most_common(1)[0][0]
         del counts[commonest]
         rest = [r for r in rest if r.predicate != commonest]
-    rest.sort(key=lambda r: (classes[r.subject] not in AGENTS, -r.score, r.subject, r.object))
+    rest.sort(key=lambda r: (r.subject not in agents, -r.score, r.subject, r.object))
     told: list[Told] = []
     for r in rest:
         before = any((r.subject, r.predicate) == (other.subject, other.predicate) for other in told)
-        if not (before and classes[r.subject] in AGENTS):
+        if not (before and r.subject in agents):
             told.append(r)
     children: dict[int, list[int]] = {}
     for child, relation in carriers.items():
         children.setdefault(relation.object, []).append(child)
-    return SceneSummary(carriers, children, tuple(told[:most]), tuple(intentions))
+    bearing = {o for o, carried in children.items() if ids[o] < FLOOR and any(ids[c] > 0 for c in carried)}
+    places = frozenset(k for k, i in enumerate(ids) if i <= FLOOR) - tops - bearing
+    return SceneSummary(carriers, children, tuple(told[:most]), tuple(intentions), agents, places, tops)
 
 
-def _carriers(relations: Sequence[Told], tops: Sequence[bool]) -> dict[int, Told]:
+def _carriers(relations: Sequence[Told], tops: Collection[int]) -> dict[int, Told]:
     """The strongest carrier of each node, a thing before its top; a relation that would close a loop is left out."""
     carriers: dict[int, Told] = {}
     for relation in sorted(
-        relations, key=lambda r: (tops[r.object], -r.score, CARRYING.index(r.predicate), r.subject, r.object)
+        relations, key=lambda r: (r.object in tops, -r.score, CARRYING.index(r.predicate), r.subject, r.object)
     ):
         if relation.subject in carriers:
             continue
@@ -136,23 +147,21 @@ class Row:
 
 def agents_in_words(graph: SceneGraph, summary: SceneSummary, activities: Activity | None = None) -> list[Row]:
     """A row for each agent: its activity, what it is on, holds or heads for."""
-    names, classes, acts = graph.names(), class_names(graph), doing(activities)
+    names, acts = graph.names(), doing(activities)
     rows = []
-    for node, (name, what) in enumerate(zip(names, classes, strict=True)):
-        identity = int(graph.ids[node])
-        if what not in AGENTS and identity not in acts:
-            continue
-        words = []
+    going = {r.subject for r in summary.intentions}
+    for node in sorted(summary.agents, key=lambda n: (n not in going, n)):
+        identity, words = int(graph.ids[node]), []
         if identity in acts:
             words.append(f"{spaced(acts[identity][0])} {percent(acts[identity][1])}")
         related = [r for r in summary.telling if r.subject == node]
-        if node in summary.carriers and classes[summary.carriers[node].object] not in PLACES:
+        if node in summary.carriers and summary.carriers[node].object not in summary.places:
             related.insert(0, summary.carriers[node])
         words += [f"{spaced(r.predicate)} {names[r.object]}" for r in related]
         goals = [f"{names[r.object]} ({percent(r.score)})" for r in summary.intentions if r.subject == node]
         words += ["heads for " + " or ".join(goals)] if goals else []
-        rows.append(Row(name, ", ".join(words)))
-    return sorted(rows, key=lambda row: (row.name.split()[0] not in PEOPLE, not row.text))
+        rows.append(Row(names[node], ", ".join(words)))
+    return sorted(rows, key=lambda row: not row.text)
 
 
 def carriers_in_words(graph: SceneGraph, summary: SceneSummary) -> list[Row]:
@@ -160,8 +169,8 @@ def carriers_in_words(graph: SceneGraph, summary: SceneSummary) -> list[Row]:
     names, classes = graph.names(), class_names(graph)
     rows, bare = [], []
     for node in range(graph.count):
-        children = [child for child in summary.carried(node) if classes[child] not in AGENTS | PLACES | TOPS]
-        if classes[node] in PLACES:
+        children = [c for c in summary.carried(node) if c not in summary.agents | summary.places | summary.tops]
+        if node in summary.places:
             alone = [c for c in children if not summary.carried(c)]
             bare += [Row(names[node], grouped([names[c] for c in alone], [classes[c] for c in alone]))] if alone else []
             continue
@@ -187,9 +196,7 @@ def grouped(names: Sequence[str], classes: Sequence[str]) -> str:
 
 def plural(word: str) -> str:
     """The plural of the name of a class, as English forms it most often."""
-    if word == "person":
-        return "people"
-    if word.endswith("shelf"):
+    if word.endswith("lf"):
         return word[:-1] + "ves"
     return word + ("es" if word.endswith(("s", "x", "ch", "sh")) else "s")
 

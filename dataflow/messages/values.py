@@ -16,6 +16,17 @@ class Number(Message):
     unit: str = scalar("str", "its unit, such as `°C` or `m/s`; empty for a pure number", default="")
 
 
+class Measurement(Message):
+    """One number that a sensor at a place has measured: a temperature, a pressure, an illuminance."""
+
+    frame: str = scalar("str", "frame of the sensor")
+    value: float = scalar("float", "the number, in `unit`; NaN where it could not be measured")
+    unit: str = scalar("str", "its unit, such as `°C`, `Pa` or `lx`; empty for a ratio", default="")
+    variance: float | None = scalar(
+        "float", "of the value, in the square of `unit`; None where not known", default=None
+    )
+
+
 class Text(Message):
     """One piece of text: a spoken command, a state's name, a line for people."""
 
@@ -29,7 +40,7 @@ class Switch(Message):
 
 
 class Alarm(Message):
-    """Something that somebody should know, now."""
+    """Something that needs attention at once."""
 
     level: str = scalar("str", "how serious it is", choices=ALARM_LEVELS)
     name: str = scalar("str", "what it is about, such as `battery` or `camera/driver`")

@@ -6,53 +6,36 @@ file said of operators that still matters (their parameters, how often they were
 
 from __future__ import annotations
 
-import json
-import queue
 import shutil
-import threading
 import time
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dataflow.editing.part import Part
-from dataflow.editing.rolling import keep_span
-from dataflow.editing.spans import folded
 from dataflow.graph.model import Graph
 from dataflow.graph.sections import Flight
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
-from dataflow.process.recorder import RecorderSink
+from dataflow.process.flight_files import FlightFiles, Segment
+from dataflow.process.outage import Lost, Outage
+from dataflow.process.recorder import GOES_ON, RecorderSink
 from dataflow.process.triggers import Triggers
-from dataflow.recording import LogLine, Recording, RecordingError
-from dataflow.recording.layout import FLIGHT
-from dataflow.records.cuts import Held, cut_record
-from dataflow.records.firing import FiringRecord
-from dataflow.records.reading import FiringLog
+from dataflow.recording import LogLine, RecordingError
+from dataflow.recording.parts import Storage
+from dataflow.records.cuts import Held
+from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.sync.stamps import format_stamp
 
 PARTS = 6
 """Files into which the time to keep is divided."""
 MOST_REASONS = 100
 """Triggers that one recording names."""
-MOST_WAITING = 8
-"""Files that wait to be deleted, and spans that wait to be joined: then the recorder waits, so that the disk is
-bounded."""
 SHORTEST = 1_000_000_000
 """Event time of a file, at least (ns)."""
-
-
-@dataclass(slots=True)
-class Segment:
-    """One file of the ring. `begin`: the stamp at which it was begun (None: before the first message); `held`: the
-    messages of files before it that stand in front, by operator."""
-
-    path: Path
-    begin: int | None
-    held: Mapping[str, list[Held]]
 
 
 @dataclass(slots=True)
@@ -75,8 +58,10 @@ class FlightSink:
         self.flight: Flight = flight
         self.folder, self.graph, self._streams, self._options = folder, graph, streams, options
         self._ring = folder / f".{options['label']}"
+        self._storage: Storage = options["storage"]
         shutil.rmtree(self._ring, ignore_errors=True)
-        self._ring.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        self._ring.mkdir(0o700)
         self.length = max(flight.keep // PARTS, SHORTEST)
         self.slack = 2 * (graph.record.snapshots or 0) + 2 * self.length
         """Tells how much more than what is to be kept is there: from a state of every operator on."""
@@ -84,7 +69,7 @@ class FlightSink:
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
         self._forgotten = False
-        self._work = _Work(graph)
+        self._work = FlightFiles(graph, self._storage.mode)
         self._segments: deque[Segment] = deque()
         self._made = 0
         self._begun = 0
@@ -94,7 +79,10 @@ class FlightSink:
         self._refused = 0
         self._said_full = False
         self.messages = 0
-        self._sink = self._open()
+        self._outage = Outage(folder)
+        self.lost = Lost()
+        self._given: Counter[str] = Counter()
+        self._sink: RecorderSink | None = self._open()
 
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
         """Takes a message; begins the next file, and keeps what was asked for, when it is time to."""
@@ -106,37 +94,46 @@ class FlightSink:
                 self._keep(self._wanted)
             elif self._clock - self._begun >= self.length:
                 self._rotate()
-        self._sink.message(stream, message, seq, incarnation)
+        self._given[stream] += 1
+        self._store(lambda sink: sink.message(stream, message, seq, incarnation))
         self._newest[stream] = (message, seq, incarnation)
         self.messages += 1
         for reason in self._triggers.message(stream, message):
             self._trigger(reason, message.stamp)
 
-    def firings(self, operator: str, stamp: int, payload: bytes) -> None:
-        self._sink.firings(operator, stamp, payload)
+    def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
+        if self._sink is None:
+            self.lost.firings += sum(record.kind in CALLS for record in records)
+        self._store(lambda sink: sink.firings(operator, records[-1].stamp, payload))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        self._sink.end(stream, final_stamp, reason)
+        self._store(lambda sink: sink.end(stream, final_stamp, reason))
 
     def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
         """Takes an event: a restart, or somebody who asks to keep what was."""
-        self._sink.event(name, stamp, data)
+        self._store(lambda sink: sink.event(name, stamp, data))
         for reason in self._triggers.event(name, data):
             self._trigger(reason, stamp)
 
     def diagnostics(self, message: Diagnostics) -> None:
-        self._sink.diagnostics(message)
+        self._store(lambda sink: sink.diagnostics(message))
         for reason in self._triggers.diagnostics(message):
             self._trigger(reason, message.stamp)
 
     def log(self, line: LogLine) -> None:
-        self._sink.log(line)
+        self._store(lambda sink: sink.log(line))
 
     def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
         """Sums of operators are told by their finish records."""
 
     def flush(self) -> None:
-        self._sink.flush()
+        """Hands everything to the operating system, about once a second; a disk that had refused is tried again."""
+        self._store(RecorderSink.flush)
+        if self._sink is None and self._outage.over():
+            self._begin()
+            if self._sink is not None:
+                self.lost.spans[-1] = self.lost.spans[-1][0], self._clock
+                print("flight recorder: goes on", flush=True)
 
     def close(self, outcome: str) -> Mapping[str, Any]:
         """Keeps what is still asked for; a run that failed asks for its end, where it was to."""
@@ -145,16 +142,18 @@ class FlightSink:
         if self._wanted is not None:
             self._keep(self._wanted, outcome=outcome)
         else:
-            self._sink.close(outcome)
+            self._store(lambda sink: sink.close(outcome))
+        self._lose()
         self._work.finish()
         shutil.rmtree(self._ring, ignore_errors=True)
-        return {
+        facts = {
             "path": str(self.folder),
-            "messages": self.messages,
+            "messages": sum(one.get("messages", 0) for one in self._kept),
             "bytes": sum(one["bytes"] for one in self._kept),
             "kept": self._kept,
             "not_kept": self._refused,
         }
+        return {**facts, "lost": self.lost.as_json()} if self.lost.any else facts
 
     # Ring
 
@@ -170,17 +169,76 @@ class FlightSink:
         sink = RecorderSink(path, self.graph, self._streams, self._options)
         held: dict[str, list[Held]] = {}
         for stream, (message, seq, incarnation) in sorted(self._newest.items()):
-            sink.message(stream, message, seq, incarnation)
+            try:
+                sink.message(stream, message, seq, incarnation)
+            except RecordingError:
+                with suppress(RecordingError):  # the refusal once more; the file is closed
+                    sink.writer.close()
+                raise
             one = Held(stream, incarnation, seq, message.stamp, message.digest())
             held.setdefault(self.graph.streams[stream].node, []).append(one)
+        self.lost.messages += self._given  # while there was no file
+        self._given = Counter(self._newest.keys())
         self._begun = self._clock
         self._segments.append(Segment(path, self._clock if self._newest else None, held))
         return sink
 
-    def _rotate(self, outcome: str = "goes on") -> None:
-        self._sink.close(outcome)
-        self._sink = self._open()
+    def _rotate(self) -> None:
+        if self._sink is not None:
+            self._close_file(GOES_ON)
+            self._begin()
         self._forget()
+
+    def _close_file(self, outcome: str) -> None:
+        self._store(lambda sink: sink.close(outcome))
+        self._lose()
+
+    def _begin(self) -> None:
+        try:
+            self._sink = self._open()
+        except RecordingError as error:
+            self._stop(error)
+
+    # A disk that refuses
+
+    def _store(self, act: Callable[[RecorderSink], object]) -> None:
+        """Stores something in the current file, if there is one."""
+        if self._sink is None:
+            return
+        try:
+            act(self._sink)
+        except RecordingError as error:
+            if self._sink.writer.failed or self._storage.on_failure != "go_on":
+                self._stop(error)
+            elif self.lost.because(str(error)):
+                print(f"flight recorder: not recorded: {error}", flush=True)
+
+    def _stop(self, error: RecordingError) -> None:
+        """Nothing is recorded from here on until the disk takes something again, or the run ends."""
+        if self._storage.on_failure != "go_on":
+            raise error
+        if self._sink is not None:
+            with suppress(RecordingError):  # the refusal once more; the file is closed
+                self._sink.writer.close()
+            self.lost.firings += self._sink.unsaved_calls
+        self._lose()
+        self._outage.begin()
+        self.lost.because(str(error))
+        if not self.lost.spans or self.lost.spans[-1][1] is not None:
+            self.lost.spans.append((self._clock, None))
+            print(f"flight recorder: stops, the run goes on: {error}", flush=True)
+
+    @property
+    def _is_stopped(self) -> bool:
+        return bool(self.lost.spans) and self.lost.spans[-1][1] is None
+
+    def _lose(self) -> None:
+        """Counts what was given and is not in the current file, which is closed."""
+        if self._sink is not None:
+            self._given -= Counter({stream: self._sink.writer.saved(stream) for stream in self._streams})
+            self._sink = None
+        self.lost.messages += self._given
+        self._given.clear()
 
     def _forget(self) -> None:
         """Deletes the files that nobody can ask for any more."""
@@ -228,10 +286,11 @@ class FlightSink:
     def _keep(self, wanted: Wanted, outcome: str = "") -> None:
         """Closes the current file and joins what is wanted of all of them."""
         self._wanted = None
-        self._sink.close(outcome or "goes on")
+        if self._sink is not None:
+            self._close_file(outcome or GOES_ON)
         segments = list(self._segments)
-        if not outcome:
-            self._sink = self._open()
+        if not outcome and not self._is_stopped:
+            self._begin()
         whole_beginning = not self._forgotten and (self._first or 0) >= wanted.start
         to_the_end = outcome and self._clock <= wanted.due
         part = Part(None if whole_beginning else wanted.start, None if to_the_end else wanted.due)
@@ -246,81 +305,3 @@ class FlightSink:
         taken = {one["path"] for one in self._kept}
         numbered = (self.folder / f"{name}{f'_{k}' if k else ''}.mcap" for k in range(10_000))
         return next(path for path in numbered if not path.exists() and str(path) not in taken)
-
-
-class _Work:
-    """Deletes files and joins others, on a thread of its own, one after the other.
-
-    What deleted files said of operators is folded into a few records each.
-    """
-
-    def __init__(self, graph: Graph) -> None:
-        self._graph = graph
-        self._prologue: dict[str, list[FiringRecord]] = {}
-        self._asked: queue.Queue[Callable[[], None] | None] = queue.Queue(MOST_WAITING)
-        self._thread = threading.Thread(target=self._run, name="flight recorder", daemon=True)
-        self._thread.start()
-
-    def forget(self, segment: Segment) -> None:
-        """Deletes a file, when what was asked for before is done; waits where much is asked for already."""
-        self._asked.put(partial(self._forget, segment))
-
-    def join(self, segments: list[Segment], part: Part, out: Path, one: dict[str, Any]) -> None:
-        """Cuts a span out of some files into a recording; `one` is told how large it is, or what went wrong."""
-        self._asked.put(partial(self._join, segments, part, out, one))
-
-    def finish(self) -> None:
-        """Returns when everything is done."""
-        self._asked.put(None)
-        self._thread.join()
-
-    def _run(self) -> None:
-        while (act := self._asked.get()) is not None:
-            act()
-
-    def _forget(self, segment: Segment) -> None:
-        try:
-            with Recording(segment.path) as recording:
-                log = FiringLog.read(recording)
-                for operator in log.operators:
-                    self._prologue[operator] = folded([*self._prologue.get(operator, ()), *log.of(operator)])
-        except RecordingError as error:  # what follows it is not known then, which verification says
-            print(f"flight recorder: {error}", flush=True)
-        finally:
-            segment.path.unlink(missing_ok=True)
-
-    def _join(self, segments: list[Segment], part: Part, out: Path, one: dict[str, Any]) -> None:
-        try:
-            records = _records(segments, self._prologue)
-            about = {FLIGHT: {"triggers": json.dumps(one["reasons"])}}
-            files = [segment.path for segment in segments]
-            one["bytes"] = keep_span(files, records, self._graph, part, out, metadata=about).bytes
-            print(f"flight recorder: kept {out}: {one['reasons'][0]['what']}", flush=True)
-        except Exception as error:  # the run goes on; the failure is said, and stands in its report
-            one["error"] = f"{type(error).__name__}: {error}"
-            print(f"flight recorder: could not keep {out}: {one['error']}", flush=True)
-
-
-def _records(segments: list[Segment], prologue: dict[str, list[FiringRecord]]) -> dict[str, list[FiringRecord]]:
-    """The firing records of files, behind what stands in for those that were deleted."""
-    records = {operator: list(known) for operator, known in prologue.items()}
-    for segment in segments:
-        with Recording(segment.path) as recording:
-            log = FiringLog.read(recording)
-            for operator in log.operators:
-                records.setdefault(operator, []).extend(log.of(operator))
-    for operator, held in segments[0].held.items():
-        listed = records.get(operator, [])
-        at = next((k for k, record in enumerate(listed) if record.kind == "cut"), None)
-        if at is not None:
-            cut = listed[at]
-            again = cut_record(cut, left_out=0, taken=None, held=held, stamp=cut.stamp)
-            listed[at] = FiringRecord(
-                cut.operator,
-                cut.incarnation,
-                cut.index,
-                "cut",
-                cut.stamp,
-                detail={**cut.detail, "held": again.detail["held"]},
-            )
-    return records

@@ -20,8 +20,10 @@ from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.restarts import Restarts
 from dataflow.firing.source import SourceRunner, step_size, step_stamp
 from dataflow.messages.base import Message
+from dataflow.process.awake import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
+from dataflow.process.outlived import tell_outlived
 from dataflow.process.pace import Pace
 from dataflow.process.speech import SOURCE_THREAD
 
@@ -55,9 +57,10 @@ class Reader:
         self._thread = threading.Thread(target=self._run, name=f"{SOURCE_THREAD}{runner.node.name}", daemon=True)
         self._thread.start()
 
-    def join(self, timeout: float) -> bool:
-        """Waits for the thread to end; False when it has not after `timeout` seconds."""
-        self._thread.join(max(0.0, timeout))
+    def join(self, clock: AwakeClock, deadline: float) -> bool:
+        """Waits for the thread to end; False when it has not at the deadline, by that clock."""
+        while self._thread.is_alive() and (left := deadline - clock()) > 0:
+            self._thread.join(min(left, LOOK_EVERY))
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -278,13 +281,7 @@ class LiveSources:
         restarts = self._restarts[runner.node.name]
         if self.stopping.is_set() or not restarts.failed():
             raise failure
-        self._channel.send(
-            "restarting",
-            operator=failure.operator,
-            when=failure.when,
-            summary=failure.summary,
-            pause=restarts.due_in(),
-        )
+        tell_outlived(self._channel, failure, restarts.due_in())
 
     def _restart(self, runner: SourceRunner) -> None:
         try:
@@ -321,8 +318,9 @@ class LiveSources:
         """Waits (bounded) for the threads; returns the sources whose thread did not return, and what went wrong in
         those that did."""
         self._stop_reading()
-        deadline = time.monotonic() + RETURN_WITHIN
-        late = {name for name, reader in self._readers.items() if not reader.join(deadline - time.monotonic())}
+        clock = AwakeClock()
+        deadline = clock() + RETURN_WITHIN
+        late = {name for name, reader in self._readers.items() if not reader.join(clock, deadline)}
         for name in sorted(late):
             print(
                 f"the stream() of source {name!r} did not return within {RETURN_WITHIN:g} s: close() is not called",

@@ -7,7 +7,6 @@ import os
 import queue
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 from dataflow.firing.failure import MOST_OF_A_TRACEBACK, cut
 from dataflow.messages.memory import make_large_arrays_in
+from dataflow.process.awake import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.handed import Handed, take_handed
 from dataflow.process.inbox import Inbox
+from dataflow.process.speech import log_failure
 
 if TYPE_CHECKING:
     from dataflow.graph.model import Graph
@@ -38,7 +39,7 @@ def _listen(channel: Channel, inbox: Inbox) -> None:
             inbox.put(("control", kind, fields))
     except ChannelClosed:
         inbox.put(("control", "lost", {}))
-        time.sleep(LEAVE_WITHIN)
+        AwakeClock().sleep(LEAVE_WITHIN)
         os._exit(SUPERVISOR_GONE)
 
 
@@ -67,22 +68,27 @@ def _make(
 
 def _recorder(config: SinkConfig, graph: Graph) -> StreamSink:
     """The sink that writes an MCAP recording; options: `path` (or `flight`: a folder), `metadata`,
-    `compression`, `overwrite`."""
+    `compression`, `overwrite`, `storage`."""
     from dataflow.process.freed_memory import keep_freed_memory
+    from dataflow.recording.parts import Storage
 
     keep_freed_memory()
-    if "flight" in config.options:
+    options = {**config.options, "storage": Storage.from_json(config.options["storage"])}
+    if "flight" in options:
         from dataflow.process.flight import FlightSink
 
-        return FlightSink(Path(config.options["flight"]), graph, config.streams, config.options)
-    from dataflow.process.recorder import RecorderSink
+        return FlightSink(Path(options["flight"]), graph, config.streams, options)
+    from dataflow.process.parts import PartsSink
 
-    return RecorderSink(Path(config.options["path"]), graph, config.streams, config.options)
+    return PartsSink(Path(options["path"]), graph, config.streams, options, life=config.life)
 
 
 def _viewer_file(config: SinkConfig, graph: Graph) -> StreamSink:
-    """The sink that writes a viewer file; options: `path`."""
+    """The sink that writes a viewer file; options: `path`, `storage`."""
     from dataflow.process.viewer_file import ViewerFileSink
+    from dataflow.recording.parts import Storage
+
+    os.umask(0o666 & ~Storage.from_json(config.options["storage"]).mode)  # the viewer's library opens the file
 
     return ViewerFileSink(config.options["path"], graph, config.streams)
 
@@ -107,24 +113,26 @@ def _report(channel: Channel, error: BaseException, phase: str) -> None:
     operator = getattr(error, "operator", None)
     text = cut(getattr(error, "traceback", None) or "".join(traceback.format_exception(error)), MOST_OF_A_TRACEBACK)
     summary = cut(getattr(error, "summary", None) or f"{type(error).__name__}: {error}")
-    when = getattr(error, "when", "")
+    when, where = getattr(error, "when", ""), getattr(error, "where", "")
     try:
-        channel.send("failed", operator=operator, when=when, phase=phase, summary=summary, traceback=text)
+        channel.send("failed", operator=operator, when=when, phase=phase, summary=summary, where=where, traceback=text)
     except ChannelClosed:
         print(text, file=sys.stderr)
 
 
-def await_leave(inbox: Inbox) -> str:
-    """After a failure: waits (bounded) until the supervisor has dealt with it; returns the outcome it names."""
-    deadline = time.monotonic() + LEAVE_WITHIN
-    while (left := deadline - time.monotonic()) > 0:
+def await_leave(inbox: Inbox) -> bool:
+    """After a failure: waits (bounded) until the supervisor has dealt with it; True when this process is to be started
+    again."""
+    clock = AwakeClock()
+    deadline = clock() + LEAVE_WITHIN
+    while (left := deadline - clock()) > 0:
         try:
-            item = inbox.get(timeout=left)
+            item = inbox.get(timeout=min(left, LOOK_EVERY))
         except queue.Empty:
             continue  # something else has woken it, or the time is up
         if item[0] == "control" and item[1] in ("leave", "lost"):
-            return str(item[2].get("outcome", "the supervisor is gone"))
-    return "the supervisor did not answer"
+            return bool(item[2].get("again"))
+    return False
 
 
 def main(descriptor: int, handed: Sequence[int]) -> int:
@@ -157,7 +165,8 @@ def main(descriptor: int, handed: Sequence[int]) -> int:
         code = FAILED
         _hand_over(process)
         _report(channel, error, phase)
-        await_leave(inbox)
+        if await_leave(inbox):  # else the end of the run says it
+            log_failure(error)
     facts: Any = {}
     try:
         if process is not None:

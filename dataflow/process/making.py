@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from dataflow.chaos.faults import OperatorFaults
 from dataflow.firing.failure import OperatorFailure
 from dataflow.graph.model import Graph, Node
@@ -10,6 +12,7 @@ from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.outlet import Outlet
+from dataflow.process.outlived import tell_outlived
 from dataflow.process.pace import Pace
 from dataflow.process.runners import Runners, make_log, make_runner, make_source
 from dataflow.remote import Remote
@@ -58,7 +61,7 @@ class Making:
                 self._outlet,
                 faults=faults,
                 event_clock=self._pace.event_time,
-                on_failure=self._tell,
+                on_failure=partial(tell_outlived, self._channel),
             )
         )
 
@@ -71,8 +74,3 @@ class Making:
             self._live.add(source)
         else:
             self._feeding.feeds.append(source)
-
-    def _tell(self, failure: OperatorFailure, pause: float) -> None:
-        self._channel.send(
-            "restarting", operator=failure.operator, when=failure.when, summary=failure.summary, pause=pause
-        )

@@ -17,6 +17,7 @@ from typing import Any
 from dataflow.feeds.window import Window
 from dataflow.firing.threads import limit_threads
 from dataflow.graph.model import Graph
+from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
@@ -166,9 +167,10 @@ class OperatorProcess:
     def _await_statics(self) -> None:
         """Waits (bounded) for the static messages that were given before this process came to be: those who made them
         send them again. Raises `StreamDamaged`."""
-        deadline = time.monotonic() + STATICS_WITHIN
+        clock = AwakeClock()
+        deadline = clock() + STATICS_WITHIN
         while (missing := self.inlet.statics_missing(self.config.subscribe)) and not self.orders.left:
-            if time.monotonic() > deadline:
+            if clock() > deadline:
                 raise StreamDamaged(
                     f"process {self.config.label!r} was restarted and did not get the static streams "
                     f"{', '.join(sorted(missing))} within {STATICS_WITHIN:g} s"

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
+from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import Channel
 from dataflow.process.config import Resumed
 from dataflow.process.recent import RecentFirings
@@ -149,9 +150,10 @@ class Outlet:
 
     def push_all(self) -> None:
         """Waits (bounded) until everything has room: before this process leaves. Says what is lost."""
-        deadline = time.monotonic() + PUSH_WITHIN
+        clock = AwakeClock()
+        deadline = clock() + PUSH_WITHIN
         while not self._fanout.flush():
-            if time.monotonic() >= deadline:
+            if clock() >= deadline:
                 text = f"what this process sent last is lost: another took too little of it for {PUSH_WITHIN:g} s"
                 print(text, file=sys.stderr)
                 return

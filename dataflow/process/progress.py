@@ -14,6 +14,7 @@ from dataflow.process.channel import Channel
 from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.runners import Runners
+from dataflow.sync import MISSES
 
 REPORT_EVERY = 0.02
 REPORT_IDLE = 0.01
@@ -87,7 +88,12 @@ class Progress:
         waits = {name: found for name, found in self._waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
         self.behind = self._live.behind()
-        self._channel.send("progress", done=done, counts=counts, drops=drops, waits=waits, behind=self.behind)
+        news = {"done": done, "counts": counts, "drops": drops, "waits": waits, "behind": self.behind}
+        self._channel.send("progress", **news, first=self._first())
+
+    def _first(self) -> int | None:
+        """The first stamp that a source has given."""
+        return min((s.first for s in self._runners.sources if s.first is not None), default=None)
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""
@@ -105,7 +111,7 @@ class Progress:
             refused = source.refused.total()
             counts[source.node.name] = _row(source, source.ports.emitted, refused, source.last)
         for runner in operators:
-            drops = sum(runner.drops.values())
+            drops = sum(n for (_, why), n in runner.drops.items() if why not in MISSES)
             counts[runner.node.name] = _row(runner, runner.ports.emitted, drops, runner.done)
         for log in self._feeding.logs:
             counts["@log"] = _row(log, log.emitted, 0, log.last)
@@ -141,6 +147,7 @@ class Progress:
             streams |= {name: [count, digest] for name, count, digest in log.counts()}
         return {
             "streams": streams,
+            "first": self._first(),
             "counts": self._counts_of(self._runners.operators),
             "drops": self._drops_of(self._runners.operators),
             "waits": self._waits_of(self._runners.operators),

@@ -76,8 +76,7 @@ def give(runner: Runner, stream: str, envelope: Envelope) -> None:
     """Gives a runner what another process says on a stream. Raises `StreamOrderError` for what contradicts it."""
     message = envelope.message
     if message is not None:
-        digest = message.digest() if runner.paranoid else b""  # as it is before anybody can have written to it
-        runner.push(stream, Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, digest, stream))
+        runner.push(stream, Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, b"", stream))
     elif envelope.kind is Kind.FRONTIER:
         runner.advance(stream, envelope.stamp)
     elif envelope.kind is Kind.END:

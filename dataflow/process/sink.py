@@ -19,12 +19,13 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
+from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
 from dataflow.process.losses import losses_of
 from dataflow.recording import LogLine
-from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
+from dataflow.records.firing import Batch, FiringRecord, FiringRecordError, consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Envelope, Kind
 from dataflow.transport.envelope import MAGIC
@@ -56,7 +57,8 @@ class StreamSink(Protocol):
 
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None: ...
 
-    def firings(self, operator: str, stamp: int, payload: bytes) -> None: ...
+    def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
+        """Takes a batch of firing records, as it came and decoded."""
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None: ...
 
@@ -108,7 +110,9 @@ class SinkProcess:
         self.sink: StreamSink | None = None
         static = [s for s in config.streams if self.graph.streams[s].static]
         losses = losses_of(config.label, channel, live=config.live)
-        self.inlet = Inlet(channel, self._deliver, static=static, losses=losses, from_start=config.live)
+        self.inlet = Inlet(
+            channel, self._deliver, static=static, losses=losses, from_start=config.live and config.life == 1
+        )
         self.batches = 0
         """Batches of firing records that were taken."""
         self.written = 0
@@ -206,7 +210,9 @@ class SinkProcess:
         """
         assert self.sink is not None
         last = batch.records[-1]
-        following = self._recorded.get(batch.operator, (-1, 0))
+        first = batch.records[0]
+        begin = (-1, 0) if self.config.life == 1 else (first.incarnation, first.index)
+        following = self._recorded.get(batch.operator, begin)
         lacking = self._lacking.setdefault(batch.operator, set())
         places = [(r.incarnation, r.index) for r in batch.records]
         due = following[1] if batch.incarnation == following[0] else 0
@@ -217,11 +223,11 @@ class SinkProcess:
         lacking.difference_update(places)
         self._recorded[batch.operator] = max(following, (places[-1][0], places[-1][1] + 1))
         if len(fresh) == len(batch.records):
-            self.sink.firings(batch.operator, last.stamp, batch.data)
-            return batch.last
+            self.sink.firings(batch.operator, batch.records, batch.data)
+            return batch.last or last.kind == "finish"
         for part in consecutive(fresh):
-            self.sink.firings(batch.operator, part[-1].stamp, encode_batch(part, last=batch.last and part[-1] is last))
-        return batch.last
+            self.sink.firings(batch.operator, part, encode_batch(part, last=batch.last and part[-1] is last))
+        return batch.last or last.kind == "finish"
 
     def _note_taken(self, operator: str, stamp: int) -> None:
         if operator in self._taken and stamp > 0:
@@ -284,6 +290,9 @@ class SinkProcess:
                 self._drain()
                 if self.sink is not None:
                     self.sink.summaries(fields.get("summaries", {}))
+            case "ended_elsewhere":
+                self._open.difference_update(fields["streams"])
+                self.frontiers |= dict.fromkeys(self.frontiers.keys() & set(fields["streams"]), FOREVER)
             case "lost":
                 self._drain()
                 raise ChannelClosed("the supervisor is gone")
@@ -301,8 +310,9 @@ class SinkProcess:
 
     def _drain(self) -> None:
         """Takes what has arrived: all others have left, or nobody can say whether they have."""
-        deadline = time.monotonic() + DRAIN_WITHIN
-        while not self.inbox.empty() and time.monotonic() < deadline:
+        clock = AwakeClock()
+        deadline = clock() + DRAIN_WITHIN
+        while not self.inbox.empty() and clock() < deadline:
             item = self.inbox.get_nowait()
             if item[0] == "envelope":
                 self._handle(item)

@@ -15,6 +15,7 @@ import threading
 import time
 from typing import Any, Final, TextIO
 
+from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.shared_generators import AT_WORK
 from dataflow.recording.logs import LogLine
 
@@ -35,6 +36,16 @@ def install() -> None:
     logging.captureWarnings(True)
     sys.stdout = _Lines(sys.stdout, "info", "stdout")
     sys.stderr = _Lines(sys.stderr, "warning", "stderr")
+
+
+def log_failure(error: BaseException) -> None:
+    """Logs the traceback of a failure that is outlived, as an error of its operator, with file and line."""
+    failure = error if isinstance(error, OperatorFailure) else OperatorFailure("", "", error)
+    logger = logging.getLogger("dataflow.failure")
+    place, about = (failure.file, failure.line), {"operator": failure.operator}
+    logger.handle(
+        logger.makeRecord(logger.name, logging.ERROR, *place, failure.traceback.rstrip(), (), None, "", about)
+    )
 
 
 def heard(line: str, process: str, operators: tuple[str, ...]) -> LogLine:
@@ -69,13 +80,16 @@ def _whereabouts() -> tuple[str, int | None]:
     return AT_WORK.operator, AT_WORK.stamp if AT_WORK.stamp > 0 else None
 
 
-def _say(descriptor: int, level: str, text: str, source: str, file: str = "", line: int = 0) -> None:
-    operator, stamp = _whereabouts()
+def _say(
+    descriptor: int, level: str, text: str, source: str, file: str = "", line: int = 0, *, operator: str = ""
+) -> None:
+    """Writes a line; of the operator whose call is under way where no other is named."""
+    at_work, stamp = _whereabouts()
     more = len(text) - LONGEST
     said = LogLine(
         level,
         f"{text[:LONGEST]}… ({more} characters more)" if more > 0 else text,
-        operator=operator,
+        operator=operator or at_work,
         stamp=stamp,
         time=time.time_ns(),
         source=source,
@@ -96,7 +110,15 @@ class _Handler(logging.Handler):
         except Exception as error:  # arguments that do not fit their text
             text = f"{record.msg} {record.args} (cannot be formatted: {error})"
         severity = ("debug", "info", "warning", "error", "fatal")[min(max(record.levelno // 10 - 1, 0), 4)]
-        _say(2, severity, text, record.name, record.pathname, record.lineno)
+        _say(
+            2,
+            severity,
+            text,
+            record.name,
+            record.pathname,
+            record.lineno,
+            operator=str(getattr(record, "operator", "")),
+        )
 
 
 class _Lines(io.TextIOBase):

@@ -38,7 +38,8 @@ class Triggers:
         if name == "trigger":
             yield {"what": data.get("text") or "somebody asked"}
         elif name == "restart" and self._raises:
-            yield {"what": str(data.get("text", "an operator failed")), "operators": list(data.get("operators", ()))}
+            reason = {"what": str(data.get("text", "an operator failed")), "operators": list(data.get("operators", ()))}
+            yield reason | {key: data[key] for key in ("where", "traceback") if data.get(key)}
 
     def diagnostics(self, message: Diagnostics) -> Iterator[Reason]:
         """The reasons that operators give by what they drop."""

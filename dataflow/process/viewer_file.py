@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from dataflow.messages.base import Message
 from dataflow.names import logs_key
 from dataflow.process.sink import SinkFailure
 from dataflow.recording import LogLine
+from dataflow.records.firing import FiringRecord
 from dataflow.view import Save, ViewerSink, as_alarm
 
 PATIENCE = 30.0
@@ -22,7 +23,7 @@ class ViewerFileSink:
 
     def __init__(self, path: str, graph: Graph, streams: list[str]) -> None:
         self.path = Path(path)
-        self.viewer = ViewerSink(Save(self.path))
+        self.viewer = ViewerSink(Save(self.path, at_end=True))
         self._logs, self._clock = logs_key(graph.namespace), 0
         self.viewer.open({**{s: graph.message_types(s)[0] for s in streams}, self._logs: Alarm}, graph)
 
@@ -33,7 +34,7 @@ class ViewerFileSink:
         if self.viewer.statistics().dropped > dropped:
             raise SinkFailure(f"{self.path} took nothing for {PATIENCE:g} s")
 
-    def firings(self, operator: str, stamp: int, payload: bytes) -> None:
+    def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Firing records are not shown."""
 
     def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:

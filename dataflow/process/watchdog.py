@@ -17,6 +17,10 @@ from dataflow.process.complaints import Complaints
 
 PERIOD = 0.05
 BEAT_EVERY = 0.25
+STOPPED_AFTER = 0.2
+"""Seconds without a look after which a process that has hardly computed was stopped meanwhile."""
+COMPUTED = 0.5
+"""The share of them for which one that was not stopped has computed: a call that keeps Python's lock, say."""
 
 
 class Watchdog:
@@ -28,6 +32,9 @@ class Watchdog:
         self._memory = 0
         self._told: set[str] = set()
         self._beat_due = 0.0
+        self._looked, self._cpu = time.monotonic(), time.process_time()
+        self._calls: dict[str, tuple[float, float]] = {}
+        """Operator → when its call began (monotonic), and for how long it has been at it while this process ran."""
         self._complaints = Complaints()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
@@ -38,37 +45,50 @@ class Watchdog:
         self._over.set()
         self._thread.join(timeout=1.0)
 
-    def _work(self, now: float) -> tuple[str, int, float] | None:
-        """The call that has taken more than a second, if any: operator, stamp, seconds."""
-        for runner in self._runners:
-            since = runner.working_since
-            if since is not None and now - since > 1.0:
-                return runner.node.name, runner.working_stamp, now - since
-        return None
-
     def _run(self) -> None:
         while not self._over.wait(PERIOD):
-            now = time.monotonic()
             try:
-                self._look(now)
+                self._look()
             except ChannelClosed:  # the supervisor is gone: the control thread sees to it
                 return
             except Exception as error:  # a process that is not watched would be taken for dead
                 self._complaints.say("watchdog", f"watchdog: {type(error).__name__}: {error}")
 
-    def _look(self, now: float) -> None:
+    def _look(self) -> None:
+        now, work = time.monotonic(), None
+        passed = self._passed(now)
         for runner in self._runners:
-            deadline, since = runner.node.live.deadline, runner.working_since
-            if not self._deadlines or deadline is None or since is None or now - since <= deadline * 1e-9:
-                self._told.discard(runner.node.name)
-            elif runner.node.name not in self._told:
-                self._told.add(runner.node.name)
-                self._channel.send(
-                    "overdue", operator=runner.node.name, stamp=runner.working_stamp, seconds=now - since
-                )
+            name, deadline = runner.node.name, runner.node.live.deadline
+            seconds = self._at_call(runner, now, passed)
+            if seconds > 1.0 and work is None:
+                work = name, runner.working_stamp, seconds
+            if not self._deadlines or deadline is None or seconds <= deadline * 1e-9:
+                self._told.discard(name)
+            elif name not in self._told:
+                self._told.add(name)
+                self._channel.send("overdue", operator=name, stamp=runner.working_stamp, seconds=seconds)
         if now >= self._beat_due:
             self._beat_due = now + BEAT_EVERY
-            self._channel.send("beat", memory=self._memory_taken(), work=self._work(now))
+            self._channel.send("beat", memory=self._memory_taken(), work=work)
+
+    def _passed(self, now: float) -> float:
+        """Returns the seconds since the last look, as far as this process ran meanwhile."""
+        cpu, passed = time.process_time(), now - self._looked
+        if passed > STOPPED_AFTER and cpu - self._cpu < COMPUTED * passed:
+            passed = PERIOD
+        self._looked, self._cpu = now, cpu
+        return passed
+
+    def _at_call(self, runner: Runner, now: float, passed: float) -> float:
+        """Returns for how long an operator has been at its call (s); 0 where it is at none."""
+        name, since = runner.node.name, runner.working_since
+        if since is None:
+            self._calls.pop(name, None)
+            return 0.0
+        begun, seconds = self._calls.get(name, (since, 0.0))
+        seconds = seconds + passed if begun == since and name in self._calls else min(now - since, passed)
+        self._calls[name] = since, seconds
+        return seconds
 
     def _memory_taken(self) -> int:
         """Resident memory in bytes; as it was last known where the system does not tell."""

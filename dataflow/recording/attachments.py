@@ -17,7 +17,7 @@ from mcap.records import Attachment as AttachmentRecord
 from mcap.records import AttachmentIndex
 
 from dataflow.recording.layout import DIGESTS, RECORDING
-from dataflow.recording.packing import MAX_CHUNK_BYTES
+from dataflow.recording.limits import MAX_CHUNK_BYTES
 from dataflow.recording.rawfile import RECORD, RawFile
 
 _TIMES = struct.Struct("<QQ")

@@ -5,28 +5,25 @@ from __future__ import annotations
 import io
 import struct
 import zlib
+from array import array
 from collections import OrderedDict
+from collections.abc import MutableSequence
 from dataclasses import dataclass
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import numpy.typing as npt
 import zstandard
 
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.packing import MAX_CHUNK_BYTES
+from dataflow.recording.limits import MAX_CHUNK_BYTES, MAX_RATIO, UNINDEXED_BYTES
 from dataflow.recording.rawfile import RECORD, RawFile
 
+Column = npt.NDArray[np.int64]
+Sizes = npt.NDArray[np.uint32]
 CACHE_BYTES = 256 * 2**20
-MAX_RATIO = 300
-"""Beyond what LZ4 can do and what zstd does on sensor data: only a file made to do harm expands so much for long."""
 LZ4_AT_ONCE = 2**26
 """Bytes that are asked of the LZ4 library at once: it takes twice as many."""
-UNDOUBTED_BYTES = 2**31
-"""Expanded bytes of a file whose ratio is not looked at."""
-LARGE_BYTES = 2**26
-"""A chunk that expands to more is large: writers begin a new one long before, so it holds one very large message."""
-MAX_LARGE_RATIO = 50
-UNDOUBTED_LARGE_BYTES = 3 * 2**28
-"""Expanded bytes of a file's large chunks whose ratio is not looked at: making memory for them takes the time."""
 
 _CHUNK = struct.Struct("<QQQII")
 CHUNK_HEAD = _CHUNK.size
@@ -54,18 +51,51 @@ class Chunks:
     """The chunks of one file by number."""
 
     def __init__(self, file: RawFile) -> None:
-        self.refs: list[ChunkRef] = []
+        self._starts: MutableSequence[int] | Column = array("q")
+        self._lengths: MutableSequence[int] | Sizes = array("q")
+        self._sizes: MutableSequence[int] | Sizes = array("q")
+        self._torn = -1
         self._file = file
         self._cache: OrderedDict[int, bytes] = OrderedDict()
         self._cached_bytes = 0
         self._packed_bytes = self._unpacked_bytes = 0
-        self._large: dict[int, tuple[int, int]] = {}  # by number: packed and unpacked bytes
         self._decompressor = zstandard.ZstdDecompressor()
+
+    def __len__(self) -> int:
+        return len(self._starts)
 
     def add(self, ref: ChunkRef) -> int:
         """The number of a chunk."""
-        self.refs.append(ref)
-        return len(self.refs) - 1
+        assert isinstance(self._starts, array)
+        assert isinstance(self._lengths, array)
+        assert isinstance(self._sizes, array)
+        number = len(self)
+        self._starts.append(ref.offset - RECORD.size)
+        self._lengths.append(ref.length + RECORD.size)
+        self._sizes.append(min(ref.uncompressed_size, 2**63 - 1))
+        if ref.torn:
+            self._torn = number
+        return number
+
+    def adopt(self, starts: Column, lengths: Sizes, sizes: Sizes) -> None:
+        """Takes all chunks as columns, which are not copied: where their records start, the bytes of these, and of what
+        is in them."""
+        self._starts, self._lengths, self._sizes = starts, lengths, sizes
+
+    def ref(self, number: int) -> ChunkRef:
+        """A chunk's place and sizes."""
+        start, length = int(self._starts[number]) + RECORD.size, int(self._lengths[number]) - RECORD.size
+        return ChunkRef(start, length, int(self._sizes[number]), number == self._torn)
+
+    @property
+    def lengths(self) -> Column:
+        """Bytes in the file, by chunk."""
+        return np.array(self._lengths, np.int64)
+
+    @property
+    def sizes(self) -> Column:
+        """Uncompressed bytes, by chunk."""
+        return np.array(self._sizes, np.int64)
 
     def clear(self) -> None:
         self._cache.clear()
@@ -77,37 +107,25 @@ class Chunks:
         if cached is not None:
             self._cache.move_to_end(number)
             return cached
-        self._make_room(self.refs[number].uncompressed_size)
+        self._make_room(self.ref(number).uncompressed_size)
         data = self._decompress(number)
         self._cache[number] = data
         self._cached_bytes += len(data)
         return data
 
     def check_ratio(self, number: int) -> None:
-        """Refuses a file whose chunks, those asked about so far, expand beyond reason."""
-        ref = self.refs[number]
+        """Refuses a file whose chunks without a sound index, those asked about so far, expand beyond reason."""
+        ref = self.ref(number)
         self._packed_bytes += ref.length
         self._unpacked_bytes += ref.uncompressed_size
-        if self._unpacked_bytes > max(UNDOUBTED_BYTES, MAX_RATIO * self._packed_bytes):
+        if self._unpacked_bytes > max(UNINDEXED_BYTES, MAX_RATIO * self._packed_bytes):
             raise self._file.damaged(
                 f"its chunks up to byte {ref.offset + ref.length} expand from {self._packed_bytes} to "
                 f"{self._unpacked_bytes} bytes and it has no index of them, so all would have to be expanded"
             )
 
-    def _check_large(self, number: int, size: int) -> None:
-        """Refuses a file whose large chunks, those read so far, expand beyond reason."""
-        if size <= LARGE_BYTES or number in self._large:
-            return
-        self._large[number] = self.refs[number].length, size
-        packed, unpacked = map(sum, zip(*self._large.values(), strict=True))
-        if unpacked > max(UNDOUBTED_LARGE_BYTES, MAX_LARGE_RATIO * packed):
-            raise self._file.damaged(
-                f"{self.where(number)} is one of {len(self._large)} chunks that together expand from {packed} to "
-                f"{unpacked} bytes: they hold next to nothing"
-            )
-
     def where(self, number: int) -> str:
-        return f"chunk {number} at byte {self.refs[number].offset}"
+        return f"chunk {number} at byte {self.ref(number).offset}"
 
     def _make_room(self, size: int) -> None:
         """Lets the oldest chunks go before the next one is there."""
@@ -116,7 +134,7 @@ class Chunks:
             self._cached_bytes -= len(old)
 
     def _decompress(self, number: int) -> bytes:
-        ref = self.refs[number]
+        ref = self.ref(number)
         where = self.where(number)
         body = self._file.read(ref.offset, ref.length)
         if len(body) < _CHUNK.size:
@@ -127,7 +145,6 @@ class Chunks:
             raise self._file.damaged(f"{where} is too short")
         if size > MAX_CHUNK_BYTES:
             raise self._file.damaged(f"{where} says it has {size} bytes, at most {MAX_CHUNK_BYTES} are read")
-        self._check_large(number, size)
         name = body[_CHUNK.size : at].decode("ascii", "replace")
         (length,) = struct.unpack_from("<Q", body, at)
         packed = memoryview(body)[at + 8 : at + 8 + length]

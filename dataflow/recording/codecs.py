@@ -189,9 +189,11 @@ def recorded_declaration(metadata: Mapping[str, str]) -> Declaration | None:
 
 
 def declaration_digest(message: type[Message]) -> str:
-    """16 hex digits that change when the names, kinds, dtypes or shapes of a type's fields change."""
+    """16 hex digits that change when the names, kinds, dtypes or shapes of a type's fields change, later ones aside."""
     words = [message.SCHEMA]
     for field in message.FIELDS:
+        if field.added:
+            continue
         kind = f"{field.dtype_text()} {field.shape_text()}" if isinstance(field, ArrayField) else field.kind
         words.append(f"{field.name}: {kind}{' | None' if field.optional else ''}")
     return xxhash.xxh3_64_hexdigest("\n".join(words).encode())

@@ -11,64 +11,40 @@ from __future__ import annotations
 
 import contextlib
 import os
-import struct
 import time
-import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NoReturn
 
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
     Channel,
     ChunkIndex,
-    DataEnd,
-    Footer,
     Header,
     McapRecord,
     Metadata,
     MetadataIndex,
     Schema,
     Statistics,
-    SummaryOffset,
 )
 
 from dataflow.recording.attachments import Attachment, Place
+from dataflow.recording.ending import MAGIC, KeptIndexes, ending, record_bytes
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.packing import MAX_CHUNK_BYTES, Buffer, Compression, Gathered, Packer, message_size
+from dataflow.recording.limits import (
+    MAX_CHANNELS,
+    MAX_CHUNK_BYTES,
+    MAX_CHUNK_MESSAGES,
+    MAX_PARSED,
+    MAX_RECORD_BYTES,
+)
+from dataflow.recording.packing import Buffer, Compression, Gathered, Packer, message_size
+from dataflow.recording.parts import OWNER_ONLY, created
 from dataflow.recording.seals import sealed
 
-MAGIC = b"\x89MCAP0\r\n"
 CHUNK_BYTES = 4 * 1024 * 1024
 CHUNK_SECONDS = 1.0
-MAX_CHANNELS = 65535
-
-
-def record_bytes(record: McapRecord) -> bytes:
-    """`record` as it lies in a file."""
-    builder = RecordBuilder()
-    record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]
-
-
-def _joined(records: Iterable[McapRecord]) -> bytes:
-    return b"".join(map(record_bytes, records))
-
-
-class _ChunkIndexes:
-    """Keeps the chunks' index records as they will lie in the file: a run of days has hundreds of thousands."""
-
-    def __init__(self) -> None:
-        self.records = bytearray()
-        self.count = 0
-        self.content_bytes = 0
-
-    def add(self, indexes: Iterable[ChunkIndex]) -> None:
-        for index in indexes:
-            self.records += record_bytes(index)
-            self.count += 1
-            self.content_bytes += index.uncompressed_size
 
 
 class ContainerWriter:
@@ -89,6 +65,7 @@ class ContainerWriter:
         chunk_bytes: int = CHUNK_BYTES,
         chunk_seconds: float = CHUNK_SECONDS,
         overwrite: bool = False,
+        mode: int = OWNER_ONLY,
     ) -> None:
         self.path = path
         self._packer = Packer(compression)
@@ -96,7 +73,7 @@ class ContainerWriter:
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._counts: dict[int, int] = {}
-        self._chunks = _ChunkIndexes()
+        self._chunks = KeptIndexes()
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._records: Gathered | None = None
@@ -105,30 +82,25 @@ class ContainerWriter:
         self.last_time = 0
         self._failure: str | None = None
         self._position = 0
-        self._fd = self._open(overwrite)
+        self._fd = created(path, overwrite, mode)
         try:
             self._append(MAGIC, sealed(record_bytes(Header(profile=profile, library=library))))
         except RecordingError:
             os.close(self._fd)
             raise
 
-    def _open(self, overwrite: bool) -> int:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_TRUNC if overwrite else os.O_EXCL)
-        try:
-            return os.open(self.path, flags, 0o666)
-        except FileExistsError:
-            raise RecordingError(f"{self.path} exists already; choose another name or ask to overwrite it") from None
-        except OSError as error:
-            raise RecordingError(f"cannot create the recording {self.path}: {error.strerror}") from error
-
     @property
     def closed(self) -> bool:
         return self._fd < 0
 
+    def saved(self, topic: str) -> int:
+        """Messages of a topic that are in the file now."""
+        return sum(self._counts[channel.id] for channel in self._channels if channel.topic == topic)
+
     @property
-    def messages(self) -> int:
-        """Messages added so far, those of the unfinished chunk included."""
-        return sum(self._counts.values()) + self._unsaved()
+    def failed(self) -> bool:
+        """Tells whether a write has failed, so that nothing more can be added."""
+        return self._failure is not None
 
     @property
     def saved_bytes(self) -> int:
@@ -141,7 +113,7 @@ class ContainerWriter:
             if (known.name, known.encoding, known.data) == (name, encoding, data):
                 return known.id
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
-        self._append(sealed(record_bytes(schema)))
+        self._append(self._checked("schema", name, schema))
         self._schemas.append(schema)
         return schema.id
 
@@ -156,20 +128,23 @@ class ContainerWriter:
             schema_id=schema_id,
             metadata=dict(metadata),
         )
-        self._append(sealed(record_bytes(channel)))
+        self._append(self._checked("channel", topic, channel))
         self._channels.append(channel)
         self._counts[channel.id] = 0
         return channel.id
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
-        record = sealed(record_bytes(Metadata(name=name, metadata=dict(metadata))))
+        record = self._checked("metadata", name, Metadata(name=name, metadata=dict(metadata)))
         offset = self._position
         self._append(record)
         self._metadata.append(MetadataIndex(offset=offset, length=len(record), name=name))
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Adds a file inside this one; its record has a checksum of its own."""
+        self._count_parsed()
         record = record_bytes(attachment.record())
+        if len(record) > MAX_CHUNK_BYTES:
+            self._refuse(f"attachment {attachment.name!r}", len(record), MAX_CHUNK_BYTES)
         place = Place(self._position, len(record))
         self._append(record)
         self._attachments.append(attachment.index(place))
@@ -181,33 +156,54 @@ class ContainerWriter:
         """
         size = sum(message_size(parts) for _, _, _, parts in group)
         if size > MAX_CHUNK_BYTES:
-            raise RecordingError(f"{self.path}: a message of {size} bytes; at most {MAX_CHUNK_BYTES} are recorded")
+            self._refuse("a message", size, MAX_CHUNK_BYTES)
         now = self._begin(0 if self._messages is None else self._messages.size + size)
         chunk = self._messages = self._messages or Gathered(now)
         for channel, log_time, sequence, parts in group:
             chunk.add(channel, log_time, sequence, parts)
-        if chunk.size >= self._chunk_bytes:
-            self.finish_chunks()
+        self._finish_if_full(chunk)
 
     def add_record(self, channel: int, log_time: int, sequence: int, data: bytes) -> None:
         """Adds a record of the run, which lies apart from the messages of streams."""
         size = message_size([data])
         if size > MAX_CHUNK_BYTES:
-            raise RecordingError(f"{self.path}: a record of {size} bytes; at most {MAX_CHUNK_BYTES} are recorded")
+            self._refuse("a record", size, MAX_CHUNK_BYTES)
         now = self._begin(0 if self._records is None else self._records.size + size)
         chunk = self._records = self._records or Gathered(now)
         chunk.add(channel, log_time, sequence, [data])
-        if chunk.size >= self._chunk_bytes:
-            self.finish_chunks()
+        self._finish_if_full(chunk)
 
     def add_copied(self, channel: int, log_time: int, publish_time: int, sequence: int, data: Buffer) -> None:
         """Adds a message of another file as it is there."""
         size = message_size([data])
+        if size > MAX_CHUNK_BYTES:
+            self._refuse("a message", size, MAX_CHUNK_BYTES)
         now = self._begin(0 if self._messages is None else self._messages.size + size)
         chunk = self._messages = self._messages or Gathered(now)
         chunk.add(channel, log_time, sequence, [data], publish_time)
-        if chunk.size >= self._chunk_bytes:
+        self._finish_if_full(chunk)
+
+    def _finish_if_full(self, chunk: Gathered) -> None:
+        if chunk.size >= self._chunk_bytes or chunk.messages >= MAX_CHUNK_MESSAGES:
             self.finish_chunks()
+
+    def _checked(self, what: str, name: str, record: McapRecord) -> bytes:
+        """A record as it will lie in the file. Raises `RecordingError` for one that readers refuse."""
+        self._count_parsed()
+        data = sealed(record_bytes(record))
+        if len(data) > MAX_RECORD_BYTES:
+            self._refuse(f"{what} {name!r}", len(data), MAX_RECORD_BYTES)
+        return data
+
+    def _count_parsed(self) -> None:
+        count = len(self._schemas) + len(self._channels) + len(self._metadata) + len(self._attachments)
+        if count >= MAX_PARSED:
+            raise RecordingError(
+                f"{self.path}: a recording holds at most {MAX_PARSED} schemas, channels, metadata and attachments"
+            )
+
+    def _refuse(self, what: str, size: int, most: int) -> NoReturn:
+        raise RecordingError(f"{self.path}: {what} of {size} bytes; at most {most} are recorded")
 
     def _begin(self, size: int) -> float:
         """The time now, after the chunks are finished that are old, or would become larger than readers take."""
@@ -254,7 +250,7 @@ class ContainerWriter:
         try:
             if self._failure is None:
                 self.finish_chunks()
-                self._append(self._ending())
+                self._write(self._ending())
             else:
                 self._close_after_failure()
         finally:
@@ -265,7 +261,7 @@ class ContainerWriter:
         """The end of a file whose last write failed: an index over what is there, if it fits."""
         failure, self._failure = self._failure, None
         with contextlib.suppress(RecordingError):  # without one, readers index the file by a pass over it
-            self._append(self._ending())
+            self._write(self._ending())
         self._failure = failure
 
     def _check_usable(self) -> None:
@@ -275,6 +271,9 @@ class ContainerWriter:
             raise RecordingError(f"the recording {self.path} is closed")
 
     def _append(self, *parts: Buffer) -> None:
+        self._write(parts)
+
+    def _write(self, parts: Iterable[Buffer]) -> None:
         """Writes all `parts` or, when the disk refuses, leaves the file as it was."""
         self._check_usable()
         try:
@@ -305,34 +304,18 @@ class ContainerWriter:
         )
         raise RecordingError(self._failure) from error
 
-    def _ending(self) -> bytes:
-        """Data end, summary, footer and magic, as they follow at the current position."""
-        data_end = record_bytes(DataEnd(data_section_crc=0))
-        summary_start = self._position + len(data_end)
-        groups: list[tuple[int, bytes | bytearray]] = [
-            (Opcode.SCHEMA, _joined(self._schemas)),
-            (Opcode.CHANNEL, _joined(self._channels)),
-            (Opcode.STATISTICS, _joined([self._statistics()])),
-            (Opcode.CHUNK_INDEX, self._chunks.records),
-            (Opcode.ATTACHMENT_INDEX, _joined(self._attachments)),
-            (Opcode.METADATA_INDEX, _joined(self._metadata)),
-        ]
-        summary = bytearray()
-        offsets = bytearray()
-        for opcode, records in groups:
-            start = len(summary)
-            summary += records
-            if records:
-                offset = SummaryOffset(
-                    group_opcode=opcode, group_start=summary_start + start, group_length=len(summary) - start
-                )
-                offsets += record_bytes(offset)
-        start_field = summary_start if summary else 0
-        offset_field = summary_start + len(summary) if offsets else 0
-        body = bytes(summary + offsets)
-        crc = zlib.crc32(body + struct.pack("<BQQQ", Opcode.FOOTER, 20, start_field, offset_field))
-        footer = Footer(summary_start=start_field, summary_offset_start=offset_field, summary_crc=crc)
-        return data_end + body + record_bytes(footer) + MAGIC
+    def _ending(self) -> Iterator[bytes]:
+        return ending(
+            self._position,
+            {
+                Opcode.SCHEMA: map(record_bytes, self._schemas),
+                Opcode.CHANNEL: map(record_bytes, self._channels),
+                Opcode.STATISTICS: [record_bytes(self._statistics())],
+                Opcode.CHUNK_INDEX: self._chunks.records(),
+                Opcode.ATTACHMENT_INDEX: map(record_bytes, self._attachments),
+                Opcode.METADATA_INDEX: map(record_bytes, self._metadata),
+            },
+        )
 
     def _statistics(self) -> Statistics:
         return Statistics(

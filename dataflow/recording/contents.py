@@ -13,15 +13,11 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 
 from dataflow.recording.attachments import Place
-from dataflow.recording.chunks import ChunkRef, Chunks
+from dataflow.recording.chunks import Chunks
+from dataflow.recording.limits import BYTES_PER_RECORD, MAX_PARSED, UNINDEXED_RECORDS
 from dataflow.recording.rawfile import RECORD, RawFile
 
 UNCHUNKED = -1
-MAX_PARSED = 2**18
-"""Schemas, channels, chunks and metadata records that one file may hold: each costs some 20 µs to read."""
-MAX_WALKED = 2**23
-"""Records that are looked for without an index: each costs a microsecond or two, and a message 24 bytes."""
-
 MESSAGE_BODY = struct.Struct("<HIQQ")
 _ID = struct.Struct("<H")
 _INDEX = struct.Struct("<HI")
@@ -38,6 +34,15 @@ class Entries:
 
     def __len__(self) -> int:
         return len(self.times)
+
+    @property
+    def columns(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Times, chunks and offsets."""
+        return self.times, self.chunks, self.offsets
+
+    def where(self, kept: npt.NDArray[np.bool_]) -> Entries:
+        """Those of them that are to be kept."""
+        return Entries(self.times[kept], self.chunks[kept], self.offsets[kept])
 
 
 @dataclass(slots=True)
@@ -67,13 +72,13 @@ class Contents:
     `damage`: notes of what was damaged and got round; `loose_bytes`: data of messages outside chunks, by channel.
     """
 
-    def __init__(self, file: RawFile) -> None:
+    def __init__(self, file: RawFile, chunks: Chunks | None = None) -> None:
         self.file = file
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.attachments: list[Place] = []
-        self.chunks = Chunks(file)
+        self.chunks = chunks or Chunks(file)
         self.damage: list[str] = []
         self.loose_bytes: dict[int, int] = {}
         self._growing: dict[int, _Growing] = {}
@@ -114,7 +119,12 @@ class Contents:
             self.channels[number] = self.file.parse(Channel, body, offset)
 
     def add_metadata(self, body: bytes, offset: int) -> None:
+        """Takes one more metadata record."""
         self.count_parsed(offset)
+        self.take_metadata(body, offset)
+
+    def take_metadata(self, body: bytes, offset: int) -> None:
+        """Takes a metadata record that is counted already."""
         record = self.file.parse(Metadata, body, offset)
         self.metadata.append((record.name, record.metadata))
 
@@ -131,10 +141,6 @@ class Contents:
         self._entries_of(channel).add(signed(log_time), UNCHUNKED, offset)
         self.loose_bytes[channel] = self.loose_bytes.get(channel, 0) + length - MESSAGE_BODY.size
 
-    def add_chunk(self, ref: ChunkRef) -> int:
-        self.count_parsed(ref.offset)
-        return self.chunks.add(ref)
-
     def add_indexes(self, chunk: int, indexes: list[bytes]) -> bool:
         """Takes a chunk's messages from the bodies of its message indexes; False, and nothing, where they are wrong."""
         found: dict[int, npt.NDArray[Any]] = {}
@@ -145,7 +151,7 @@ class Contents:
             if length % _ENTRY.itemsize or _INDEX.size + length > len(body) or channel in found:
                 return False
             entries = np.frombuffer(body, _ENTRY, length // _ENTRY.itemsize, _INDEX.size)
-            if len(entries) and int(entries["offset"].max()) >= self.chunks.refs[chunk].uncompressed_size:
+            if len(entries) and int(entries["offset"].max()) >= self.chunks.ref(chunk).uncompressed_size:
                 return False
             found[channel] = entries
         for channel, entries in found.items():
@@ -154,7 +160,6 @@ class Contents:
 
     def take_chunk(self, number: int) -> None:
         """Takes a chunk's messages, schemas and channels from its content."""
-        self.chunks.check_ratio(number)
         data = self.chunks.data(number)
         where = self.chunks.where(number)
         size, unpack, message = len(data), RECORD.unpack_from, MESSAGE_BODY
@@ -166,21 +171,22 @@ class Contents:
             start = position + RECORD.size
             if opcode == 0 or start + length > size:
                 raise self.file.damaged(f"{where} has no whole record at its byte {position}")
-            self._count_walked(self.chunks.refs[number].offset)
+            self._count_walked(self.chunks.ref(number).offset)
             if opcode == Opcode.MESSAGE:
                 if length < message.size:
                     raise self.file.damaged(f"{where} has a message of {length} bytes at its byte {position}")
                 channel, _, log_time, _ = message.unpack_from(data, start)
                 self._entries_of(channel).add(signed(log_time), number, position)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.declare(opcode, data[start : start + length], self.chunks.refs[number].offset)
+                self.declare(opcode, data[start : start + length], self.chunks.ref(number).offset)
             position = start + length
 
     def _count_walked(self, offset: int) -> None:
         self._walked += 1
-        if self._walked > MAX_WALKED:
+        most = UNINDEXED_RECORDS + self.file.size // BYTES_PER_RECORD
+        if self._walked > most:
             raise self.file.damaged(
-                f"by byte {offset} there were more than the {MAX_WALKED} records that are read without an index"
+                f"by byte {offset} there were more than the {most} records that are read without an index"
             )
 
     def _entries_of(self, channel: int) -> _Growing:

@@ -24,6 +24,7 @@ from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.layout import RECORDING, Kind, firings_topic, frames_topic
 from dataflow.recording.ordering import in_file_order
 from dataflow.recording.packing import Compression
+from dataflow.recording.parts import OWNER_ONLY
 from dataflow.recording.reader import Recording
 
 Mask = npt.NDArray[np.bool_]
@@ -76,23 +77,22 @@ class Origin:
 
     def entries(self, channel: int) -> Entries:
         """The messages of a channel."""
-        none = np.empty(0, np.int64)
-        return self.file.entries.get(channel, Entries(none, none, none))
+        return self.file.index.entries(channel)
 
     def counts(self, kept: Mapping[int, Mask] | None = None) -> dict[str, int]:
         """Messages by stream, companions aside: all, or those that are kept."""
         found: dict[str, int] = {}
         for channel in self.of_kind(Kind.STREAM).values():
             mask = None if kept is None else kept.get(channel.id)
-            number = len(self.entries(channel.id)) if kept is None else 0 if mask is None else int(mask.sum())
+            number = self.file.index.count(channel.id) if kept is None else 0 if mask is None else int(mask.sum())
             found[channel.topic] = found.get(channel.topic, 0) + number
         return found
 
     def span(self) -> tuple[int, int] | None:
         """The first and the last time (ns) in streams that are not static; None where there is no message."""
-        times = [self.entries(c.id).times for c in self.of_kind(Kind.STREAM).values() if not self.is_static(c)]
-        times = [t for t in times if len(t)]
-        return (min(int(t.min()) for t in times), max(int(t.max()) for t in times)) if times else None
+        found = [self.file.index.span(c.id) for c in self.of_kind(Kind.STREAM).values() if not self.is_static(c)]
+        spans = [span for span in found if span is not None]
+        return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
 
     def records(self) -> list[tuple[str, dict[str, str]]]:
         """The metadata records: another program's as they stand, ours with the latest of each name and key."""
@@ -123,6 +123,7 @@ class Copy:
         *,
         overwrite: bool = False,
         compression: Compression = "zstd",
+        mode: int = OWNER_ONLY,
     ) -> None:
         if path.exists() and not overwrite:
             raise RecordingError(f"{path} exists already; choose another name or ask to overwrite it")
@@ -136,6 +137,7 @@ class Copy:
             compression=compression,
             chunk_seconds=float("inf"),
             overwrite=True,
+            mode=mode,
         )
         self._channels: dict[tuple[int, int], int] = {}
         self._alike: dict[tuple[object, ...], list[tuple[int, int]]] = {}
@@ -227,8 +229,7 @@ def places(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[RawMessage]:
     """The kept messages of some channels as they lie in the file, each chunk read once."""
     chosen: list[tuple[int, Entries]] = []
     for channel, mask in kept.items():
-        entries = origin.entries(channel)
-        chosen.append((channel, Entries(entries.times[mask], entries.chunks[mask], entries.offsets[mask])))
+        chosen.append((channel, origin.entries(channel).where(mask)))
     for place in in_file_order(chosen):
         yield origin.file.read(*place)
 

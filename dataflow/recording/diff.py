@@ -96,7 +96,7 @@ def diff(
     a: Recording, b: Recording, *, streams: Sequence[str] | None = None, tolerance: float | None = None
 ) -> DiffReport:
     """Compares the decoded messages of two recordings; `streams` limits it to those named, else the runtime's own
-    streams (diagnostics: facts of one run) are left out.
+    streams (logs, diagnostics: facts of one run) are left out.
 
     Without `tolerance` messages are the same when their digests are. With it, numbers may differ by at most that much,
     absolutely, element by element, and NaN equals NaN; integers, strings and shapes must still be equal. Messages are
@@ -107,7 +107,7 @@ def diff(
     if tolerance is not None and not 0 <= tolerance < np.inf:
         raise RecordingError(f"tolerance must be a finite number ≥ 0, got {tolerance}")
     if streams is None:
-        names = sorted(name for name in {*a.streams, *b.streams} if "/@/" not in name)
+        names = sorted(name for name in {*a.streams, *b.streams} if "/@/" not in f"/{name}")
     else:
         names = list(dict.fromkeys(streams))
     report = DiffReport(str(a.path), str(b.path), tolerance)

@@ -6,16 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.json_format import ParseDict, ParseError
+from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from dataflow.messages import DepthImage, Image
+from dataflow.messages import DepthImage, Image, Image16, Transforms
 from dataflow.messages.base import Message
 from dataflow.recording.codecs import SchemaText, build
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, stamp_of
 from dataflow.recording.json_codec import decode_object
+from dataflow.recording.pixels import is_16_bit
 
 DEPTH_ENCODINGS = ("32FC1", "16UC1")
 _PREFERRED = {"foxglove.PoseInFrame": "Pose", "foxglove.RawImage": "Image"}
@@ -50,6 +54,11 @@ def foreign_decoder(message_encoding: str, schema: SchemaText) -> Callable[[byte
     return None if found is None else found.bind(schema)
 
 
+def _one_transform(proto: FrameTransform, log_time: int) -> Message:
+    """foxglove.FrameTransform: a set of one."""
+    return _message(FOXGLOVE_SCHEMAS[Transforms], FrameTransforms(transforms=[proto]), log_time)
+
+
 def _stamp(proto: Any, log_time: int) -> int:
     """The time that the message carries, or the log time where it carries none."""
     if "timestamp" in proto.DESCRIPTOR.fields_by_name:
@@ -60,8 +69,8 @@ def _stamp(proto: Any, log_time: int) -> int:
 
 def _message(schema: FoxgloveSchema, proto: Any, log_time: int) -> Message:
     if isinstance(proto, RawImage):
-        depth = proto.encoding in DEPTH_ENCODINGS
-        schema = FOXGLOVE_SCHEMAS[DepthImage if depth else Image]
+        kind = DepthImage if proto.encoding in DEPTH_ENCODINGS else Image16 if is_16_bit(proto.encoding) else Image
+        schema = FOXGLOVE_SCHEMAS[kind]
     return build(schema.message, _stamp(proto, log_time), schema.decode(proto))
 
 
@@ -77,13 +86,23 @@ def _json(schema: FoxgloveSchema) -> ForeignDecoder:
 
 
 def _from_json(schema: FoxgloveSchema, data: bytes) -> Any:
+    return _proto_of(schema.proto(), data)
+
+
+def _proto_of(proto: Any, data: bytes) -> Any:
     value = decode_object(data)
-    proto = schema.proto()
     try:
         ParseDict(_with_proto_times(value), proto, ignore_unknown_fields=True)
     except ParseError as error:
-        raise RecordingError(f"not a {schema.name}: {error}") from error
+        raise RecordingError(f"not a {proto.DESCRIPTOR.full_name}: {error}") from error
     return proto
+
+
+def _parsed_transform(data: bytes) -> FrameTransform:
+    try:
+        return FrameTransform.FromString(data)
+    except DecodeError as error:
+        raise RecordingError(f"not a foxglove.FrameTransform: {error}") from error
 
 
 def _with_proto_times(value: Any) -> Any:
@@ -108,3 +127,13 @@ for _schema in FOXGLOVE_SCHEMAS.values():
     if _PREFERRED.get(_schema.name, _schema.message.SCHEMA) == _schema.message.SCHEMA:
         register_decoder("protobuf", _schema.name, _protobuf(_schema))
         register_decoder("json", _schema.name, _json(_schema))
+register_decoder(
+    "protobuf",
+    "foxglove.FrameTransform",
+    ForeignDecoder(lambda _: lambda data, log_time: _one_transform(_parsed_transform(data), log_time)),
+)
+register_decoder(
+    "json",
+    "foxglove.FrameTransform",
+    ForeignDecoder(lambda _: lambda data, log_time: _one_transform(_proto_of(FrameTransform(), data), log_time)),
+)

@@ -1,6 +1,7 @@
 """Finds every message of an MCAP file, from its index or, for torn and foreign files without one, by a pass.
 
-The index takes 24 bytes of memory a message, whatever the messages hold.
+The index takes 24 bytes of memory a message, whatever the messages hold; of a file of many chunks it takes some 50
+bytes a chunk, and where their messages lie is read as it is needed.
 """
 
 from __future__ import annotations
@@ -17,15 +18,21 @@ from mcap.opcode import Opcode
 from mcap.records import Header
 
 from dataflow.recording.attachments import Attachment, Place, read_attachment
-from dataflow.recording.container import MAGIC
-from dataflow.recording.contents import UNCHUNKED, Contents, Entries, signed
+from dataflow.recording.contents import UNCHUNKED, Contents, signed
+from dataflow.recording.ending import MAGIC
 from dataflow.recording.errors import DamagedError, RecordingError
-from dataflow.recording.packing import MAX_CHUNK_BYTES
+from dataflow.recording.limits import MAX_CHUNK_BYTES
+from dataflow.recording.message_index import LoadedIndex, MessageIndex
+from dataflow.recording.notices import notice
 from dataflow.recording.rawfile import RECORD, RawFile
 from dataflow.recording.scan import scan
 from dataflow.recording.seals import Seal, seal_of
-from dataflow.recording.summary import TAIL_BYTES, Footer, read_footer, read_summary
+from dataflow.recording.summary import TAIL_BYTES, Footer, Summary, read_footer, read_summary
 
+NO_END = (
+    "has no proper end: it is being written, or its writer died; what its writer had not stored is missing "
+    "(`dataflow recover` saves what follows its last whole chunk)"
+)
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_FIXED = _MESSAGE.size - RECORD.size
 
@@ -58,7 +65,7 @@ class McapFile:
         self.path = path
         self._file = RawFile(path)
         try:
-            contents = self._load()
+            contents, self.index = self._load()
         except struct.error as error:
             self._file.close()
             raise self._file.damaged(f"a record is too short: {error}") from error
@@ -68,14 +75,24 @@ class McapFile:
         self.schemas, self.channels = contents.schemas, contents.channels
         self.metadata = contents.metadata
         self._attachments = contents.attachments
-        self.entries: dict[int, Entries] = contents.entries()
         self._chunks = contents.chunks
         self._loose_bytes = contents.loose_bytes
+        notice(path, [*([NO_END] if self.torn else ()), *self.damage])
 
     def close(self) -> None:
         """Closes the file. Idempotent."""
         self._file.close()
         self._chunks.clear()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the file."""
+        return self._file.size
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks."""
+        return len(self._chunks)
 
     def read(self, channel: int, chunk: int, offset: int, log_time: int) -> RawMessage:
         """The message that an entry of the index points to. Raises `DamagedError` where another one is there."""
@@ -113,8 +130,10 @@ class McapFile:
         return read_attachment(self._file, place)
 
     def message_bytes(self) -> dict[int, int]:
-        """Bytes of message data by channel, before compression. Exact where chunks hold nothing but messages."""
-        chunked = [(c, e.chunks != UNCHUNKED, e) for c, e in self.entries.items() if len(e)]
+        """Bytes of message data by channel, before compression. Exact where chunks hold nothing but messages; of a file
+        of many chunks, estimated from some of them."""
+        entries, sampled = self.index.sample()
+        chunked = [(c, e.chunks != UNCHUNKED, e) for c, e in entries.items() if len(e)]
         totals = dict(self._loose_bytes)
         if not chunked:
             return totals
@@ -127,18 +146,18 @@ class McapFile:
         last[:-1] = chunks[1:] != chunks[:-1]
         ends = np.empty_like(offsets)
         ends[:-1] = offsets[1:]
-        limits = np.array([min(c.uncompressed_size, MAX_CHUNK_BYTES) for c in self._chunks.refs], np.int64)
-        ends[last] = limits[chunks[last]]
+        ends[last] = np.minimum(self._chunks.sizes[chunks[last]], MAX_CHUNK_BYTES)
         sizes = np.bincount(owner, weights=np.maximum(ends - offsets - _MESSAGE.size, 0))
-        for channel, _, _ in chunked:
+        for channel, _, found in chunked:
             if channel < len(sizes):
-                totals[channel] = totals.get(channel, 0) + int(sizes[channel])
+                share = 1.0 if sampled is None else self.index.count(channel) / len(found)
+                totals[channel] = totals.get(channel, 0) + round(float(sizes[channel]) * share)
         return totals
 
     def broken_chunks(self) -> dict[int, tuple[str, str]]:
         """The chunks that cannot be read, by number: where each lies, and why. Reads all of the file."""
         broken: dict[int, tuple[str, str]] = {}
-        for number in range(len(self._chunks.refs)):
+        for number in range(len(self._chunks)):
             try:
                 self._chunks.data(number)
             except DamagedError as error:
@@ -147,7 +166,7 @@ class McapFile:
 
     def weights(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
         """Log times of all messages, and how many bytes of the file each takes, as its chunk is compressed."""
-        found = [e for e in self.entries.values() if len(e)]
+        found = [e for e in map(self.index.entries, self.channels) if len(e)]
         if not found:
             return np.empty(0, np.int64), np.empty(0)
         times, chunks, offsets = (
@@ -155,18 +174,17 @@ class McapFile:
         )
         order = np.lexsort((offsets, chunks))
         times, chunks, offsets = times[order], chunks[order], offsets[order]
-        refs = self._chunks.refs
+        limits, lengths = (np.append(column, 1) for column in (self._chunks.sizes, self._chunks.lengths))
         last = np.append(chunks[1:] != chunks[:-1], True)
         sizes = np.append(offsets[1:], 0) - offsets
-        limits = np.array([ref.uncompressed_size for ref in refs] or [0], np.int64)
         chunked = chunks != UNCHUNKED
         sizes[last & chunked] = limits[chunks[last & chunked]] - offsets[last & chunked]
         sizes[last & ~chunked] = 0
-        ratios = np.array([ref.length / max(ref.uncompressed_size, 1) for ref in refs] or [1.0])
-        weights = sizes * np.where(chunked, ratios[np.where(chunked, chunks, 0)], 1.0)
+        ratios = lengths / np.maximum(limits, 1)
+        weights = sizes * np.where(chunked, ratios[chunks], 1.0)  # UNCHUNKED is -1: the last one, which is 1
         return times, weights
 
-    def _load(self) -> Contents:
+    def _load(self) -> tuple[Contents, MessageIndex]:
         head = self._file.read_up_to(0, 16)
         if not head.startswith(MAGIC):
             path = self._file.path
@@ -175,16 +193,16 @@ class McapFile:
         self._load_header()
         footer = read_footer(self._file)
         self.torn = footer is None
-        contents = None if footer is None else self._from_summary(footer)
-        if contents is None:
-            contents = self._from_scan()
-        self.damage += contents.damage
+        summary = None if footer is None else self._from_summary(footer)
+        contents = self._from_scan() if summary is None else summary.contents
+        contents.damage[:0] = self.damage
+        self.damage = contents.damage
         undeclared = contents.undeclared()
         if undeclared and self._lenient:
             self.damage.append(f"messages of channels that it does not declare are left out: {undeclared[:20]}")
         elif undeclared:
             raise self._file.damaged(f"it holds messages of channels that it does not declare: {undeclared[:20]}")
-        return contents
+        return contents, LoadedIndex(contents.entries()) if summary is None else summary.index
 
     def _load_header(self) -> None:
         """The header, which also tells whether records outside chunks have checksums."""
@@ -203,7 +221,7 @@ class McapFile:
         else:
             self.header = file.parse(Header, record[RECORD.size :], start)
 
-    def _from_summary(self, footer: Footer) -> Contents | None:
+    def _from_summary(self, footer: Footer) -> Summary | None:
         try:
             return read_summary(self._file, footer, sealed=self._sealed)
         except DamagedError as error:

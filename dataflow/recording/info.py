@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -81,7 +80,7 @@ def describe(recording: Recording) -> Description:
         events[event.name] = events.get(event.name, 0) + 1
     return Description(
         path=str(recording.path),
-        bytes=os.stat(recording.path).st_size,
+        bytes=recording.nbytes,
         library=recording.library,
         profile=recording.profile,
         torn=recording.torn,

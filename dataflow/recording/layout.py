@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from enum import StrEnum
+from importlib.metadata import PackageNotFoundError, version
 from typing import Final
 
 FORMAT: Final = "1"
@@ -22,6 +23,10 @@ RECOVERED: Final = "dataflow:recovered"
 """Of a file that was saved from a broken one: its name, and what was damaged."""
 FLIGHT: Final = "dataflow:flight"
 """Of what a flight recorder kept: its triggers."""
+TOLD: Final = "dataflow:told"
+"""Of what the events of a run tell without exception, as `events`: names, by spaces."""
+PARAMETERS: Final = "parameter"
+"""The event of a parameter that was changed."""
 RESERVED_METADATA: Final = frozenset({RECORDING, DIGESTS})
 FIELDS: Final = "fields"
 """Key of a stream's channel metadata: the declaration of a type that is not of `dataflow.messages`, as JSON."""
@@ -60,6 +65,14 @@ EVENT_SCHEMA: Final = json.dumps(
     },
     indent=1,
 ).encode()
+
+
+def library() -> str:
+    """Returns the name of this program in the header of its files."""
+    try:
+        return f"robot-dataflow/{version('robot-dataflow')}"
+    except PackageNotFoundError:
+        return "robot-dataflow/unknown"
 
 
 def firings_topic(namespace: str, operator: str) -> str:

@@ -20,17 +20,34 @@ Row = tuple[int, int, int, int, int, int, int, int]
 of its companion, and its rank in the stream."""
 
 
-@dataclass(frozen=True, slots=True)
-class Track:
-    """Messages of one stream that are ordered by time: an incarnation, or all channels of a foreign stream.
+Pairs = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+"""Chunk and offset of the companion of each message."""
 
-    `times`: by entries, what the messages are ordered by (ns). `companions`: by entries, (chunks, offsets) of the
-    companion of each message, or None where there are none.
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Messages that follow each other in a track, by channel.
+
+    `times`: by entries, what the messages are ordered by (ns). `companions`: by entries, those of each message, or None
+    where there are none.
     """
 
     entries: Sequence[Entries]
     times: Sequence[npt.NDArray[np.int64]]
-    companions: Sequence[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None]
+    companions: Sequence[Pairs | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Messages of one stream that are ordered by time: an incarnation, or all channels of a foreign stream.
+
+    `span`: the first and the last time (ns) of all of them; None where there are none. `blocks`: those that may be
+    asked for, all times of a block before those of the next.
+    """
+
+    span: tuple[int, int] | None
+    channels: int
+    blocks: Iterable[Block]
 
 
 def rows(tracks: Iterable[Track], start: int | None, end: int | None) -> Iterator[Row]:
@@ -41,22 +58,20 @@ def rows(tracks: Iterable[Track], start: int | None, end: int | None) -> Iterato
     rank = passed = 0
     newest: int | None = None
     for track in tracks:
-        times, order, columns = _columns(track, passed)
-        passed += len(track.entries)
-        if not len(order):
-            continue
-        first, last = int(times[order[0]]), int(times[order[-1]])
+        first, last = track.span or (0, 0)
         shift = 0 if newest is None or first > newest else newest + 1 - first
-        newest = last + shift
-        low = 0 if start is None else int(np.searchsorted(times[order], start, "left"))
-        high = len(order) if end is None else int(np.searchsorted(times[order], end, "right"))
-        for at in range(low, high, BLOCK):
-            block = order[at : min(at + BLOCK, high)]
-            keys = (times[block] + shift).tolist()
-            yield from zip(
-                keys, *(c[block].tolist() for c in columns), range(rank + at, rank + at + len(block)), strict=True
-            )
-        rank += len(order)
+        newest = last + shift if track.span else newest
+        for block in track.blocks:
+            times, order, columns = _columns(block, passed)
+            low = 0 if start is None else int(np.searchsorted(times[order], start, "left"))
+            high = len(order) if end is None else int(np.searchsorted(times[order], end, "right"))
+            for at in range(low, high, BLOCK):
+                part = order[at : min(at + BLOCK, high)]
+                keys = (times[part] + shift).tolist()
+                ranks = range(rank + at, rank + at + len(part))
+                yield from zip(keys, *(c[part].tolist() for c in columns), ranks, strict=True)
+            rank += len(order)
+        passed += track.channels
 
 
 def merged(cursors: Sequence[Iterator[Row]]) -> Iterator[tuple[int, Row]]:
@@ -90,9 +105,7 @@ def in_file_order(entries: Sequence[tuple[int, Entries]]) -> Iterator[tuple[int,
         yield from zip(*(column[block].tolist() for column in (names, chunks, offsets, times)), strict=True)
 
 
-def companions_of(
-    times: npt.NDArray[np.int64], companion: Entries
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+def companions_of(times: npt.NDArray[np.int64], companion: Entries) -> Pairs | None:
     """By message of `times`, chunk and offset of the companion message of the same time; NOWHERE where there is none.
 
     None where a companion message has the time of no message, so that it would be passed over.
@@ -109,19 +122,19 @@ def companions_of(
 
 
 def _columns(
-    track: Track, passed: int
+    block: Block, passed: int
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], list[npt.NDArray[np.int64]]]:
     """Returns what the messages are ordered by, the order, and the columns of a row between its key and its rank.
 
-    `passed`: entries of the tracks before.
+    `passed`: channels of the tracks before.
     """
-    times = np.concatenate(track.times)
-    chunks = np.concatenate([e.chunks for e in track.entries])
-    offsets = np.concatenate([e.offsets for e in track.entries])
-    log_times = np.concatenate([e.times for e in track.entries])
-    owners = np.concatenate([np.full(len(e), i, np.int64) for i, e in enumerate(track.entries, passed)])
+    times = np.concatenate(block.times)
+    chunks = np.concatenate([e.chunks for e in block.entries])
+    offsets = np.concatenate([e.offsets for e in block.entries])
+    log_times = np.concatenate([e.times for e in block.entries])
+    owners = np.concatenate([np.full(len(e), i, np.int64) for i, e in enumerate(block.entries, passed)])
     absent = np.full(len(chunks), NOWHERE)
-    pairs = [c or (absent[: len(e)], absent[: len(e)]) for c, e in zip(track.companions, track.entries, strict=True)]
+    pairs = [c or (absent[: len(e)], absent[: len(e)]) for c, e in zip(block.companions, block.entries, strict=True)]
     companion_chunks = np.concatenate([chunk for chunk, _ in pairs])
     companion_offsets = np.concatenate([offset for _, offset in pairs])
     order = np.lexsort((offsets, chunks, times))

@@ -24,9 +24,6 @@ Compression = Literal["zstd", "lz4", "none"]
 Buffer = bytes | memoryview
 
 ZSTD_LEVEL = 1
-MAX_CHUNK_BYTES = 2**29
-"""Uncompressed. Readers refuse more, so that a file made to do harm takes no more memory."""
-
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_FIXED = _MESSAGE.size - 9
 _INDEX = struct.Struct("<BQHI")
@@ -45,6 +42,7 @@ class Gathered:
     since: float
     parts: list[Buffer] = field(default_factory=list)
     size: int = 0
+    messages: int = 0
     entries: dict[int, array[int]] = field(default_factory=dict)
     """By channel: log time and offset of each message, alternating."""
     first: int = 0
@@ -61,6 +59,7 @@ class Gathered:
         self.parts.extend(parts)
         self.entries.setdefault(channel, array("Q")).extend((log_time, self.size))
         self.size += size
+        self.messages += 1
 
     @property
     def counts(self) -> dict[int, int]:

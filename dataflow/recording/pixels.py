@@ -17,6 +17,7 @@ MILLIMETRES = np.float32(1000)
 _PROBED_ROWS = 8
 """Of a depth image, looked at before all of it is."""
 DEPTH_ENCODINGS = ("32FC1", "64FC1", "16UC1")
+_COLORS_16 = ("mono16", "rgb16", "bgr16", "16UC3")
 _LAYOUTS: dict[str, tuple[str, int]] = {
     "mono8": ("u1", 1),
     "8UC1": ("u1", 1),
@@ -28,6 +29,7 @@ _LAYOUTS: dict[str, tuple[str, int]] = {
     "bgra8": ("u1", 4),
     "rgb16": ("u2", 3),
     "bgr16": ("u2", 3),
+    "16UC3": ("u2", 3),
     "bayer_rggb8": ("u1", 1),
     "bayer_bggr8": ("u1", 1),
     "bayer_gbrg8": ("u1", 1),
@@ -48,10 +50,22 @@ def is_depth(encoding: str) -> bool:
     return encoding in DEPTH_ENCODINGS
 
 
+def is_16_bit(encoding: str) -> bool:
+    """Tells whether an encoding holds colours or greys of 16 bits; `16UC1` is depth (REP 118)."""
+    return encoding in _COLORS_16
+
+
+def as_image16(encoding: str, rows: Pixels) -> npt.NDArray[np.uint16]:
+    """Returns (H, W, 3) RGB or (H, W) grey pixels of rows as they are stored; raises `RecordingError`."""
+    if not is_16_bit(encoding):
+        raise RecordingError(f"image encoding {encoding!r} is no Image16; those known are {', '.join(_COLORS_16)}")
+    return np.ascontiguousarray(rows[..., 2::-1] if encoding in ("bgr16", "16UC3") else rows, np.uint16)
+
+
 def as_image(encoding: str, rows: Pixels) -> npt.NDArray[np.uint8]:
     """Returns (H, W, 3) RGB or (H, W) grey pixels of rows as they are stored; raises `RecordingError`.
 
-    16-bit colours and greys keep their upper 8 bits, an alpha channel is left out, a Bayer mosaic is interpolated
+    16-bit colours and greys are `as_image16`. An alpha channel is left out, a Bayer mosaic is interpolated
     bilinearly, YUV is converted by BT.601.
     """
     convert = _IMAGES.get(encoding)
@@ -120,10 +134,6 @@ def _plain(rows: Pixels) -> Pixels:
     return rows
 
 
-def _upper_bits(rows: Pixels) -> Pixels:
-    return (rows >> 8).astype(np.uint8)
-
-
 def _reversed(rows: Pixels) -> Pixels:
     return rows[..., 2::-1]
 
@@ -174,14 +184,11 @@ def _yuv(luma: int) -> Callable[[Pixels], Pixels]:
 _IMAGES: dict[str, Callable[[Pixels], Pixels]] = {
     "mono8": _plain,
     "8UC1": _plain,
-    "mono16": _upper_bits,
     "rgb8": _plain,
     "8UC3": _reversed,
     "bgr8": _reversed,
     "rgba8": _without_alpha,
     "bgra8": _reversed,
-    "rgb16": _upper_bits,
-    "bgr16": lambda rows: _reversed(_upper_bits(rows)),
     "bayer_rggb8": _bayer(0, 0),
     "bayer_bggr8": _bayer(1, 1),
     "bayer_gbrg8": _bayer(1, 0),

@@ -12,11 +12,10 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 
 from dataflow.recording.errors import DamagedError, RecordingError
+from dataflow.recording.limits import MAX_RECORD_BYTES
 
 RECORD = struct.Struct("<BQ")
 """The head of every record: opcode, length of the rest."""
-MAX_RECORD_BYTES = 2**28
-"""Of a record that is neither a chunk nor a message: more than any graph, schema or index takes."""
 WINDOW_BYTES = 2**16
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
-import numpy.typing as npt
 from mcap.records import Channel
 
 from dataflow.messages.digest import StreamDigest
@@ -22,29 +20,31 @@ from dataflow.recording.json_codec import decode_object
 from dataflow.recording.json_columns import Values
 from dataflow.recording.layout import FORMAT, RECORDING, Kind
 from dataflow.recording.logs import LogLine
-from dataflow.recording.ordering import NOWHERE, Row, Track, companions_of, in_file_order, merged, rows
+from dataflow.recording.ordering import NOWHERE, Row, in_file_order, merged, rows
+from dataflow.recording.part_folder import PartedFile, parts_in
 from dataflow.recording.streams import (
     IndexedStream,
     StreamChannel,
     StreamFinder,
     StreamInfo,
     decoded,
-    entries_of,
-    unordered,
     unreadable,
 )
+from dataflow.recording.tracks import tracks
 
 
 class Recording:
     """A recording opened for reading: a context manager, with random access. Not thread-safe.
 
-    Opens our own recordings and anybody's MCAP. A file without an index (torn by `kill -9`, or foreign) is indexed by a
-    pass over it. Raises `RecordingError` for a file that is no MCAP or is damaged.
+    Opens our own recordings, a folder of the parts of one (NAME_000.mcap and so on), and anybody's MCAP. A file without
+    an index (torn by `kill -9`, or foreign) is indexed by a pass over it. Raises `RecordingError` for a file that is no
+    MCAP or is damaged.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._file = McapFile(self.path)
+        parts = parts_in(self.path) if self.path.is_dir() else []
+        self._file: McapFile | PartedFile = PartedFile(self.path, parts) if parts else McapFile(self.path)
         try:
             self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
             _check_format(self.path, self.metadata)
@@ -58,6 +58,11 @@ class Recording:
     def torn(self) -> bool:
         """Tells whether the file has no proper end: it is being written, or its writer died. The rest can be read."""
         return self._file.torn
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the file, or of all parts."""
+        return self._file.nbytes
 
     @property
     def lost_bytes(self) -> int:
@@ -118,7 +123,7 @@ class Recording:
         """
         (found,) = self._choose([stream])
         return StreamIndex(
-            rows(self._tracks(found, False), start, end),
+            rows(tracks(self._file, found, start, end), start, end),
             read=lambda row: self._recorded(found, row),
             columns=lambda rows, names: self._columns(found, rows, names),
             stamped_by_log_time=found.own,
@@ -137,8 +142,9 @@ class Recording:
             yield record
             del record
 
-    def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
-        """(operator, payload) of every batch of firing records, of one operator or of all, in file order.
+    def firings(self, operator: str | None = None, start: int | None = None) -> Iterator[tuple[str, bytes]]:
+        """(operator, payload) of every batch of firing records, of one operator or of all, in file order: all of them,
+        or those with log times from `start` (ns) on, which are those of a batch's last record.
 
         One pass: they lie in chunks of their own, without the messages of streams (in older recordings among them).
         """
@@ -147,7 +153,7 @@ class Recording:
             for c in self._channels_of(Kind.FIRINGS)
             if operator is None or c.metadata.get("operator", "") == operator
         }
-        for raw in self._in_file_order(list(channels)):
+        for raw in self._in_file_order(list(channels), start):
             yield channels[raw.channel], bytes(raw.data)
 
     def firing_batches(self) -> Mapping[str, int]:
@@ -155,15 +161,16 @@ class Recording:
         counts: dict[str, int] = {}
         for channel in self._channels_of(Kind.FIRINGS):
             name = channel.metadata.get("operator", "")
-            counts[name] = counts.get(name, 0) + len(entries_of(self._file, channel.id))
+            counts[name] = counts.get(name, 0) + self._file.index.count(channel.id)
         return dict(sorted(counts.items()))
 
-    def counts(self, stream: str) -> Mapping[int, int]:
-        """Stored messages of a stream by incarnation; empty for a stream that the file does not hold."""
+    def counts(self, stream: str, start: int | None = None) -> Mapping[int, int]:
+        """Stored messages of a stream by incarnation, all or those with log times from `start` (ns) on; empty for a
+        stream that the file does not hold."""
         found: dict[int, int] = {}
         if stream in self._streams:
             for channel in self._streams[stream].channels:
-                found[channel.incarnation] = found.get(channel.incarnation, 0) + len(channel.entries)
+                found[channel.incarnation] = found.get(channel.incarnation, 0) + channel.count_from(start)
         return found
 
     def events(self) -> Iterator[Event]:
@@ -275,9 +282,9 @@ class Recording:
         _, owner, chunk, offset, time, companion_chunk, companion_offset, _ = row
         channel = stream.channels[owner]
         raw = self._file.read(channel.record.id, chunk, offset, time)
-        if companion_chunk == NOWHERE or channel.companion is None:
+        if channel.companion is None or companion_chunk == NOWHERE:
             return channel, raw, None
-        companion = self._file.read(channel.companion[0], companion_chunk, companion_offset, time)
+        companion = self._file.read(channel.companion, companion_chunk, companion_offset, time)
         if companion.sequence != raw.sequence:
             raise unreadable(self.path, stream.info.name, raw, f"its companion is numbered {companion.sequence}")
         return channel, raw, companion.data
@@ -287,46 +294,18 @@ class Recording:
     ) -> Iterator[tuple[IndexedStream, Row]]:
         """The merged sequence: always the stream whose next message has the smallest (stamp, stream)."""
         ordered = sorted(streams, key=lambda s: s.info.name)
-        cursors = [rows(self._tracks(stream, by_log_time), start, end) for stream in ordered]
+        cursors = [
+            rows(tracks(self._file, stream, start, end, by_log_time=by_log_time), start, end) for stream in ordered
+        ]
         return ((ordered[i], row) for i, row in merged(cursors))
 
-    def _tracks(self, stream: IndexedStream, by_log_time: bool) -> Iterator[Track]:
-        """The incarnations of a stream, one after the other, or all channels of a foreign one."""
-        for group in [[c] for c in stream.channels] if stream.own else [stream.channels]:
-            yield Track(
-                entries=[c.entries for c in group],
-                times=[c.entries.times if by_log_time else self._stamps(stream, c) for c in group],
-                companions=[None if by_log_time else self._companions(stream, c) for c in group],
-            )
-
-    def _companions(
-        self, stream: IndexedStream, channel: StreamChannel
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-        if channel.companion is None:
-            return None
-        found = companions_of(channel.entries.times, channel.companion[1])
-        if found is None:
-            raise RecordingError(
-                f"{self.path}: stream {stream.info.name!r} has companion messages of messages it lacks"
-            )
-        return found
-
-    def _stamps(self, stream: IndexedStream, channel: StreamChannel) -> npt.NDArray[np.int64]:
-        """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass.
-
-        Foreign messages of which two carry the same time are stamped with their log times instead.
-        """
-        if channel.stamps is None:
-            count = len(channel.entries)
-            decoded = (message.stamp for message in unordered(self._file, stream.info.name, channel))
-            channel.stamps = np.fromiter(decoded, np.int64, count)
-            if len(np.unique(channel.stamps)) < count:
-                channel.stamps, channel.by_log_time = channel.entries.times, True
-        return channel.stamps
-
-    def _in_file_order(self, channels: list[int]) -> Iterator[RawMessage]:
-        for place in in_file_order([(c, entries_of(self._file, c)) for c in channels]):
-            yield self._file.read(*place)
+    def _in_file_order(
+        self, channels: list[int], start: int | None = None, end: int | None = None
+    ) -> Iterator[RawMessage]:
+        for part in self._file.index.in_file_order(channels, start, end):
+            for place in in_file_order(list(part.items())):
+                if (start is None or place[3] >= start) and (end is None or place[3] <= end):
+                    yield self._file.read(*place)
 
 
 def _merged(records: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, str]]:

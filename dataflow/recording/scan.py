@@ -8,8 +8,8 @@ from mcap.opcode import Opcode
 
 from dataflow.recording.attachments import Place
 from dataflow.recording.chunks import CHUNK_HEAD, ChunkRef, size_in_head
-from dataflow.recording.container import MAGIC
 from dataflow.recording.contents import MESSAGE_BODY, Contents
+from dataflow.recording.ending import MAGIC
 from dataflow.recording.errors import DamagedError
 from dataflow.recording.rawfile import RECORD, RawFile
 from dataflow.recording.seals import Seal, seal_of
@@ -69,7 +69,7 @@ class Scan:
                     raise self._file.damaged(f"the chunk at byte {at} is too short")
                 head = self._file.near(at + RECORD.size, CHUNK_HEAD)
                 ref = ChunkRef(at + RECORD.size, length, size_in_head(head))
-                self._pending = _Pending(self.contents.add_chunk(ref))
+                self._pending = _Pending(self.contents.chunks.add(ref))
             case Opcode.SCHEMA | Opcode.CHANNEL:
                 body = self._body(at, length)
                 if body is not None:
@@ -96,7 +96,7 @@ class Scan:
         if there < CHUNK_HEAD:
             return
         size = size_in_head(self._file.near(at, CHUNK_HEAD))
-        number = self.contents.add_chunk(ChunkRef(at, there, size, torn=True))
+        number = self.contents.chunks.add(ChunkRef(at, there, size, torn=True))
         before = sum(self.contents.counts().values())
         try:
             self.contents.take_chunk(number)
@@ -126,6 +126,8 @@ class Scan:
             if contents.add_indexes(pending.number, pending.indexes):
                 return
             contents.damage.append(f"a message index of {contents.chunks.where(pending.number)} is damaged")
+        if not self._sealed:  # what our writer writes expands as it may: a damaged recording can be read whole
+            contents.chunks.check_ratio(pending.number)
         try:
             contents.take_chunk(pending.number)
         except DamagedError as error:

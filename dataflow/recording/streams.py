@@ -19,6 +19,8 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.foreign import foreign_decoder
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.layout import Kind
+from dataflow.recording.message_index import MessageIndex
+from dataflow.recording.part_folder import PartedFile
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,8 @@ class StreamInfo:
 
 
 Decode = Callable[[RawMessage, memoryview | None], Message]
+File = McapFile | PartedFile
+"""A recording in one file or in parts."""
 TypeOf = Callable[[], type[Message] | None]
 
 
@@ -84,14 +88,35 @@ class StreamChannel:
     record: Channel
     incarnation: int
     base: int
-    entries: Entries
-    companion: tuple[int, Entries] | None
-    """Id and entries of the companion."""
+    index: MessageIndex
+    companion: int | None
+    """Id of the companion."""
     decode: Decode | None
     stamps: npt.NDArray[np.int64] | None = None
     """By entry; of foreign channels only known after a pass."""
     by_log_time: bool = False
     """Foreign messages whose own times are not usable."""
+
+    @property
+    def count(self) -> int:
+        """Messages of the channel."""
+        return self.index.count(self.record.id)
+
+    def count_from(self, start: int | None) -> int:
+        """Messages with log times from `start` (ns) on."""
+        if start is None:
+            return self.count
+        return sum(int((part.times >= start).sum()) for part in self.index.blocks(self.record.id, start, None))
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """The smallest and the largest log time (ns); None where there is no message."""
+        return self.index.span(self.record.id)
+
+    @property
+    def entries(self) -> Entries:
+        """All messages of the channel."""
+        return self.index.entries(self.record.id)
 
 
 @dataclass(slots=True)
@@ -103,13 +128,10 @@ class IndexedStream:
     channels: list[StreamChannel] = field(default_factory=list)
 
 
-_EMPTY = Entries(*(np.empty(0, np.int64) for _ in range(3)))
-
-
 class StreamFinder:
     """Finds the streams of a file by its channels, without decoding messages other than one of each foreign stream."""
 
-    def __init__(self, file: McapFile) -> None:
+    def __init__(self, file: File) -> None:
         self._file = file
 
     def all(self) -> dict[str, IndexedStream]:
@@ -149,7 +171,7 @@ class StreamFinder:
         channels.sort(key=lambda c: (c.incarnation, c.base))
         if not own:
             known = self._peek(name, channels)
-        times = [c.entries.times for c in channels if len(c.entries)]
+        spans = [span for c in channels if (span := c.span) is not None]
         schema = self._schema(first)
         info = StreamInfo(
             name=name,
@@ -157,12 +179,12 @@ class StreamFinder:
             encoding=first.message_encoding,
             declaration=declaration,
             known=known,
-            count=sum(len(c.entries) for c in channels),
-            first=min((int(t.min()) for t in times), default=None),
-            last=max((int(t.max()) for t in times), default=None),
+            count=sum(c.count for c in channels),
+            first=min((first for first, _ in spans), default=None),
+            last=max((last for _, last in spans), default=None),
             static=first.metadata.get("static") == "true" and own,
             bytes=size,
-            incarnations=len({c.incarnation for c in channels if len(c.entries)}),
+            incarnations=len({c.incarnation for c in channels if c.count}),
             metadata=first.metadata,
         )
         return IndexedStream(info, own, channels)
@@ -173,15 +195,13 @@ class StreamFinder:
             assert message_type is not None
             return codec_for(message_type).decode(raw.log_time, raw.data, extra)
 
-        entries = entries_of(self._file, record.id)
         return StreamChannel(
             record,
             incarnation=_number(record.metadata.get("incarnation", "0")),
             base=_number(record.metadata.get("sequence_base", "0")),
-            entries=entries,
-            companion=None if companion is None else (companion.id, entries_of(self._file, companion.id)),
+            index=self._file.index,
+            companion=None if companion is None else companion.id,
             decode=None if read_as() is None else decode,
-            stamps=entries.times,
         )
 
     def _foreign_channel(self, record: Channel) -> StreamChannel:
@@ -191,12 +211,12 @@ class StreamFinder:
             assert decoder is not None
             return decoder(bytes(raw.data), raw.log_time)
 
-        return StreamChannel(record, 0, 0, entries_of(self._file, record.id), None, None if decoder is None else decode)
+        return StreamChannel(record, 0, 0, self._file.index, None, None if decoder is None else decode)
 
     def _peek(self, name: str, channels: list[StreamChannel]) -> type[Message] | None:
         """The type of a foreign stream's first message; None when it does not decode."""
         for channel in channels:
-            if channel.decode is None or not len(channel.entries):
+            if channel.decode is None or not channel.count:
                 continue
             try:
                 return type(next(unordered(self._file, name, channel)))
@@ -209,12 +229,7 @@ class StreamFinder:
         return SchemaText("", "", b"") if schema is None else SchemaText(schema.name, schema.encoding, schema.data)
 
 
-def entries_of(file: McapFile, channel: int) -> Entries:
-    """Returns the index of a channel, which may have no messages."""
-    return file.entries.get(channel, _EMPTY)
-
-
-def unordered(file: McapFile, stream: str, channel: StreamChannel) -> Iterator[Message]:
+def unordered(file: File, stream: str, channel: StreamChannel) -> Iterator[Message]:
     """The messages of a foreign channel in the order of its entries."""
     entries = channel.entries
     for i in range(len(entries)):

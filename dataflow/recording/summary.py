@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import struct
 import zlib
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, ChunkIndex, MetadataIndex, Statistics
+from mcap.records import AttachmentIndex, MetadataIndex, Statistics
 
 from dataflow.recording.attachments import Place
-from dataflow.recording.chunks import ChunkRef
-from dataflow.recording.container import MAGIC
+from dataflow.recording.chunk_indexes import ChunkIndexes, ChunkIndexReader
+from dataflow.recording.chunks import Column
 from dataflow.recording.contents import Contents
+from dataflow.recording.ending import MAGIC
+from dataflow.recording.message_index import LoadedIndex, LongIndex, MessageIndex, take_messages
 from dataflow.recording.rawfile import RECORD, RawFile
 from dataflow.recording.seals import Seal, seal_of
 
 _FOOTER = struct.Struct("<BQQQI")
 TAIL_BYTES = _FOOTER.size + len(MAGIC)
-MAX_SUMMARY_BYTES = 2**28
+BLOCK_BYTES = 2**24
+"""Of the summary, in memory at a time."""
+LONG = 2**14
+"""Chunks of a file beyond which its message indexes are read as they are needed: all would take seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,63 +49,106 @@ def read_footer(file: RawFile) -> Footer | None:
     return Footer(start, data[: _FOOTER.size - 4], crc)
 
 
-def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Contents | None:
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Returns what a summary tells of the file; `index`: of its messages."""
+
+    contents: Contents
+    index: MessageIndex
+
+
+def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Summary | None:
     """Returns what the summary tells; None where it does not suffice to find every message.
 
     Raises `DamagedError` where it fails its checksum or contradicts itself or the file. Chunks, message indexes and
-    metadata must not overlap, so that what is read is bounded by the size of the file.
+    metadata must not overlap, so that what is read is bounded by the size of the file. The message indexes of a file of
+    many chunks (`LONG`) are read and checked as they are needed, those of others at once.
     """
     if not footer.summary_start:
         if footer.crc and zlib.crc32(footer.head) != footer.crc:
             raise file.damaged(f"its footer at byte {file.size - TAIL_BYTES} fails its checksum")
         return None
-    data = _summary_bytes(file, footer)
     contents = Contents(file)
-    chunks: list[ChunkIndex] = []
+    chunks = ChunkIndexReader(file, max(0, file.size - footer.summary_start))
     metadata: list[MetadataIndex] = []
     statistics: Statistics | None = None
-    position = 0
-    while position + RECORD.size <= len(data):
-        at = footer.summary_start + position
-        opcode, length = RECORD.unpack_from(data, position)
-        body = data[position + RECORD.size : position + RECORD.size + length]
-        if len(body) != length:
-            raise file.damaged(f"its summary ends within the record at byte {at}")
-        match opcode:
-            case Opcode.SCHEMA | Opcode.CHANNEL:
-                contents.declare(opcode, body, at)
-            case Opcode.CHUNK_INDEX:
-                contents.count_parsed(at)
-                chunks.append(file.parse(ChunkIndex, body, at))
-            case Opcode.METADATA_INDEX:
-                contents.count_parsed(at)
-                metadata.append(file.parse(MetadataIndex, body, at))
-            case Opcode.ATTACHMENT_INDEX:
-                index = file.parse(AttachmentIndex, body, at)
-                contents.add_attachment(Place(index.offset, index.length))
-            case Opcode.STATISTICS:
-                statistics = file.parse(Statistics, body, at)
-        position += RECORD.size + length
+    for block, at, records, others in _blocks(file, footer):
+        chunks.add(block, records, at)
+        for opcode, place, length in others:
+            start, offset = place + RECORD.size, at + place
+            body = block[start : start + length]
+            match opcode:
+                case Opcode.SCHEMA | Opcode.CHANNEL:
+                    contents.declare(opcode, body, offset)
+                case Opcode.METADATA_INDEX:
+                    contents.count_parsed(offset)
+                    metadata.append(file.parse(MetadataIndex, body, offset))
+                case Opcode.ATTACHMENT_INDEX:
+                    index = file.parse(AttachmentIndex, body, offset)
+                    contents.add_attachment(Place(index.offset, index.length))
+                case Opcode.STATISTICS:
+                    statistics = file.parse(Statistics, body, offset)
+    indexes = chunks.done()
     _read_metadata(contents, metadata, sealed)
-    if not all(index.message_index_offsets for index in chunks) or not (
-        chunks or (statistics is not None and statistics.message_count == 0)
+    if not np.diff(indexes.rows).all() or not (
+        len(indexes) or (statistics is not None and statistics.message_count == 0)
     ):
         return None
-    _read_chunks(contents, chunks, sealed)
-    if contents.undeclared():
+    contents.chunks.adopt(indexes.starts, indexes.lengths, indexes.sizes)
+    found = _long(contents, indexes, statistics, sealed) if len(indexes) > LONG else _loaded(contents, indexes, sealed)
+    if found is None or contents.undeclared():
         return None
-    _compare(contents, statistics)
-    return contents
+    _compare(contents, statistics, found)
+    return Summary(contents, found)
 
 
-def _summary_bytes(file: RawFile, footer: Footer) -> bytes:
-    size = file.size - TAIL_BYTES - footer.summary_start
-    if footer.summary_start < len(MAGIC) or not 0 <= size <= MAX_SUMMARY_BYTES:
-        raise file.damaged(f"its footer puts the summary at byte {footer.summary_start} of {file.size}")
-    data = file.read(footer.summary_start, size)
-    if footer.crc and zlib.crc32(footer.head, zlib.crc32(data)) != footer.crc:
+def _blocks(file: RawFile, footer: Footer) -> Iterator[tuple[bytes, int, Column, list[tuple[int, int, int]]]]:
+    """The records of the summary, some at a time: their bytes, where these lie, the places of chunk indexes among them,
+    and (opcode, place, length) of others. Raises `DamagedError` at the end where they fail their checksum."""
+    at, end = footer.summary_start, file.size - TAIL_BYTES
+    if not len(MAGIC) <= at <= end:
+        raise file.damaged(f"its footer puts the summary at byte {at} of {file.size}")
+    crc, unpack, head, wanted = 0, RECORD.unpack_from, RECORD.size, int(Opcode.CHUNK_INDEX)
+    while at + head <= end:
+        block = file.read(at, min(BLOCK_BYTES, end - at))
+        chunks, others = array("q"), list[tuple[int, int, int]]()
+        place, size = 0, len(block)
+        while place + head <= size:
+            opcode, length = unpack(block, place)
+            following = place + head + length
+            if following > size:
+                break
+            if opcode == wanted:
+                chunks.append(place)
+            else:
+                others.append((opcode, place, length))
+            place = following
+        if not place:
+            opcode, length = unpack(block)
+            if at + head + length > end or opcode == wanted:
+                raise file.damaged(f"its summary ends within the record at byte {at}")
+            block, place = file.record(at, length), head + length
+            others.append((opcode, 0, length))
+        block = block[:place]
+        crc = zlib.crc32(block, crc)
+        yield block, at, np.frombuffer(chunks, np.int64) if len(chunks) else np.empty(0, np.int64), others
+        at += place
+    crc = zlib.crc32(file.read(at, end - at), crc)
+    if footer.crc and zlib.crc32(footer.head, crc) != footer.crc:
         raise file.damaged(f"its summary at byte {footer.summary_start} fails its checksum")
-    return data
+
+
+def _loaded(contents: Contents, indexes: ChunkIndexes, sealed: bool) -> LoadedIndex:
+    for number in range(len(indexes)):
+        take_messages(contents, indexes, number, sealed=sealed)
+    return LoadedIndex(contents.entries())
+
+
+def _long(contents: Contents, indexes: ChunkIndexes, statistics: Statistics | None, sealed: bool) -> LongIndex | None:
+    if not contents.channels.keys() >= set(np.unique(indexes.channels).tolist()):
+        return None
+    counts = None if statistics is None else statistics.channel_message_counts
+    return LongIndex(contents.file, contents.chunks, indexes, sealed=sealed, counts=counts, damage=contents.damage)
 
 
 def _read_metadata(contents: Contents, indexes: list[MetadataIndex], sealed: bool) -> None:
@@ -115,7 +166,7 @@ def _read_metadata(contents: Contents, indexes: list[MetadataIndex], sealed: boo
         if not intact or not _names(body, index.name):
             contents.damage.append(f"metadata {index.name!r} at byte {index.offset} is damaged and left out")
             continue
-        contents.add_metadata(body, index.offset)
+        contents.take_metadata(body, index.offset)
 
 
 def _names(metadata: bytes, name: str) -> bool:
@@ -123,45 +174,7 @@ def _names(metadata: bytes, name: str) -> bool:
     return metadata.startswith(struct.pack("<I", len(encoded)) + encoded)
 
 
-def _read_chunks(contents: Contents, indexes: list[ChunkIndex], sealed: bool) -> None:
-    """Takes the messages of every chunk: by its message indexes, or where they are damaged by its content."""
-    file = contents.file
-    free = len(MAGIC)
-    for index in sorted(indexes, key=lambda i: i.chunk_start_offset):
-        start, end = index.chunk_start_offset, index.chunk_start_offset + index.chunk_length
-        if start < free or index.chunk_length < RECORD.size:
-            raise file.damaged(f"its index puts a chunk at byte {start}, among other records")
-        free = end + index.message_index_length
-        ref = ChunkRef(start + RECORD.size, index.chunk_length - RECORD.size, index.uncompressed_size)
-        number = contents.chunks.add(ref)
-        bodies = _message_indexes(file, end, index, sealed)
-        if bodies is None or not contents.add_indexes(number, bodies):
-            contents.take_chunk(number)
-            contents.damage.append(
-                f"the message index at byte {end} is damaged; {contents.chunks.where(number)} was read instead"
-            )
-
-
-def _message_indexes(file: RawFile, start: int, index: ChunkIndex, sealed: bool) -> list[bytes] | None:
-    """The bodies of the message indexes behind a chunk; None where they are not what the chunk index says."""
-    data = file.read(start, index.message_index_length)
-    bodies: list[bytes] = []
-    found: dict[int, int] = {}
-    position = 0
-    while position + RECORD.size + 2 <= len(data):
-        opcode, length = RECORD.unpack_from(data, position)
-        end = position + RECORD.size + length
-        if opcode != Opcode.MESSAGE_INDEX or end > len(data):
-            return None
-        if sealed and seal_of(data[position:end]) is not Seal.SOUND:
-            return None
-        bodies.append(data[position + RECORD.size : end])
-        found[int.from_bytes(bodies[-1][:2], "little")] = start + position
-        position = end
-    return bodies if position == len(data) and found == index.message_index_offsets else None
-
-
-def _compare(contents: Contents, statistics: Statistics | None) -> None:
+def _compare(contents: Contents, statistics: Statistics | None, index: MessageIndex) -> None:
     """Raises `DamagedError` where the statistics count other messages than the index."""
     if statistics is None:
         return
@@ -169,9 +182,8 @@ def _compare(contents: Contents, statistics: Statistics | None) -> None:
         contents.damage.append(
             f"its statistics count {statistics.attachment_count} attachments, its index {len(contents.attachments)}"
         )
-    found = contents.counts()
     for channel, count in statistics.channel_message_counts.items():
-        if found.get(channel, 0) != count:
+        if index.count(channel) != count:
             raise contents.file.damaged(
-                f"its statistics count {count} messages of channel {channel}, its index {found.get(channel, 0)}"
+                f"its statistics count {count} messages of channel {channel}, its index {index.count(channel)}"
             )

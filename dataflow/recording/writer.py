@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -30,12 +29,14 @@ from dataflow.recording.layout import (
     events_topic,
     firings_topic,
     frames_topic,
+    library,
     logs_topic,
 )
 from dataflow.recording.logs import SCHEMA as LOG_SCHEMA
 from dataflow.recording.logs import SCHEMA_NAME as LOG_SCHEMA_NAME
 from dataflow.recording.logs import LogLine
 from dataflow.recording.packing import Buffer, Compression
+from dataflow.recording.parts import OWNER_ONLY
 from dataflow.sync.stamps import FOREVER
 
 
@@ -75,14 +76,16 @@ class RecordingWriter:
         chunk_bytes: int = CHUNK_BYTES,
         chunk_seconds: float = CHUNK_SECONDS,
         overwrite: bool = False,
+        mode: int = OWNER_ONLY,
     ) -> None:
         self._file = ContainerWriter(
             Path(path),
-            library=f"robot-dataflow/{_version()}",
+            library=library(),
             compression=compression,
             chunk_bytes=chunk_bytes,
             chunk_seconds=chunk_seconds,
             overwrite=overwrite,
+            mode=mode,
         )
         self._namespace = namespace
         self._streams: dict[str, _Stream] = {}
@@ -118,9 +121,13 @@ class RecordingWriter:
         return self._file.saved_bytes
 
     @property
-    def messages(self) -> int:
-        """Messages, firing batches and events added so far."""
-        return self._file.messages
+    def failed(self) -> bool:
+        """Tells whether a write has failed: nothing more can be added."""
+        return self._file.failed
+
+    def saved(self, stream: str) -> int:
+        """Messages of a stream that are in the file now."""
+        return self._file.saved(stream)
 
     def add_stream(
         self,
@@ -341,10 +348,3 @@ class RecordingWriter:
 
 def _base(base: int) -> dict[str, str]:
     return {"sequence_base": str(base)} if base else {}
-
-
-def _version() -> str:
-    try:
-        return version("robot-dataflow")
-    except PackageNotFoundError:
-        return "unknown"

@@ -35,6 +35,7 @@ class Verification:
     then the messages without a record. `not_stored` messages were made again, but are not in the recording.
     `tainted` is the index of the first firing that was given anything other than recorded, `own_fault` says that the
     first difference came before; `states` of the differences are in snapshots, not in messages.
+    `wrote` names the first message that the operator has written into, which others may be given too.
     `began` says from where it was repeated: "start", "snapshot" (its recorded state) or "stateless".
     """
 
@@ -58,10 +59,13 @@ class Verification:
     tainted: int | None = None
     first: Difference | None = None
     missing: str = ""
+    wrote: str = ""
     files_changed: list[str] = field(default_factory=list)
 
     @property
     def verdict(self) -> Verdict:
+        if self.wrote:
+            return "culprit"
         if self.first is not None:
             return "culprit" if self.own_fault else "downstream"
         return "identical" if self.whole else "unverifiable"

@@ -75,7 +75,7 @@ def taken_by(record: FiringRecord) -> Taken | None:
 
 def is_known(record: FiringRecord) -> bool:
     """Tells whether a record holds the operator's state."""
-    return record.kind == "snapshot" or (record.kind == "cut" and "state" in record.detail)
+    return record.kind in ("snapshot", "cut") and "state" in record.detail
 
 
 def without_unknown(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
@@ -88,7 +88,7 @@ def without_unknown(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord]
     for record in records:
         if record.kind == "cut" and taken_by(record) is not None:
             waiting = "state" not in record.detail
-        elif waiting and record.kind == "snapshot":
+        elif waiting and record.kind == "snapshot" and is_known(record):
             waiting = False
             kept.append(replace(record, kind="restore"))
             continue

@@ -16,6 +16,9 @@ import msgpack
 from dataflow.sync import Drop, FiringInputs, InputRef, MessageRef, RunRef
 
 FORMAT = 1
+MAX_STATE_BYTES = 2**29 - 2**16
+"""Of a state in a record: with the record it fits into a chunk (`dataflow.recording.limits`). A larger one is left out,
+and the run goes on."""
 Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot", "cut"]
 Outcome = Literal["ok", "error"]
 KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot", "cut")
@@ -52,10 +55,11 @@ class FiringRecord:
     `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were
     given, by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those
     decided since the previous record. `detail` holds what is particular to the kind: parameters and file hashes for
-    `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot`, what stands in for the
-    records that were left out for `cut` (`dataflow.records.cuts`), what the operator sums up
-    for `finish`, the error's text for the outcome `error` (with `injected` where no call was made at all), and for
-    `fire` and `finish` of a source how many steps it has not sent since the record before, by reason.
+    `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot` (of one that is too large
+    to be recorded its bytes, as `left_out`), what stands in for the records that were left out for `cut`
+    (`dataflow.records.cuts`), what the operator sums up for `finish`, the error's text for the outcome `error` (with
+    `injected` where no call was made at all), and for `fire` and `finish` of a source how many steps it has not sent
+    since the record before, by reason.
     `wall_start` (ns since the epoch) and `duration` (ns) are facts of that run and never compared.
     """
 

@@ -29,8 +29,12 @@ class Maker(Protocol):
 class FiringLog:
     """The firing records of many operators: as batches until somebody asks for them."""
 
-    def __init__(self, batches: Mapping[str, Sequence[bytes]], origin: str) -> None:
+    def __init__(
+        self, batches: Mapping[str, Sequence[bytes]], origin: str, begins: Mapping[str, int] | None = None
+    ) -> None:
+        """`begins`: by operator the index from which on there are all records, where those before were not read."""
         self._batches, self._origin = batches, origin
+        self.begins: Mapping[str, int] = begins or {}
         self._decoded: dict[str, tuple[FiringRecord, ...]] = {}
 
     @staticmethod

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from dataflow.feeds.log import LogFeed
+from dataflow.firing.memory import MemoryGuard
 from dataflow.firing.recorded import RecordedRunner
 from dataflow.firing.threads import limit_threads
 from dataflow.graph.model import Graph, Node
@@ -104,6 +105,7 @@ class Recomputation:
 
     Re-execution begins at the stamp `begin` (see `records.reading.beginning`) and ends before the firings from `end`
     on; `slices` are operators of which only the calls between two stamps are repeated (see `verification.slices`).
+    `guard` watches over the memory of what they are given.
     `made` is given every message that the operators make, `read` every message that is read for them; `ended` the
     ends of the streams that are made.
     """
@@ -121,6 +123,7 @@ class Recomputation:
         begin: int | None = None,
         end: int | None = None,
         slices: Mapping[str, tuple[int | None, int | None]] = _NOTHING,
+        guard: MemoryGuard | None = None,
         watcher: Watcher | None = None,
     ) -> None:
         self._fed = frozenset(feeding.streams)
@@ -144,6 +147,7 @@ class Recomputation:
                 inputs=inputs,
                 seed=graph.seed,
                 seeding=seeding_of(recording),
+                guard=guard,
                 begin=begins.get(node.name),
             )
             for node in nodes

@@ -16,6 +16,8 @@ from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import ENDS, GRAPH, RUN
 
+_PROCESS = "process of "
+
 
 class ReplayError(ValueError):
     """A recording that cannot drive a graph: says which stream is missing and what would help."""
@@ -35,6 +37,33 @@ def recorded_graph(recording: PlayableStreams) -> Graph:
     Its operators are imported. Raises `ReplayError` when the recording does not hold a graph, `GraphError`.
     """
     return isolated(graph_as_recorded(recording))
+
+
+def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
+    """Returns the graph that made a recording, and why operators of it are not here, by operator: their modules or
+    classes are gone. These are external in it, so that what they made is taken from the recording.
+
+    Raises as `recorded_graph`.
+    """
+    from dataflow.graph import GraphError
+    from dataflow.graph.lookup import NotFound, find_operator
+
+    try:
+        return recorded_graph(recording), {}
+    except GraphError:
+        graph = resolved_graph(recording)
+        found = {} if graph is None else {name: find_operator(node.use) for name, node in graph.nodes.items()}
+        absent = {name: cls.message for name, cls in found.items() if isinstance(cls, NotFound) and cls.deleted}
+        if graph is None or not absent:
+            raise
+    nodes = {
+        name: replace(node, external=True)
+        if name in absent
+        else replace(node, use=node.use if isinstance(cls, NotFound) else f"{cls.__module__}:{cls.__qualname__}")
+        for name, node in graph.nodes.items()
+        for cls in (found[name],)
+    }
+    return isolated(replace(graph, nodes=nodes)), absent
 
 
 def isolated(graph: Graph) -> Graph:
@@ -60,7 +89,7 @@ def graph_as_recorded(recording: PlayableStreams) -> Graph:
     return load_bundle(bundle)
 
 
-def resolved_graph(recording: Recording) -> Graph | None:
+def resolved_graph(recording: PlayableStreams) -> Graph | None:
     """Returns the graph that made a recording as it was resolved then, for tools that look: imports no operator.
 
     None where the recording holds none, or none that is sound (another version's, or another program's).
@@ -128,6 +157,12 @@ def final_stamps(recording: PlayableStreams, streams: Iterable[str]) -> dict[str
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise RecordingError(f"{recording.path}: how stream {stream!r} ended cannot be read: {error!r}") from error
     return finals
+
+
+def processes_of(recording: Recording) -> dict[str, str]:
+    """Returns the process in which each operator ran, by operator, where the recording says so."""
+    facts = recording.metadata.get(RUN, {})
+    return {fact.removeprefix(_PROCESS): label for fact, label in facts.items() if fact.startswith(_PROCESS)}
 
 
 def seeding_of(recording: Recording) -> int:

@@ -75,7 +75,7 @@ def _is_unknown(records: Iterable[FiringRecord], stamp: int) -> bool:
     for record in records:
         if record.stamp > stamp and record.kind in CALLS:
             break
-        if taken_by(record) is not None or record.kind == "snapshot":
+        if taken_by(record) is not None or is_known(record):
             unknown = not is_known(record)
         elif record.kind == "setup":
             unknown = False

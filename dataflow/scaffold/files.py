@@ -21,7 +21,7 @@ _OPERATORS = {
 
 
 class NameFault(ValueError):
-    """A name that a module, a class or a graph cannot have: says why."""
+    """A module, a class or a graph cannot have this name; the message has the reason."""
 
 
 def snake(name: str) -> str:

@@ -149,7 +149,7 @@ class Device:
 class $Class(Source):
     """Readings of a thermometer, as they come."""
 
-    live = True  # it does not wait for anybody: `dataflow run --live` reads it on a thread of its own
+    live = True  # it waits for no consumer: `dataflow run --live` reads it on a separate thread
 
     temperature: Out[Number] = Out(doc="degrees Celsius")
 
@@ -250,7 +250,7 @@ name = "$distribution"
 version = "0.1.0"
 description = "Operators and graphs of $name"
 requires-python = ">=3.11"
-dependencies = ["robot-dataflow"]
+dependencies = ["robot-dataflow[all]"]
 
 [project.optional-dependencies]
 dev = ["pytest>=8"]
@@ -304,7 +304,7 @@ README = Template("""\
 # $name
 
     python3 -m venv .venv && . .venv/bin/activate
-    pip install -e PATH/TO/robot-dataflow  # where it was cloned to
+    pip install -e "PATH/TO/robot-dataflow[all]"  # where it was cloned to
     pip install -e ".[dev]"
     pytest
     dataflow run graphs/$package.yaml --record out/run.mcap --view out/run.rrd

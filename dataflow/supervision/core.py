@@ -22,6 +22,7 @@ from dataflow.supervision.events import (
     LeftBehind,
     Moment,
     NotReading,
+    Paused,
     PlaybackAsked,
     Printed,
     Remained,
@@ -76,6 +77,10 @@ class Core:
                 self._barrier.begin()
             case Tick():
                 self._tick()
+            case Paused(seconds):
+                self.run.event(
+                    "paused", f"the supervisor did not run for {seconds:.1f} s, which count against no process"
+                )
             case StopAsked():
                 self._stop()
             case PlaybackAsked(action, steps, speed):
@@ -203,8 +208,10 @@ class Core:
         by_policy = operator is None or process.life in ON_ITS_WAY  # at work its process has restarted it by it
         if by_policy and self._closing is None and self._restarts.grant(process):
             process.take(Step.LEAVE_FAILED, self.run.steady)
-            process.cause = f"has left: {what}" if operator else what
-            self.run.send(process, "leave", outcome=f"failed: {what}")
+            where = fields["where"]
+            process.cause = (f"has left: {what}" if operator else what) + (f" ({where})" if where else "")
+            process.failed_in = {"where": where, "traceback": fields["traceback"]}
+            self.run.send(process, "leave", outcome=f"failed: {what}", again=True)
             return
         raise RunFailed(what if operator else f"{process.describe()} {what}", fields["traceback"], operator)
 

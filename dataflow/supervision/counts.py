@@ -40,6 +40,8 @@ class Counts(Part):
 
     def _take(self, fields: Mapping[str, Any]) -> None:
         counts, drops, waits = fields["counts"], fields.get("drops", {}), fields.get("waits", {})
+        if (first := fields.get("first")) is not None:
+            self.run.status.began = min(first, self.run.status.began or first)
         for name, values in counts.items():
             self._reported[name] = OperatorCounts(*values)
         for name, found in drops.items():

@@ -82,7 +82,11 @@ class LiveCover(Cover):
 
     def _decided(self, process: Supervised, done: Mapping[str, int]) -> Mapping[str, int]:
         """One that was started again has not decided anything yet."""
-        return done if process.is_sink else {name: stamp for name, stamp in done.items() if stamp != NEVER}
+        return (
+            done
+            if process.is_sink and not process.attempt
+            else {name: stamp for name, stamp in done.items() if stamp != NEVER}
+        )
 
     def _jumped(self, stamp: int) -> None:
         """The clock of a source has jumped back: nothing from there on is done."""
@@ -96,7 +100,7 @@ class LiveCover(Cover):
 
     def back(self, process: Supervised) -> None:
         self._told.pop(process.label, None)
-        self._excuse(self.run.consumers(process))
+        self._excuse([] if process.is_sink else self.run.consumers(process))
 
     def heard_again(self, process: Supervised) -> None:
         """A process that gave no sign of life gives one."""
@@ -130,7 +134,7 @@ class LiveCover(Cover):
         strict = [
             max((self.flow.lag(source, stamp) for source, stamp in process.done.items()), default=0)
             for process in run.processes.values()
-            if process.is_sink and process.report is None
+            if process.is_sink and process.report is None and process.life is not Life.AWAY
         ]
         loose = list(strict)
         for process, name in self.counted():

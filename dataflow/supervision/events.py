@@ -13,7 +13,8 @@ from dataflow.records.black_box import Remains
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A clock value. `steady` (s) never goes back and times everything; `wall` (s since the epoch) is for stamps."""
+    """A clock value. `steady` (s) never goes back, stands still while the supervisor does not run, and times
+    everything; `wall` (s since the epoch) is for stamps."""
 
     steady: float
     wall: float
@@ -27,6 +28,13 @@ class Begin:
 @dataclass(frozen=True, slots=True)
 class Tick:
     """Time has passed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Paused:
+    """The supervisor did not run for so many seconds: it, or the whole machine, was stopped. No clock went on."""
+
+    seconds: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +130,7 @@ class Died:
 Event = (
     Begin
     | Tick
+    | Paused
     | StopAsked
     | PlaybackAsked
     | TriggerAsked

@@ -49,7 +49,8 @@ class Heartbeats(Part):
 
     def not_reading(self, process: Supervised, seconds: float, *, overflowed: bool) -> None:
         """One that reads nothing is stopped, like one that says nothing."""
-        if self.run.under_way and process.life is Life.RUNNING and (seconds > BEAT_WITHIN or overflowed):
+        late = seconds > BEAT_WITHIN and not process.is_sink  # a recorder may wait for its disk
+        if self.run.under_way and process.life is Life.RUNNING and (late or overflowed):
             self._miss(process, f"has read nothing for {seconds:.1f} s")
 
     def tick(self) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import socket
 import subprocess
 import sys
+import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +19,25 @@ import msgpack
 
 from dataflow.process.channel import QueuedChannel
 from dataflow.process.polling import readable
-from dataflow.supervision.nursery_process import ENVIRONMENT, MORE, MOST_DESCRIPTORS, SPAWN
+from dataflow.supervision.nursery_process import DIE_WITHIN, ENVIRONMENT, MORE, MOST_DESCRIPTORS, SPAWN, adopt_orphans
+from dataflow.supervision.wording import how_it_ended
 
 LEAVE_WITHIN = 15.0
 WORDS_AT_ONCE = 65536
+_PR_GET_CHILD_SUBREAPER = 37
+
+
+@contextlib.contextmanager
+def adopting() -> Iterator[None]:
+    """Makes this process the parent of those that a nursery leaves, if it dies: so their ends are known."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    before = ctypes.c_int(0)
+    libc.prctl(_PR_GET_CHILD_SUBREAPER, ctypes.byref(before), 0, 0, 0)
+    adopt_orphans()
+    try:
+        yield
+    finally:
+        adopt_orphans(bool(before.value))
 
 
 class NurseryFailed(RuntimeError):
@@ -86,6 +103,36 @@ class Child:
     def dead(self) -> bool:
         """Tells whether it has ended, for when nobody is left to tell."""
         return self._pidfd is not None and bool(readable([self._pidfd], 0))
+
+    def bury(self) -> int | None:
+        """Returns the exit code of one that has ended when no nursery is left to; kills what is left of its group.
+
+        None: it is not ours, since this process adopts no orphans.
+        """
+        if self._pidfd is None or self.pid is None:
+            return None
+        try:
+            os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+            with contextlib.suppress(ProcessLookupError, PermissionError):  # nothing is left of it
+                os.killpg(self.pid, signal.SIGKILL)  # it is not waited for yet: nobody else has its number
+            found = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
+        except ChildProcessError:
+            return None
+        if found is None:
+            return None
+        return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
+
+    def await_end(self, within: float) -> None:
+        """Waits (bounded) until it has ended; one that the nursery has not named, until its output ends."""
+        if self._pidfd is not None:
+            readable([self._pidfd], within)
+            self.bury()
+            return
+        self.channel.close()  # it leaves, if it is there at all
+        deadline = time.monotonic() + within
+        while self._words is not None and (left := deadline - time.monotonic()) > 0:
+            readable([self._words], left)
+            self.lines()
 
     def close(self) -> list[str]:
         """Closes everything that belongs to it; returns its last line, if it had no end."""
@@ -187,8 +234,9 @@ class Nursery:
             raise NurseryFailed(f"the process that starts the others is gone: {error}") from error
         self._pidfds.extend(pidfds)
         if not data:
-            code = self._process.poll()
-            raise NurseryFailed(f"the process that starts the others has ended (exit code {code})")
+            with contextlib.suppress(subprocess.TimeoutExpired):  # its end of the socket closes before it is dead
+                self._process.wait(timeout=DIE_WITHIN)
+            raise NurseryFailed(f"the process that starts the others {how_it_ended(self._process.poll())}")
         self._unpacker.feed(data)
         news = (self._taken(*message) for message in self._unpacker)
         return [each for each in news if each is not None]
@@ -216,3 +264,5 @@ class Nursery:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait(timeout=LEAVE_WITHIN)
+        for child in (*self._children.values(), *self._unborn):  # it was killed before it could end them
+            child.await_end(LEAVE_WITHIN)

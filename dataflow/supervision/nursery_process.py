@@ -41,10 +41,10 @@ PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "liv
 _PR_SET_CHILD_SUBREAPER = 36
 
 
-def _adopt_orphans() -> None:
-    """Makes this process the parent of descendants whose parent ends."""
+def adopt_orphans(wanted: bool = True) -> None:
+    """Makes this process the parent of descendants whose parent ends, or no longer."""
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) != 0:
+    if libc.prctl(_PR_SET_CHILD_SUBREAPER, int(wanted), 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")
 
 
@@ -55,7 +55,7 @@ def _fork_process(descriptor: int, words: int, handed: Sequence[int], inherited:
     code = 1
     try:
         os.setpgid(0, 0)
-        _adopt_orphans()
+        adopt_orphans()
         os.dup2(words, 1)
         os.dup2(words, 2)
         for other in (words, *inherited):
@@ -199,7 +199,7 @@ def main(descriptor: int) -> None:
     from dataflow.process import stacks
 
     stacks.ignore()
-    _adopt_orphans()
+    adopt_orphans()
     for name in PRELOAD:
         importlib.import_module(name)
     gc.collect()

@@ -31,11 +31,12 @@ def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport
         summaries=summaries_of(run),
         transport={label: r["transport"] for label, r in reports.items() if "transport" in r},
         files={p.label: p.facts for p in run.processes.values() if p.is_sink},
-        first=status.first,
+        first=status.began if status.first is None else status.first,
         last=max(reached, default=None),
         wall=0.0 if run.release is None else ended_at - run.release.at.steady,
         interrupted=interrupted,
         notes=tuple(status.notes),
+        sources=tuple(node.name for node in run.graph.sources() if node.name in status.operators),
         restarts=dict(status.restarts),
         waits={
             node: tuple((i, what, n) for (i, what), n in sorted(found.items()))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dataflow.graph.model import Graph, Placement, current_placement
 from dataflow.graph.sections import PLACE_FRAMES
 from dataflow.names import firings_key
+from dataflow.recording.parts import Storage
 
 if TYPE_CHECKING:  # runs without faults read no fault plan
     from dataflow.chaos.plan import Fault
@@ -48,7 +49,7 @@ class RunPlan:
     - `log`: a recording instead of the sources (a replay); None runs the sources themselves.
     - `flight`: the folder of the graph's flight recorder; None, or a `record`: there is none.
     - `record`, `view_file`: files to write; None for none; an existing recording only with `overwrite`. `metadata` goes
-      into the recording.
+      into the recording; `storage`: how its files are split, kept, and who may read them.
     - `live`: time does not wait: every source is read on its own thread, at the pace of the clock, and the operators'
       `live:` policies apply.
     - `faults`: what is to go wrong on purpose, by time (live runs only).
@@ -77,9 +78,12 @@ class RunPlan:
     stall_timeout: float = 120.0
     compression: str = "zstd"
     overwrite: bool = False
+    storage: Storage = field(default_factory=Storage)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "placement", current_placement(self.placement))
+        on_failure = self.storage.on_failure or ("go_on" if self.live else "end")
+        object.__setattr__(self, "storage", replace(self.storage, on_failure=on_failure))
 
     @property
     def keeps_records(self) -> bool:
@@ -125,6 +129,7 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
         if edge.stream in streams and edge.consumer not in replaced:
             taken_in[edge.stream].add(labels[edge.consumer])
 
+    storage = plan.storage.to_json()
     sinks: dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]] = {}
     options: dict[str, Any]
     if plan.record is not None:
@@ -134,18 +139,19 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
             "metadata": {name: dict(values) for name, values in plan.metadata.items()},
             "compression": plan.compression,
             "overwrite": plan.overwrite,
+            "storage": storage,
         }
         sinks[RECORDER] = ("record", recorded, options)
     elif plan.flight is not None:
         everything = tuple(s for s in graph.record.streams if s in streams)
         metadata = {name: dict(values) for name, values in plan.metadata.items()}
         options = {"flight": str(plan.flight), "metadata": metadata, "compression": plan.compression, "overwrite": True}
-        options |= {"label": f"{graph.name}-{os.getpid()}", "settle": FLIGHT_SETTLES}
+        options |= {"label": f"{graph.name}-{os.getpid()}", "settle": FLIGHT_SETTLES, "storage": storage}
         sinks[RECORDER] = ("record", everything, options)
     if plan.view_file is not None:
         hidden = {s for s in graph.view.hide if not set(graph.streams[s].types) & set(PLACE_FRAMES)}
         shown = tuple(sorted(streams - hidden))
-        sinks[VIEWER_FILE] = ("view", shown, {"path": str(plan.view_file)})
+        sinks[VIEWER_FILE] = ("view", shown, {"path": str(plan.view_file), "storage": storage})
     for label, (_, taken, _) in sinks.items():
         for stream in taken:
             taken_in[stream].add(label)

@@ -52,6 +52,8 @@ class Status:
     """By operator and (input, "timeout" or "late"): waits that were given up, and messages that came late."""
     process_of: dict[str, str] = field(default_factory=dict)
     first: int | None = None
+    began: int | None = None
+    """The first stamp that a source has given; `first` is known before, where sources can say it."""
     steps: int | None = None
     notes: list[str] = field(default_factory=list)
     health: list[Health] = field(default_factory=list)
@@ -94,6 +96,7 @@ class RunReport:
     interrupted: bool
     notes: tuple[str, ...]
     restarts: Mapping[str, int] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()
     waits: Mapping[str, tuple[tuple[str, str, int], ...]] = field(default_factory=dict)
     """Each operator's (input, "timeout" or "late", count): waits that were given up, which drops nothing, and messages
     that came after what needed them was decided, of which those for a trigger are among the drops too."""

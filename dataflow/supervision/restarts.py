@@ -22,6 +22,8 @@ from dataflow.supervision.run_state import Phase, RunState
 from dataflow.supervision.supervised import Supervised
 
 EDGES_WITHIN = 5.0
+RECORDER = Restart(max=5, backoff=1_000_000_000)
+"""Policy of the recorder of a run that goes on without it: the next one begins another file."""
 
 
 class RestartPolicy(Part):
@@ -58,12 +60,15 @@ class LiveRestarts(RestartPolicy):
     # Policy
 
     def may_restart(self, process: Supervised) -> bool:
-        return not self._closing() and not process.is_sink and self._policy(process).max > 0
+        return not self._closing() and self._policy(process).max > 0
 
     def _closing(self) -> bool:
         return self.run.phase in (Phase.CLOSING, Phase.OVER)
 
     def _policy(self, process: Supervised) -> Restart:
+        if process.is_sink:
+            goes_on = process.plan.sink == "record" and process.plan.options["storage"]["on_failure"] == "go_on"
+            return RECORDER if goes_on else Restart(0)
         policies = [self.run.graph.nodes[name].live.restart for name in process.nodes]
         return Restart(min((p.max for p in policies), default=0), max((p.backoff for p in policies), default=0))
 
@@ -80,7 +85,7 @@ class LiveRestarts(RestartPolicy):
     def await_turn(self, process: Supervised, how: str) -> None:
         run = self.run
         process.take(Step.AWAIT, run.steady)
-        process.cause = how
+        process.cause, failed_in = how, process.failed_in
         for name in process.nodes:
             run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
         if run.release is not None:
@@ -93,6 +98,7 @@ class LiveRestarts(RestartPolicy):
             f"{process.describe()} {how}; started again in {self._attempts[process.label].due_in():.2g} s",
             operators=list(process.nodes),
             cause=how,
+            **failed_in,
         )
 
     def _tell_producers(self, process: Supervised) -> None:
@@ -121,6 +127,9 @@ class LiveRestarts(RestartPolicy):
         if self.run.release is None:  # nobody has heard of the one before
             self._remains.forget(process.nodes)
             process.begins = {}
+            self.run.spawn(process)
+        elif process.is_sink:
+            process.done.clear()  # it owes nothing of what was before it
             self.run.spawn(process)
         else:
             restarts = self.run.status.restarts
@@ -156,10 +165,14 @@ class LiveRestarts(RestartPolicy):
         if unproven:
             run.note(f"{process.describe()} goes on without: {', '.join(sorted(unproven))}")
         run.send(process, "go", first=run.release.first, at=run.release.at.wall)
-        taken = set(process.plan.subscribe)
+        taken = run.takes(process)
         for reason in sorted(set(self._ended_streams.values())):
             over = sorted(s for s in taken if self._ended_streams.get(s) == reason)
             run.send(process, "ended_elsewhere", streams=over, reason=reason)
+        if process.is_sink:  # of what the recorder before had not stored, operators have kept the records
+            for each in run.working():
+                for name in each.nodes:
+                    run.send(each, "lacks", operator=name)
         self._tell("back", process)
         run.event("restarted", f"{process.describe()} is back", operators=list(process.nodes))
 
@@ -171,12 +184,15 @@ class LiveRestarts(RestartPolicy):
             case "restarting":
                 name = fields["operator"]
                 run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
+                where = f" ({fields['where']})" if fields["where"] else ""
                 run.event(
                     "restart",
-                    f"operator {name!r} failed in {fields['when']}: {fields['summary']}; "
+                    f"operator {name!r} failed in {fields['when']}: {fields['summary']}{where}; "
                     f"made anew in {fields['pause']:.2g} s",
                     operators=[name],
                     cause=fields["summary"],
+                    where=fields["where"],
+                    traceback=fields["traceback"],
                 )
             case "stream_ended":
                 self._ended_streams[fields["stream"]] = fields["reason"]

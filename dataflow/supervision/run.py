@@ -22,6 +22,7 @@ from dataflow.supervision.interrupts import interrupts
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import RunReport, Watch
+from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.supervision.supervisor import Supervisor
 
 Controls = Callable[[Supervisor], AbstractContextManager[None]]
@@ -38,6 +39,7 @@ def run(
 ) -> RunReport:
     """Runs a graph's own sources. `controls` may pause and step them, unless the run is live. Further options are the
     fields of `RunPlan`. Raises `RunFailed`."""
+    warn_of_gap(graph)
     return execute(RunPlan(graph, **options), mode="run", watch=watch, early=early, controls=controls)
 
 
@@ -61,6 +63,7 @@ def replay(
     with Recording(played) if isinstance(played, Path) else nullcontext(played) as recording:
         loaded = graph or recorded_graph(recording)
         log = plan_replay(recording, loaded, start=start, end=end)
+        warn_of_gap(loaded, recording)
     return execute(RunPlan(loaded, log=log, **options), mode="replay", watch=watch, early=early, controls=controls)
 
 

@@ -32,6 +32,8 @@ class Supervised:
     words: deque[str] = field(default_factory=lambda: deque(maxlen=WORDS_KEPT))
     cause: str = ""
     """Why it was killed or told to leave."""
+    failed_in: dict[str, str] = field(default_factory=dict)
+    """The place (`where`, such as "crashy.py:12") and the `traceback` of its failure, if it has reported one."""
     work: tuple[str, int, float] | None = None
     """The firing that took longer than a moment when it was last heard of: operator, stamp, seconds."""
     silent: bool = False
@@ -77,7 +79,7 @@ class Supervised:
         self.attempt += 1
         self.unseen.clear()
         self.words.clear()
-        self.cause, self.report, self.work = "", None, None
+        self.cause, self.report, self.work, self.failed_in = "", None, None, {}
         self.silent, self.hung_up = False, None
 
     def expect(self, now: float) -> None:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 
 from dataflow.feeds.playback import Action
 from dataflow.firing.threads import environment
+from dataflow.process.awake import LONGEST_STEP, AwakeClock
 from dataflow.process.channel import ChannelClosed
 from dataflow.process.speech import heard, shown
 from dataflow.supervision import commands, events
@@ -24,7 +25,7 @@ from dataflow.supervision.boxes import Boxes
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.early import EarlyNursery
-from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
+from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed, adopting
 from dataflow.supervision.plan import RunPlan, process_plans
 from dataflow.supervision.report import RunFailed, RunReport, Status
 from dataflow.supervision.rings import Rings, pairs_of
@@ -33,16 +34,10 @@ from dataflow.transport import registry, reserve_endpoints
 from dataflow.transport.log_file import LogFile
 
 TICK = 0.05
+PAUSE = 1.0
+"""Seconds for which the supervisor did not run, at once, that are worth saying."""
 NOT_READING_AFTER = 1.0
 """Seconds for which a process may leave what was sent to it, before the core hears of it."""
-
-
-def clock() -> events.Moment:
-    return events.Moment(time.monotonic(), time.time())
-
-
-def _print(label: str, line: str) -> None:
-    print(f"[{label}] {line}", file=sys.stderr)
 
 
 class Supervisor:
@@ -61,7 +56,7 @@ class Supervisor:
         self._reserved = reserve_endpoints(len(self._processes))
         self._endpoints = dict(zip(self._processes, self._reserved.endpoints, strict=True))
         self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
-        self._on_output = on_output or _print
+        self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))
         self._children: dict[str, Child] = {}
         self._boxes = Boxes(plan.graph, self._processes, live=plan.live)
         self._taken_at: dict[str, float] = {}  # label → when the process last took what was queued for it
@@ -102,7 +97,7 @@ class Supervisor:
 
     def run(self) -> RunReport:
         """Runs to the end. Raises `RunFailed` with the first cause; no process is left in either case."""
-        with contextlib.ExitStack() as stack:
+        with adopting(), contextlib.ExitStack() as stack:
             stack.callback(self._close_pipe)
             stack.callback(self._reserved.close)
             stack.enter_context(self._announced)
@@ -136,6 +131,7 @@ class Supervisor:
             raise RunFailed(f"cannot start a process: {error}") from error
 
     def _loop(self) -> commands.Over:
+        self._clock = AwakeClock()
         self._selector.register(self._woken, selectors.EVENT_READ, None)
         self._selector.register(self._nursery, selectors.EVENT_READ, self._nursery)
         interrupted: BaseException | None = None
@@ -144,14 +140,14 @@ class Supervisor:
         due = 0.0
         while self._over is None:
             try:
-                self._wait(max(0.0, due - time.monotonic()))
+                self._wait(max(0.0, due - self._clock()))
                 while seen_stops < self._stops:
                     seen_stops += 1
                     self._feed(events.StopAsked())
                 while self._asked:
                     self._feed(self._asked.popleft())
-                if time.monotonic() >= due:
-                    due = time.monotonic() + TICK
+                if self._clock() >= due:
+                    due = self._clock() + TICK
                     self._tick()
                 self._flush()
             except BaseException as error:  # Ctrl-C without a handler, or a fault of the core: end in order, once
@@ -166,7 +162,7 @@ class Supervisor:
     # Events
 
     def _feed(self, event: events.Event) -> None:
-        for command in self.core.handle(event, clock()):
+        for command in self.core.handle(event, events.Moment(self._clock(), time.time())):
             self._do(command)
 
     def _wait(self, timeout: float) -> None:
@@ -256,14 +252,16 @@ class Supervisor:
             self._feed(events.Printed(label, each))
 
     def _tick(self) -> None:
-        now, deserted = time.monotonic(), not self._nursery_lives
+        if (lost := self._clock.take_lost()) > PAUSE:
+            self._feed(events.Paused(lost + LONGEST_STEP))
+        now, deserted = self._clock(), not self._nursery_lives
         for label, child in list(self._children.items()):
             stuck = now - self._taken_at.get(label, now)
             if stuck > NOT_READING_AFTER or child.channel.overflowed:
                 waiting, overflowed = child.channel.waiting, child.channel.overflowed
                 self._feed(events.NotReading(label, stuck, waiting, overflowed))
             if deserted and child.dead:
-                self._ended(label, None)
+                self._ended(label, child.bury())
         self._feed(events.Tick())
 
     @property
@@ -301,13 +299,14 @@ class Supervisor:
             self._feed(events.Aborted(str(failure)))
             return
         self._children[label] = child
+        self._taken_at[label] = self._clock()
         self._selector.register(child.channel, selectors.EVENT_READ, (label, "channel"))
         assert child.words is not None
         self._selector.register(child.words, selectors.EVENT_READ, (label, "words"))
 
     def _flush(self) -> None:
         """Sends what processes take; who takes nothing is looked at again when it does."""
-        now = time.monotonic()
+        now = self._clock()
         for label, child in self._children.items():
             channel = child.channel
             if not channel.waiting:

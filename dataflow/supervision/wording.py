@@ -8,7 +8,7 @@ import signal
 def how_it_ended(code: int | None) -> str:
     """Returns what an exit code says of a process."""
     if code is None:
-        return "ended, nobody knows how"
+        return "ended in a way that is not known"
     if code >= 0:
         return f"exited with code {code}"
     try:

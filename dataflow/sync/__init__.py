@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from dataflow.sync.demand import Cycle, Edge, stuck_cycle
     from dataflow.sync.drops import DropLog
     from dataflow.sync.entries import (
+        MISSES,
         TICK,
         Drop,
         DropReason,
@@ -32,6 +33,7 @@ else:
             "demand": ("Cycle", "Edge", "stuck_cycle"),
             "drops": ("DropLog",),
             "entries": (
+                "MISSES",
                 "TICK",
                 "Drop",
                 "DropReason",
@@ -51,6 +53,7 @@ else:
 
 __all__ = [
     "FOREVER",
+    "MISSES",
     "NEVER",
     "TICK",
     "AlignSpec",

@@ -206,7 +206,7 @@ class Aligner:
     def poll(self, most: int | None = None) -> Firing | None:
         """The next firing, or None while it is not decided. The last one has kind "finish".
 
-        None also after `most` decided stamps that were dropped instead of fired; `paused` then tells that there is
+        None also after `most` decided stamps that were dropped instead of fired; `paused` then shows that there is
         more to decide.
         """
         self.paused = False
@@ -244,7 +244,7 @@ class Aligner:
         return undecided.decided
 
     def idle_frontier(self) -> int:
-        """The output frontier, where no firing is held back and none is left: nothing will come before somebody says
+        """The output frontier, where no firing is held back and none is left: nothing will come before an input brings
         more. NEVER where `poll` is to be asked."""
         undecided = self._undecided
         undecided.settle()

@@ -1,6 +1,6 @@
 """Feedback: whether a graph's cycles can always make progress.
 
-The *demand* of an edge is how far ahead of its own next firing a consumer must know the producer's stream. An
+The *demand* of an edge is how far ahead of its next firing a consumer needs the producer's stream. An
 operator's output frontier advances to t - 1 once its inputs' frontiers reach t + demand; round a cycle this
 gets ahead only if the demands sum to less than zero.
 """

@@ -8,7 +8,7 @@ from dataflow.sync.entries import TICK, Drop, DropReason, Entry
 from dataflow.sync.lanes import Lane
 
 KEPT = 4096
-"""Drops that are kept one by one until somebody takes them. Of more, the oldest are only counted: an operator that
+"""Drops that are kept one by one until they are taken. Of more, the oldest are only counted: an operator that
 never fires must not fill the memory with what it has not used."""
 
 

@@ -1,6 +1,6 @@
 """Inputs and outputs of an aligner: entries, firings and drops.
 
-Nobody changes them. Those that are made for every message are not frozen all the same: it would make them cost three
+They are never changed. Those that are made for every message are not frozen all the same: it would make them cost three
 times as much.
 """
 
@@ -12,6 +12,8 @@ from typing import Any, Literal
 
 FiringKind = Literal["fire", "tick", "finish"]
 DropReason = Literal["unmatched", "no_sample", "stale", "unused", "late", "overflow", "reset", "refused"]
+MISSES = frozenset({"unmatched", "unused", "no_sample"})
+"""Reasons that are no loss: no firing needed the message, or there was nothing to join or to sample it with."""
 
 TICK = "@tick"
 """The input named by the drop of a tick, which belongs to no declared input."""

@@ -127,7 +127,7 @@ class Join:
             above = entries[0]
         below_stamp = below.stamp if below is not None else None
         above_stamp = above.stamp if above is not None else None
-        if lane.removed is not None:  # taken entries are matched no more, but still are somebody's nearest
+        if lane.removed is not None:  # taken entries are matched no more, but may still be the nearest of another
             if lane.removed > stamp:
                 above, above_stamp = None, lane.removed
             elif below_stamp is None:

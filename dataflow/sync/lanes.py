@@ -61,7 +61,7 @@ class StreamState:
         return True
 
     def advance(self, frontier: int) -> bool:
-        """Takes note of a promise; False if it says nothing new."""
+        """Takes note of a promise; False if it promises nothing new."""
         if frontier >= FOREVER:
             raise StreamOrderError(
                 self.name, "a frontier lies before the end of time; a stream that is over sends its end"

@@ -1,6 +1,6 @@
 """A firing by reference: which messages each input had, without their content. Firing records embed this.
 
-Nobody changes a reference; those to one message, made for every firing, are not frozen all the same (see `entries`).
+A reference is never changed; those to one message, made for every firing, are not frozen all the same (see `entries`).
 """
 
 from __future__ import annotations

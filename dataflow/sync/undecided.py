@@ -14,7 +14,7 @@ from dataflow.sync.ticks import Ticks
 class Undecided:
     """Finds the first undecided stamp among those of triggers and of ticks.
 
-    `stamp` to `ready` hold after `settle()`. Whoever changes a lane of a trigger or a bounding stream, or decides,
+    `stamp` to `ready` hold after `settle()`. Code that changes a lane of a trigger or a bounding stream, or decides,
     sets `settled` to False.
     """
 

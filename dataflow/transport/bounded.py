@@ -1,4 +1,4 @@
-"""A bound on what a library may take: Zenoh's calls that end something wait for threads of its own."""
+"""A bound on what a library may take: Zenoh's calls that end something wait for its threads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 def within(seconds: float, act: Callable[[], object], name: str) -> bool:
     """Runs `act` on a thread called `name`, and returns whether it came to its end in so many seconds.
 
-    Raises what `act` raises. One that takes longer goes on, on its daemon thread, and nobody hears of it again.
+    Raises what `act` raises. One that takes longer goes on, on its daemon thread, and its result is discarded.
     """
     failures: list[BaseException] = []
 

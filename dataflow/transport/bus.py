@@ -127,8 +127,8 @@ class Bus:
     def query_static(self, namespace: str, expression: str = "**", timeout: float = 2.0) -> dict[str, bytes]:
         """Returns the encoded messages of the static streams that match a stream key expression, by stream.
 
-        Waits at most `timeout` seconds; a process that does not answer within it is left out. For tools: whoever is
-        connected may have answered.
+        Waits at most `timeout` seconds; a process that does not answer within it is left out. For tools: any
+        connected process may have answered.
         """
         wanted = zenoh.KeyExpr.autocanonize(expression)
         replies = self.session.get(

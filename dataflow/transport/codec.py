@@ -103,7 +103,7 @@ def decode_head(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Head:
 def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS, types: TypeOf = message_type) -> Envelope:
     """Returns the envelope in `buffer`, which must hold exactly one. `types` gives the class of a schema name.
 
-    The message's arrays are read-only views of `buffer`: nobody may write to it afterwards. Raises only `DecodeError`.
+    The message's arrays are read-only views of `buffer`, which must not change afterwards. Raises only `DecodeError`.
     """
     if limits is DEFAULT_LIMITS and (found := _usual(buffer, types)) is not None:
         return found
@@ -185,12 +185,12 @@ def _usual(buffer: Buffer, types: TypeOf) -> Envelope | None:
         if not made.adopt(message, stamp, header, arrays):
             return None
         return Envelope(_MESSAGE, stream, incarnation, seq, stamp, message, reason, wall)
-    except Exception:  # whatever it is, the general way finds it, and says what is wrong and where
+    except Exception:  # the general decoder names the fault and its place
         return None
 
 
 def _described(data: bytes, types: TypeOf) -> _Described:
-    """Reads what a small body says. Raises for anything that is rare, or wrong. Most bodies of a stream are equal: what
+    """Reads a small body. Raises for anything that is rare, or wrong. Most bodies of a stream are equal: what
     they say is kept."""
     schema, header, arrays = _unpack_small(data)
     cls = types(schema)
@@ -227,7 +227,7 @@ def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
     if magic != MAGIC:
         raise DecodeError(f"prelude: magic {magic.hex()}, expected {MAGIC.hex()}")
     if version != VERSION:
-        raise DecodeError(f"prelude: version {version}, this decoder knows {VERSION}")
+        raise DecodeError(f"prelude: version {version}, this decoder reads {VERSION}")
     if kind not in _KINDS:
         raise DecodeError(f"prelude: kind {kind}, known are {', '.join(f'{k.value} ({k.name})' for k in Kind)}")
     if head_bytes > limits.head_bytes or body_bytes > limits.body_bytes:
@@ -311,7 +311,7 @@ def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits,
         raise DecodeError(f"{where(head)}: {len(view) - offset} bytes after the last array, expected none")
     try:
         return cls.from_parts(head.stamp, scalars, arrays)
-    except Exception as error:  # MessageError, and whatever a type's own checks meet in values nobody foresaw
+    except Exception as error:  # MessageError, and anything that a type's checks raise for unforeseen values
         raise DecodeError(f"{where(head)}: {type(error).__name__}: {short(error)}") from None
 
 

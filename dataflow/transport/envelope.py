@@ -18,7 +18,7 @@ Buffer = bytes | bytearray | memoryview
 
 
 class DecodeError(ValueError):
-    """Bytes that are no envelope: says what is wrong and where."""
+    """Bytes are no envelope; the message names the fault and its place."""
 
 
 class Kind(IntEnum):
@@ -29,7 +29,7 @@ class Kind(IntEnum):
     FRONTIER = 2
     """No later message has a stamp ≤ `stamp`. `incarnation` and `seq` are the next message's."""
     END = 3
-    """Nothing follows: `stamp` is the final one, `reason` says why. `incarnation` and `seq` are those that the next
+    """Nothing follows: `stamp` is the final one, `reason` the cause. `incarnation` and `seq` are those that the next
     message would have had."""
     PROBE = 5
     """Start barrier: carries no data. `seq` is the probe's number."""
@@ -54,7 +54,7 @@ DEFAULT_LIMITS: Final = Limits()
 
 @dataclass(slots=True)
 class Head:
-    """Holds what every envelope says before its content: enough for rates, lag and routing."""
+    """Holds what every envelope has before its content: enough for rates, lag and routing."""
 
     kind: Kind
     stream: str
@@ -68,7 +68,7 @@ class Head:
 
 @dataclass(slots=True)
 class Envelope:
-    """One thing that happens on a stream. Nobody changes it (it is not frozen: one is made for every message).
+    """One thing that happens on a stream. It is never changed (it is not frozen: one is made for every message).
 
     `stamp` is the message's stamp, the frontier, or the final stamp (ns since the epoch), by `kind`. `wall` is the wall
     time of the publication (ns), for showing lag only.

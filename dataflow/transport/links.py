@@ -79,9 +79,9 @@ class Outgoing:
         self._taken, self._took_at = self._ring.taken(), time.monotonic()
         self.claim = LinkClaim(self._cells)
         self.away = False
-        """The consumer has died: what is sent now is for nobody."""
+        """The consumer has died: what is sent now has no receiver."""
         self.joined = False
-        """Another process has taken the consumer's place, and nobody has noticed yet: it lacks what is said once."""
+        """Another process has taken the consumer's place, which is not noticed yet: it lacks what is sent once."""
         self.dropped = 0
         """Envelopes that did not reach the consumer: it took nothing for too long."""
 
@@ -104,7 +104,7 @@ class Outgoing:
         return not (self._waiting or self.joined or self.away) and self._reader == self._words[READERS]
 
     def present(self) -> bool:
-        """Tells whether somebody is there to take what is sent, or is believed to be."""
+        """Returns whether the consumer is present, or is believed to be."""
         if self._reader != self._words[READERS]:
             self._new_reader()
         return not self.away

@@ -17,7 +17,7 @@ _LOCAL_PROTOCOLS = ("unixsock-stream", "unixpipe")
 
 
 class NetworkError(ValueError):
-    """An endpoint or a Zenoh setting that cannot be: says which, and what would be right."""
+    """An endpoint or a Zenoh setting is invalid; the message names it, and what would be right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class NetworkConfig:
 
     `listen` and `connect` are Zenoh endpoints such as `"unixsock-stream//run/user/1000/a"` or `"tcp/127.0.0.1:7447"`.
     Peers that are not up yet are tried again in the background until the bus is closed. An endpoint beyond this machine
-    is refused in `listen` unless `exposed` is set: it stands for "the graph's `network:` section says so".
+    is refused in `listen` unless `exposed` is set: the graph's `network:` section asks for it.
     `blocked`: seconds that a publication waits for a subscriber that takes
     nothing; then its link is closed, and it misses messages until it has connected again. `zenoh` holds further
     settings of Zenoh's own configuration by path: `{"transport/link/tls": {...}, "access_control": {}}`.

@@ -1,6 +1,6 @@
-"""Publishes streams to subscribers from outside the run, on a thread of its own: none of them holds up the graph.
+"""Publishes streams to subscribers from outside the run, on a separate thread: none of them holds up the graph.
 
-What is to be published waits in a queue. In a live run that is bounded by dropping: the oldest go first, and
+Messages wait in a queue. In a live run it is bounded by dropping: the oldest go first, and
 subscribers see a gap in the numbers. In any other run nothing is lost, so a subscriber that is too slow makes the run
 wait once the queue is full.
 """

@@ -65,7 +65,7 @@ class Block:
 
 
 class _Array(weakref.ref["npt.NDArray[np.uint8]"]):
-    """Claims a block for an array of a message that lies in it, for as long as somebody here holds the array."""
+    """Claims a block for an array of a message that lies in it, for as long as this process holds the array."""
 
     __slots__ = ("block", "gone", "key", "sent")
     block: Block
@@ -138,7 +138,7 @@ class SharedPool:
             self._lock.release()
 
     def _let_array_go(self, claim: _Array) -> None:
-        """Nobody here holds an array any more. Called at any moment, on any thread: so without the lock."""
+        """Releases an array that nothing here holds. Called at any moment on any thread, so without the lock."""
         del self._arrays[claim.key]
         claim.gone = True
         self._let_go.append(claim.block.capacity)
@@ -181,7 +181,7 @@ class SharedPool:
         return PRELUDE.pack(MAGIC, VERSION, Kind.REFERENCE, len(head), len(body)) + head + body
 
     def free(self) -> int:
-        """Returns how many bytes belong to nobody now."""
+        """Returns how many bytes are free."""
         with self._lock:
             released = sum(b.capacity for blocks in self._out.values() for b in blocks if b.free())
             return released + sum(length for _, length in self._gaps)

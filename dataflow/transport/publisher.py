@@ -1,4 +1,4 @@
-"""Publishes a stream to whoever subscribes to its key from outside the run: in order, reliably."""
+"""Publishes a stream to subscribers outside the run: in order, reliably."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataflow.transport.counters import Counters
 
 
 class BusError(RuntimeError):
-    """The network refused: says which operation, on which key, and why."""
+    """The network refused an operation; the message names it, the key and the reason."""
 
 
 UNDECLARE_WITHIN = 10.0
@@ -42,7 +42,7 @@ class StreamPublisher:
         self._counted = counted
         self._blocked = blocked
         self.matched = False
-        """True when anybody subscribes to the key."""
+        """Whether the key has a subscriber."""
         self._matching = publisher.declare_matching_listener(zenoh.handlers.Callback(self._on_matching, indirect=False))
         status: Any = publisher.matching_status  # Zenoh's stubs call it a bool
         self.matched = bool(status.matching)

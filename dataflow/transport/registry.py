@@ -1,6 +1,6 @@
 """The graphs that run on this machine, for tools to find: one small file for each, in a folder of this user alone.
 
-The sockets of their processes lie in the same folder. What a dead process left is removed by whoever looks next.
+The sockets of their processes lie in the same folder. The next reader removes what a dead process left.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ START_TOLERANCE = 1.0
 
 
 class RegistryError(RuntimeError):
-    """The folder of running graphs cannot be used: says why."""
+    """The folder of running graphs cannot be used; the message has the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +67,11 @@ def private_folder(folder: Path) -> Path:
     except OSError as error:
         raise RegistryError(f"cannot make the folder of running graphs {folder}: {error}") from error
     if not stat.S_ISDIR(status.st_mode):
-        raise RegistryError(f"{folder} is no folder; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+        raise RegistryError(f"{folder} is no folder; remove it, or set XDG_RUNTIME_DIR to another folder")
     if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o077):
         raise RegistryError(
             f"{folder} must belong to user {os.getuid()} with mode 0700, but belongs to {status.st_uid} with mode "
-            f"{stat.S_IMODE(status.st_mode):04o}; remove it, or set XDG_RUNTIME_DIR to a folder of your own"
+            f"{stat.S_IMODE(status.st_mode):04o}; remove it, or set XDG_RUNTIME_DIR to another folder"
         )
     return folder
 

@@ -1,6 +1,6 @@
 """A ring in shared memory from one process to another, with an eventfd that wakes the reader.
 
-One writer, one reader, each on one thread. Whoever starts both makes the memory (a memfd) and hands it down, so nothing
+One writer, one reader, each on one thread. The parent of both makes the memory (a memfd) and hands it down, so nothing
 else on the machine can write to it: what comes out of a ring comes from the process at its other end. Five words are
 shared, each with one writer: `head` and `tail` count the bytes ever written and read, `asleep` is set by a reader that
 is about to wait, `blocked` by a writer that found no room,
@@ -80,7 +80,7 @@ class RingWriter(_End):
         super().__init__(descriptor)
         self._wake = wake
         self.woke = False
-        """A reader that slept was woken; whoever takes note of that sets it back."""
+        """A reader that slept was woken; reset when that is noted."""
         self._head = self._words[_HEAD]
         self.largest = self.capacity // 4 - _FRAME.size
         """Bytes of the largest frame that can pass, once there is room."""

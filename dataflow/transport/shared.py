@@ -32,7 +32,7 @@ _REFERENCE: Final = bytes([Kind.REFERENCE])
 
 
 class SharedMemoryError(RuntimeError):
-    """A pool or board that cannot be made or opened: says which and why."""
+    """A pool or board cannot be made or opened; the message names it and the reason."""
 
 
 def make_memory(name: str, size: int) -> int:
@@ -75,7 +75,7 @@ def open_memory(pid: int, descriptor: int, name: str) -> mmap.mmap:
 
 
 def make_board() -> int:
-    """Makes the memory in which a consumer says which blocks of its producer's pool it has released."""
+    """Makes the memory in which a consumer marks the blocks of its producer's pool that it has released."""
     descriptor = os.memfd_create("board")
     os.ftruncate(descriptor, BOARD_BYTES)
     return descriptor
@@ -112,7 +112,7 @@ class Board:
         """Has a block released when the last view of it is gone."""
         lent = _Lent(block, self._take_back)
         lent.of = base, slot, generation
-        self._lent[id(lent)] = lent  # a reference that is gone itself calls nobody
+        self._lent[id(lent)] = lent  # a reference that is gone has no callback
 
     def _take_back(self, lent: _Lent) -> None:
         del self._lent[id(lent)]

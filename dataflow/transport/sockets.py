@@ -47,5 +47,5 @@ class Reservation:
 
 
 def reserve_endpoints(count: int) -> Reservation:
-    """Returns `count` endpoints on this machine that nobody else can listen on or connect to."""
+    """Returns `count` endpoints on this machine that no other process can listen on or connect to."""
     return Reservation(count)

@@ -45,7 +45,7 @@ class TapMessage:
 
 @dataclass(slots=True)
 class _Origin:
-    """State of one process, as a tap knows it: its counts as received, as taken, and as acknowledged."""
+    """State of one process at a tap: its counts as received, as taken, and as acknowledged."""
 
     epoch: int = 0
     received: tuple[int, int] = (0, 0)
@@ -75,7 +75,7 @@ class _Origin:
 class TapClient:
     """The tool's side: receives copies of the streams that match `expressions` (stream key expressions).
 
-    The latest static messages that match come first. What is not taken is not acknowledged, so at most `window` waits
+    The latest static messages that match come first. Messages are acknowledged when taken, so at most `window` waits
     here for each process, however slow the tool is.
     """
 

@@ -48,7 +48,7 @@ class _Copy:
 
 @dataclass(slots=True)
 class _Tap:
-    """State of one tap, as a process knows it. Counts are cumulative."""
+    """State of one tap at a process. Counts are cumulative."""
 
     id: str
     expressions: tuple[zenoh.KeyExpr, ...]
@@ -128,7 +128,7 @@ class _Tap:
 
 
 class TapServer:
-    """The process's side: knows the taps of its namespace and sends them copies of what the process publishes.
+    """The process's side: keeps the taps of its namespace and sends them copies of what the process publishes.
 
     `active` is False while there is no tap: publishers look at it before they call `offer`.
     """
@@ -294,7 +294,7 @@ class TapServer:
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.DATA_LOW,
             )
-        except zenoh.ZError:  # the session is closing under us: there is nobody left to send to
+        except zenoh.ZError:  # the session is closing under us: no receiver is left
             with self._wake:
                 for tap_id in list(self._taps):
                     self._drop(tap_id)

@@ -3,7 +3,7 @@
 A tap names the streams it wants and a window. A process sends it copies only while what it has not yet acknowledged
 fits the window; beyond that the newest message of each stream waits, and older ones are skipped and counted. Copies
 that Zenoh drops, for a full socket, are named by the acknowledgement; one that is still the newest of its stream is
-sent again. Copies are encoded and sent by a thread of their own. Here is what both sides share of the protocol;
+sent again. Copies are encoded and sent by a separate thread. Here is what both sides share of the protocol;
 `docs/wire-format.md` specifies it.
 """
 

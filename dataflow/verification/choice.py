@@ -79,7 +79,7 @@ def require_records(recording: Recording, log: FiringLog, operators: Iterable[st
         if log.batches(name):
             continue
         if recording.torn or outcome not in ("", COMPLETE):
-            why = "the recording has no proper end" if recording.torn else f"it {outcome}"
+            why = "the recording has no proper end" if recording.torn else f"its outcome: {outcome}"
             raise ReplayError(
                 f"{recording.path}: the recorded run ended before operator {name!r} began ({why}): "
                 "there is nothing to verify"

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
+from dataflow.recording.part_folder import parts_in
 from dataflow.records.comparison import Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed
@@ -22,7 +23,15 @@ from dataflow.verification.report import StandIn, VerifyReport
 FORMAT = 1
 
 OperatorVerdict = Literal[
-    "identical", "within tolerance", "accepted", "culprit", "downstream", "not as accepted", "changed", "unverifiable"
+    "identical",
+    "within tolerance",
+    "accepted",
+    "culprit",
+    "downstream",
+    "not as accepted",
+    "changed",
+    "unverifiable",
+    "not here",
 ]
 RecordingVerdict = Literal[
     "identical",
@@ -91,7 +100,7 @@ class Checked:
             return "different"
         if self.report.empty:
             return "nothing verified"
-        if "unverifiable" in found:
+        if found & {"unverifiable", "not here"}:
             return "not wholly verified"
         if "accepted" in found:
             return "accepted"
@@ -172,7 +181,9 @@ class Baseline:
         """Takes over what a recording came to. (operators accepted anew or otherwise, operators that cannot be)."""
         outcomes = {j.operator: j.outcome for j in checked.judged if j.outcome is not None and j.firm}
         refused = [
-            j.operator for j in checked.judged if not j.firm and (j.outcome is not None or j.verdict == "unverifiable")
+            j.operator
+            for j in checked.judged
+            if not j.firm and (j.outcome is not None or j.verdict in ("unverifiable", "culprit"))
         ]
         before = self.of(checked.path)
         changed = [name for name in {**before, **outcomes} if before.get(name) != outcomes.get(name)]
@@ -189,13 +200,16 @@ class Baseline:
 
 
 def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
-    """Files as they are, of folders every .mcap in them, at any depth: (path, name to show).
+    """Files, and folders of the parts of a recording, as they are, of others every .mcap in them, at any depth: (path,
+    name to show).
 
     Raises `ReplayError` for what is not there, and for a folder that holds no recording.
     """
     found: dict[Path, str] = {}
     for target in targets:
-        if target.is_dir():
+        if target.is_dir() and parts_in(target):
+            found.setdefault(target, target.name)
+        elif target.is_dir():
             inside = sorted(p for p in target.rglob("*.mcap") if p.is_file())
             if not inside:
                 raise ReplayError(f"folder {target} holds no recording (no .mcap file, at any depth)")
@@ -278,17 +292,18 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
     for v in report.operators:
         own, outcome = report.verdict(v), outcomes[v.operator]
         verdict: OperatorVerdict = own
-        if v.operator in accepted and outcome is None and v.whole:
+        if v.operator in accepted and outcome is None and v.whole and not v.wrote:
             verdict = "not as accepted"
-        elif outcome is not None and v.operator not in unexpected:
+        elif outcome is not None and v.operator not in unexpected and not v.wrote:
             verdict = "accepted"
         elif own == "downstream" and accepted and not _led_astray(v.operator, unexpected, report.producers):
             verdict = "culprit"
         if verdict in (*PASSES, "changed") and not v.whole:
             verdict = "unverifiable"
         steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
-        judged.append(Judged(v.operator, verdict, outcome, v.whole and steady))
-    return (*judged, *_judged_stand_ins(report, report.stand_ins))
+        judged.append(Judged(v.operator, verdict, outcome, v.whole and steady and not v.wrote))
+    absent = (Judged(name, "not here", firm=False) for name in report.absent)
+    return (*judged, *absent, *_judged_stand_ins(report, report.stand_ins))
 
 
 def _judged_stand_ins(report: VerifyReport, stand_ins: Iterable[StandIn]) -> Iterable[Judged]:

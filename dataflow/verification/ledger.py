@@ -16,7 +16,7 @@ from dataflow.recording.cutting import Cut, cut_of
 from dataflow.recording.layout import OUTCOME, RECOVERED
 from dataflow.records.comparison import Verification
 from dataflow.records.cuts import held_by
-from dataflow.records.firing import CALLS, WITHHELD
+from dataflow.records.firing import CALLS, WITHHELD, Emission
 from dataflow.records.reading import FiringLog, Place, whole
 from dataflow.sync import messages_of
 
@@ -71,9 +71,12 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
     made: dict[str, set[Place]] = {s: set() for name in nodes for s in graph.nodes[name].outputs.values()}
     taken: dict[str, set[Place]] = {s: set() for s in made}
     finished, lost = dict.fromkeys(nodes, False), dict.fromkeys(nodes, 0)
+    since: dict[str, Emission] = {}
     for name, node in graph.nodes.items():
         outputs, last = list(node.outputs.values()), (-1, -1)
         for record in log.of(name):
+            if record.index < log.begins.get(name, 0) and record.kind != "setup":
+                continue
             for ref in record.inputs.values():
                 for message in messages_of(ref):
                     if message.stream in taken:
@@ -83,6 +86,8 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
             for stream, emission in zip(outputs, record.outputs, strict=False):  # a failed call has none
                 if emission is not None and emission.seq != WITHHELD:
                     made[stream].add((record.incarnation, emission.seq))
+                    if name in log.begins and record.kind != "setup":
+                        since.setdefault(stream, emission)
             for held in held_by(record):
                 if held.stream in made:
                     made[held.stream].add(held.place)
@@ -91,7 +96,12 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
                 finished[name] = record.kind == "finish" or (finished[name] and record.kind not in CALLS)
         if name in lost:
             lost[name] = whole(log.of(name))[1]
-    accounts = {name: _account(recording, graph, name, made, taken, lost[name], finished[name]) for name in nodes}
+    for stream, first in since.items():
+        taken[stream] = {place for place in taken[stream] if place >= (0, first.seq)}
+    stored = {s: recording.counts(s, since[s].stamp if s in since else None) for s in made}
+    accounts = {
+        name: _account(recording, stored, graph, name, made, taken, lost[name], finished[name]) for name in nodes
+    }
     outcome = recording.metadata.get(OUTCOME, {}).get("outcome")
     part, torn = cut_of(recording.metadata), recording.torn or RECOVERED in recording.metadata
     return Ledger(accounts, not torn and part is None and outcome == COMPLETE, torn, part)
@@ -125,6 +135,7 @@ def incomplete_streams(recording: Recording, graph: Graph, log: FiringLog, nodes
 
 def _account(
     recording: Recording,
+    counts: Mapping[str, Mapping[int, int]],
     graph: Graph,
     node: str,
     made: Mapping[str, set[Place]],
@@ -135,7 +146,7 @@ def _account(
     unaccounted = not_stored = 0
     for stream in graph.nodes[node].outputs.values():
         told = Counter(incarnation for incarnation, _ in made[stream])
-        stored = recording.counts(stream)
+        stored = counts[stream]
         if graph.streams[stream].static:  # recorded once, however often it was made
             unaccounted += bool(sum(stored.values())) and not told
             not_stored += stream in recording.streams and not sum(stored.values()) and bool(told)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from dataflow.firing.memory import MemoryGuard
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.records.reading import FiringLog
@@ -22,7 +23,8 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
 
     The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
     `incomplete` (recorded streams to be made again), `records` and `batches` (see `letters.shared_records`), `begin`
-    (stamp, or None), `tolerance`, `slices` (by operator the stamps between which its calls are made).
+    (stamp, or None), `tolerance`, `slices` (by operator the stamps between which its calls are made), `until`
+    (operators: once each of them has differed, the rest is left), `guard` (watch over messages in every call).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
     stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: `operator` and `work` of
     those that are not repeated as a whole.
@@ -48,9 +50,11 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             read=read,
             begin=request["begin"],
             slices=request["slices"],
+            guard=MemoryGuard(keeping=True) if request["guard"] else None,
             watcher=board,
         )
-        results = work.run()
+        until = [work.runners[name].result for name in request["until"]]
+        results = work.run(until=lambda: bool(until) and all(result.first is not None for result in until))
         compared = comparer.close(results)
     slices = request["slices"]
     counts = {
@@ -73,22 +77,6 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     }
 
 
-def repeat_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
-    """Re-executes operators once more, until each has differed. Runs in a worker; the request is that of `verify_part`.
-
-    The answer: the first difference of each, as [incarnation, index, what was made]; None where there was none.
-    """
-    graph = Graph.from_json(request["graph"])
-    with Recording(request["path"]) as recording:
-        feeding = plan_feeding(recording, graph, request["operators"], incomplete=request["incomplete"])
-        log = _records(request, graph, feeding)
-        work = Recomputation(recording, graph, feeding, log, made=_let_go, begin=request["begin"], watcher=board)
-        results = work.results()
-        asked = [results[name] for name in request["operators"]]
-        work.run(until=lambda: all(result.first is not None for result in asked))
-    return {v.operator: None if v.first is None else [v.first.incarnation, v.first.index, v.first.got] for v in asked}
-
-
 def _records(request: Mapping[str, Any], graph: Graph, feeding: Feeding) -> FiringLog:
     """The firing records of the operators, and of those that made what they take."""
     taken = {s for name in feeding.operators for given in graph.nodes[name].inputs.values() for s in given}
@@ -109,7 +97,3 @@ def _checks(recording: Recording, graph: Graph, log: FiringLog, request: Mapping
         )
         for stream in streams
     }
-
-
-def _let_go(stream: str, entry: Entry) -> None:
-    """Takes a message that nobody needs."""

@@ -60,6 +60,9 @@ class VerifyReport:
     `start`: seconds into the recording, where it began there. `torn`: the recording has no proper end, so what is
     verified is what had been stored. `part`: the recording is a part of another, cut out of it. `work` tells how long
     each operator worked, `reading` the CPU seconds for which that worker read the recording that read most of it.
+    `absent` are operators whose code is not here, and why: what they made is taken from the recording.
+    `shared` are operators that make what was recorded, but not always in one process with those named; `mates` are, by
+    operator, those that ran in its process.
     """
 
     operators: tuple[Verification, ...]
@@ -84,6 +87,9 @@ class VerifyReport:
     part: Cut | None = None
     work: Mapping[str, OperatorCounts] = field(default_factory=dict)
     reading: float = 0.0
+    absent: Mapping[str, str] = field(default_factory=dict)
+    shared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    mates: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def identical(self) -> bool:
@@ -91,6 +97,7 @@ class VerifyReport:
         stored message is the one that the firing records tell of."""
         return (
             not self.cut
+            and not self.absent
             and all(self.verdict(v) == "identical" for v in self.operators)
             and not self.changed
             and all(s.whole for s in self.stand_ins)
@@ -130,7 +137,7 @@ class VerifyReport:
         if verification.first is None:
             changed = any(s.maker == verification.operator for s in self.changed)
             return "changed" if changed else verification.verdict
-        if self.tolerance is None or compared is None:
+        if self.tolerance is None or compared is None or verification.wrote:
             return verification.verdict
         return "within tolerance" if compared.tolerated else "culprit" if compared.own else "downstream"
 
@@ -167,5 +174,7 @@ class VerifyReport:
             "sources": [asdict(s) | {"whole": s.whole} for s in self.stand_ins],
             "stored": [s.to_wire() for s in self.stored if not s.as_recorded or s.missing],
             "unchecked": list(self.unchecked),
+            "absent": dict(self.absent),
+            "shared": {name: list(beside) for name, beside in self.shared.items()},
             "differing_facts": [{"fact": f, "recorded": a, "here": b} for f, a, b in self.facts],
         }

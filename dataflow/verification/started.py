@@ -103,7 +103,7 @@ def _adopts(yes: bool) -> bool:
 
 
 class EarlyWorkers:
-    """Starts workers that have no call yet: one process imports what they need, and becomes all of them."""
+    """Starts workers that have no call yet: one process imports what they need, and is the worker, or becomes all."""
 
     def __init__(self, count: int) -> None:
         self._environment = environment(1)
@@ -113,7 +113,10 @@ class EarlyWorkers:
             return
         with contextlib.suppress(OSError):  # whoever needs one will try again, and say why it cannot be
             self._waiting = [Started() for _ in range(count)]
-            self._maker = _spawn(self._waiting, 1)
+            if count == 1:
+                self._waiting[0].spawn(1)
+            else:
+                self._maker = _spawn(self._waiting, 1)
 
     def foresee(self, modules: Iterable[str]) -> None:
         """Has them import modules that they will need, found as they are found here."""
@@ -140,7 +143,8 @@ class EarlyWorkers:
             self._maker.wait(timeout=LEAVE_WITHIN)
         while self._waiting:
             worker = self._waiting.pop()
-            worker.hear()
+            if not worker.pid:
+                worker.hear()
             worker.end()
         _adopts(False)
 

@@ -5,22 +5,21 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dataflow.firing.threads import environment
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.cutting import cut_of
-from dataflow.recording.facts import machine_facts
 from dataflow.recording.layout import RECOVERED
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog, beginning, whole
+from dataflow.records.window import records_from
 from dataflow.reexecution.engine import plan_feeding
-from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
+from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, processes_of
 from dataflow.supervision.report import OperatorCounts, Watch
 from dataflow.verification import part, partition, slices
 from dataflow.verification.choice import (
@@ -33,19 +32,25 @@ from dataflow.verification.choice import (
     with_makers,
 )
 from dataflow.verification.compare import OutputComparison
+from dataflow.verification.facts import differing_facts
 from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
 from dataflow.verification.letters import shared_records
 from dataflow.verification.processes import Call, Locate, Workers, call_workers
 from dataflow.verification.report import StandIn, VerifyReport
+from dataflow.verification.retrial import Retrial, Trial, mates_of, retry
 from dataflow.verification.started import EarlyWorkers
 from dataflow.verification.stored import StoredStream
+
+Attempt = Callable[[Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]], list[Any]]
+"""Answers (what is special of a request, operators), as `part.verify_part` does."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
     """Holds what is to be verified, and what the recording says of it: all that was read before any worker starts.
 
-    `unfed`: operators that cannot be repeated, by the stream that they need and the recording does not hold.
+    `unfed`: operators that cannot be repeated, by the stream that they need and the recording does not hold;
+    `placed`: the process in which each ran.
     """
 
     path: Path
@@ -64,6 +69,8 @@ class _Task:
     span: float
     unfed: Mapping[str, str]
     torn: bool
+    placed: Mapping[str, str]
+    absent: Mapping[str, str]
 
 
 def verify(
@@ -75,6 +82,7 @@ def verify(
     tolerance: float | None = None,
     start: float | None = None,
     jobs: int | None = None,
+    paranoid: bool = False,
     stall_timeout: float = 120.0,
     watch: Watch | None = None,
     workers: Workers | None = None,
@@ -85,8 +93,9 @@ def verify(
     `first`: verify that operator and what follows from it; `only`: those alone. Every operator is fed from the
     recording; where its inputs were not recorded, or not wholly, those that made them run with it. Operators marked
     `external` are always taken from it. Stored messages are compared with the digests in the firing records, too.
-    `tolerance`: absolute, in the unit of each floating-point field. Culprits are run a second time, to see whether they
-    differ alike.
+    `tolerance`: absolute, in the unit of each floating-point field. Culprits are run a second time, beside those with
+    which they shared a process in the run (`verification.retrial`).
+    `paranoid`: look after each call whether it has written into its inputs; else after the first few of each operator.
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
     before that moment, one without state begins there, any other is repeated from its beginning.
     `jobs`: worker processes; by default one for each core that may be used, fewer where there is little to do.
@@ -112,28 +121,38 @@ def verify(
             "begin": task.begin,
             "incomplete": sorted(task.incomplete),
             "tolerance": tolerance,
+            "checks": [],
             "slices": {},
+            "until": [],
+            "guard": paranoid,
         }
-        calls = [
-            Call(
-                f"{part.__name__}:{part.verify_part.__name__}",
-                request
-                | {"operators": list(one.operators), "checks": list(one.checks)}
-                | {"slices": {name: (cut.begin, cut.end) for name, cut in one.slices.items()}},
+
+        def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
+            function = f"{part.__name__}:{part.verify_part.__name__}"
+            made = [Call(function, {**request, **more, "operators": list(names)}, names) for more, names in calls]
+            return workers(made, **options)
+
+        answers = attempt(
+            (
+                {
+                    "checks": list(one.checks),
+                    "slices": {name: (cut.begin, cut.end) for name, cut in one.slices.items()},
+                },
                 one.operators,
             )
             for one in task.parts
-        ]
-        answers = [*workers(calls, **options)]
+        )
         divided, left = slices.answer(task.graph, task.log, answers)
         if left:
             needed = tuple(n for n in task.operators if n in with_makers(task.held, task.graph, left))
-            whole = request | {"operators": list(needed), "checks": [], "slices": {}}
-            answers += workers([Call(f"{part.__name__}:{part.verify_part.__name__}", whole, needed)], **options)
+            answers += attempt([({}, needed)])
         answers.append(divided)
         report = _report(task, answers, tolerance, start)
-        repeated = _repeat(task, report, request, options, workers)
-    return replace(report, repeated=repeated, total=time.monotonic() - began)
+        if report.culprits:
+            differing = [v.operator for v in report.operators if v.operator in report.culprits and v.first is not None]
+            retrial = _retry(task, differing, answers, attempt)
+            report = _report(task, answers, tolerance, start, retrial)
+    return replace(report, total=time.monotonic() - began)
 
 
 def _prepare(
@@ -146,11 +165,13 @@ def _prepare(
     early: EarlyWorkers | None,
 ) -> _Task:
     with Recording(path) as recording:
-        played = graph or recorded_graph(recording)
+        played, absent = (graph, dict[str, str]()) if graph is not None else graph_that_is_here(recording)
+        if gone := [name for name in [first, *(only or ())] if name in absent]:
+            raise ReplayError(f"{gone[0]!r} cannot be verified: it is not here: {absent[gone[0]]}")
         if early is not None:
             wanted = with_makers(recording.streams.keys(), played, chosen_operators(played, first, only))
             early.foresee({played.nodes[name].use.partition(":")[0] for name in wanted})
-        log = FiringLog.read(recording)
+        log = _read_records(recording, played, start)
         told = [n for n in played.nodes if accountable(recording, played, log, n)]
         incomplete = incomplete_streams(recording, played, log, told)
         held = recording.streams.keys() - incomplete
@@ -184,12 +205,27 @@ def _prepare(
             held=frozenset(held),
             parts=tuple(partition.with_checks(played, parts, checks)),
             unchecked=unchecked,
-            facts=_differing_facts(recording.metadata, played),
+            facts=differing_facts(recording.metadata, played),
             begin=None if start is None else begin,
             span=(last - begin) * 1e-9,
             unfed=unfed,
             torn=recording.torn or RECOVERED in recording.metadata,
+            placed=processes_of(recording),
+            absent=absent,
         )
+
+
+def _read_records(recording: Recording, graph: Graph, start: float | None) -> FiringLog:
+    if start is None:
+        return FiringLog.read(recording)
+    again = [node for node in graph.nodes.values() if not node.source and not node.external]
+    return records_from(
+        recording,
+        graph.nodes.values(),
+        _span(recording, start)[0],
+        stateless={node.name for node in again if node.operator.stateless},
+        stateful={node.name for node in again if not node.operator.stateless},
+    )
 
 
 def _locate(task: _Task) -> Locate:
@@ -210,13 +246,19 @@ def _locate(task: _Task) -> Locate:
 
 
 def _report(
-    task: _Task, answers: Sequence[Mapping[str, Any]], tolerance: float | None, start: float | None
+    task: _Task,
+    answers: Sequence[Mapping[str, Any]],
+    tolerance: float | None,
+    start: float | None,
+    retrial: Retrial | None = None,
 ) -> VerifyReport:
-    of = _answer_of_each(answers)
+    retrial = retrial or Retrial()
+    of = {**_answer_of_each(answers), **retrial.instead}
     found = {name: Verification.from_wire(answer["operators"][name]) for name, answer in of.items()}
     stored = [StoredStream.from_wire(s) for answer in answers for s in answer["stored"]]
     for name in task.operators:
         task.ledger.enter(found[name])
+        found[name].wrote = found[name].wrote or retrial.wrote.get(name, "")
     for name, stream in task.unfed.items():
         calls = sum(record.kind in CALLS for record in task.log.of(name))
         found[name] = Verification(name, firings=calls, unverifiable=max(calls, 1), missing=stream)
@@ -255,6 +297,10 @@ def _report(
         torn=task.torn,
         part=task.ledger.part,
         work={name: OperatorCounts(*answer["work"][name]) for name, answer in of.items()},
+        absent=task.absent,
+        repeated=retrial.repeated,
+        shared=retrial.shared,
+        mates={name: tuple(sorted(mates - {name})) for name, mates in mates_of(task.placed, task.operators).items()},
     )
 
 
@@ -285,22 +331,21 @@ def _stand_in(task: _Task, name: str, stored: Iterable[StoredStream]) -> StandIn
     )
 
 
-def _repeat(
-    task: _Task, report: VerifyReport, request: Mapping[str, Any], options: Mapping[str, Any], workers: Workers
-) -> Mapping[str, bool]:
-    """Runs the culprits once more, to the first difference of each: did they differ alike?"""
-    culprits = report.culprits
-    if not culprits:
-        return {}
-    calls, left = [], set(culprits)
-    for one in task.parts:
-        if here := [name for name in one.operators if name in left]:
-            left.difference_update(here)
-            call = f"{part.__name__}:{part.repeat_part.__name__}"
-            calls.append(Call(call, {**request, "operators": here}, one.operators))
-    again = {name: first for answer in workers(calls, **options) for name, first in answer.items()}
-    before = {v.operator: v.first for v in report.operators if v.first is not None}
-    return {name: again[name] == [before[name].incarnation, before[name].index, before[name].got] for name in culprits}
+def _retry(task: _Task, culprits: Iterable[str], answers: Sequence[Mapping[str, Any]], attempt: Attempt) -> Retrial:
+    """Tries culprits again, as many at a time as there were workers."""
+
+    def tried(trials: Sequence[Trial]) -> list[Any]:
+        calls = []
+        for trial in trials:
+            made = {s for n in trial.operators for s in task.graph.nodes[n].outputs.values()} if trial.wired else set()
+            chosen = with_makers(task.held - made, task.graph, set(trial.operators))
+            operators = tuple(name for name in task.operators if name in chosen)
+            incomplete = sorted(task.incomplete.union(made))
+            calls.append(({"until": list(trial.asked), "incomplete": incomplete, "guard": True}, operators))
+        at_once = len(task.parts)
+        return [answer for k in range(0, len(calls), at_once) for answer in attempt(calls[k : k + at_once])]
+
+    return retry(culprits, _answer_of_each(answers), mates_of(task.placed, task.operators), tried)
 
 
 def _span(recording: Recording, start: float | None) -> tuple[int, int]:
@@ -316,19 +361,3 @@ def _span(recording: Recording, start: float | None) -> tuple[int, int]:
     if not first <= begin <= last:
         raise ReplayError(f"--start {start:g}: the recording is {(last - first) * 1e-9:.3g} s long")
     return begin, last
-
-
-def _differing_facts(metadata: Mapping[str, Mapping[str, str]], graph: Graph) -> tuple[tuple[str, str, str], ...]:
-    """Facts of the machine, packages, threads and devices that are not as when the recording was made."""
-    here = machine_facts(environment(graph.threads))
-    here["threads"] = {name: value for name, value in here["threads"].items() if name in metadata.get("threads", {})}
-    facts = [
-        (f"{group} {name}", metadata[group].get(name, "–"), here[group].get(name, "–"))
-        for group in sorted(here.keys() & metadata.keys())
-        for name in sorted(here[group].keys() | metadata[group].keys())
-        if metadata[group].get(name) != here[group].get(name)
-    ]
-    threads = metadata.get("dataflow:run", {}).get("threads", str(graph.threads))
-    if threads != str(graph.threads):
-        facts.append(("graph threads", threads, str(graph.threads)))
-    return tuple(facts)

@@ -36,7 +36,7 @@ def blueprint(
 ) -> rrb.Blueprint:
     """The views for `streams` (name → message type), less those that the graph hides.
 
-    `outlook` says where to look from; without it Rerun chooses. `following`: the viewer keeps up with what arrives.
+    `outlook` is the view point; without it Rerun chooses. `following`: the viewer keeps up with what arrives.
     """
     return blueprint_of(layout(streams, graph), outlook=outlook, following=following)
 
@@ -78,7 +78,10 @@ def blueprint_of(
 
 
 def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
-    """One 3-D view of everything with a place. Overlays stay with their images; depth gives way to clouds."""
+    """One 3-D view of everything with a place. Overlays stay with their images; depth gives way to clouds.
+
+    None where nothing has depth or a place: colour images alone would hang in an empty world.
+    """
     clouds = shown.of_type(PointCloud)
     contents = []
     for name in _with_role(shown, "space"):
@@ -88,7 +91,7 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
         calibrated = [c for c in users if c.info is not None]
         if not users or any(not (c.depth and clouds) for c in calibrated):
             contents.append(f"+ {entity_of(name)}")
-    if not contents:
+    if not _with_role(shown, "space") and not any(c.depth and c.info is not None for c in shown.cameras):
         return None
     forever = rr.VisibleTimeRange(
         TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()

@@ -136,10 +136,10 @@ PLOTS: dict[type[Message], tuple[str, ...]] = {}
 def visualizer(
     message_type: type[M], *roles: Role, plots: tuple[str, ...] = ()
 ) -> Callable[[Callable[[Canvas, M], None]], Callable[[Canvas, M], None]]:
-    """Registers the function that draws a message type; `roles` says in which views it appears.
+    """Registers the function that draws a message type; it appears in the views of `roles`.
 
-    `plots`: the curves at `<entity>/plot/<name>` that get axes of their own; none: all share one plot. A package with
-    message types of its own registers theirs the same way. Subclasses inherit.
+    `plots`: the curves at `<entity>/plot/<name>` that get separate axes; none: all share one plot. A package with
+    custom message types registers theirs the same way. Subclasses inherit.
     """
 
     def register(function: Callable[[Canvas, M], None]) -> Callable[[Canvas, M], None]:

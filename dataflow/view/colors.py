@@ -15,8 +15,8 @@ Colors = npt.NDArray[np.uint8]
 TRUTH: RGB = (80, 200, 120)
 """Ground truth, wherever it is drawn."""
 
-PERSON: RGB = (255, 120, 60)
-"""People, whatever else there is."""
+AGENT: RGB = (255, 120, 60)
+"""Agents, whatever else there is."""
 
 NEUTRAL: RGB = (150, 155, 165)
 """Colour of things without class and identity."""

@@ -18,7 +18,7 @@ def roles_of(message_type: type[Message]) -> tuple[Role, ...]:
 
 
 def plots_of(message_type: type[Message]) -> tuple[str, ...]:
-    """The plots with axes of their own."""
+    """Returns the plots with separate axes."""
     return next((PLOTS[c] for c in message_type.__mro__ if c in PLOTS), ())
 
 

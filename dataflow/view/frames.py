@@ -40,7 +40,7 @@ class Rank(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Attach:
-    """`child` now lies at `T_parent_child` in `parent`. `assumed`: nobody said so, it is only drawn there."""
+    """`child` now lies at `T_parent_child` in `parent`. `assumed`: no stream places it, it is only drawn there."""
 
     child: str
     parent: str
@@ -69,7 +69,7 @@ Change = Attach | Detach | NewRoot
 class _Edge:
     parent: str
     T_parent_child: Matrix
-    owner: str  # "" where nobody said anything
+    owner: str  # "" where no stream places it
     rank: Rank | None  # None: assumed
 
     @property
@@ -107,7 +107,7 @@ class FrameTree:
     def place(
         self, parent: str, child: str, T_parent_child: Matrix, *, owner: str, rank: Rank, stamp: int
     ) -> list[Change]:
-        """Stream `owner` says that `child` lies at `T_parent_child` (4×4) in `parent`.
+        """Places `child`, by stream `owner`, at `T_parent_child` (4×4) in `parent`.
 
         When another stream of the same or better rank places `child` already, the pose only serves to align the two
         streams' root frames, once. Raises `FrameCycleError`.
@@ -133,7 +133,7 @@ class FrameTree:
         return changes + self._join_roots()
 
     def owner(self, frame: str) -> str | None:
-        """Returns the stream that places `frame`; None where nobody does."""
+        """Returns the stream that places `frame`; None where none does."""
         edge = self._edges.get(frame)
         return None if edge is None or edge.assumed else edge.owner
 
@@ -146,7 +146,7 @@ class FrameTree:
     def pose_at(self, frame: str, stamp: int) -> Matrix | None:
         """`T_root_frame` (4×4) at a stamp (ns).
 
-        None where a frame on the way moves and nobody said where it was then, or is only assumed to lie somewhere.
+        None where a frame on the way moves and no stream places it then, or is only assumed to lie somewhere.
         """
         if frame not in self._frames:
             return None
@@ -163,7 +163,7 @@ class FrameTree:
         return T
 
     def assumed(self) -> dict[str, str]:
-        """Frame → parent, for the frames whose place nobody gave."""
+        """Frame → parent, for the frames that no stream places."""
         return {child: edge.parent for child, edge in self._edges.items() if edge.assumed}
 
     def reason(self, frame: str) -> str:

@@ -17,6 +17,7 @@ from dataflow.messages import (
     DepthImage,
     Detections2D,
     Image,
+    Image16,
     Mesh,
     Message,
     Planes,
@@ -28,7 +29,7 @@ from dataflow.messages import (
 )
 from dataflow.view.pacing import Pace
 
-COLOR: tuple[type[Message], ...] = (Image, CompressedImage)
+COLOR: tuple[type[Message], ...] = (Image, CompressedImage, Image16)
 DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth, RelativeDepth)
 OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
 
@@ -81,7 +82,7 @@ class Layout:
         return tuple(name for name, type_ in self.streams.items() if issubclass(type_, types))
 
     def pace(self, step: int) -> Pace:
-        """The choice of what is drawn in a step of event time (ns). What stays, or never changes, is drawn whole."""
+        """The choice of what is drawn in a step of event time (ns). Kept and static streams are drawn whole."""
         return Pace(step, frozenset(self.of_type(*HEAVY)) - self.static - self.kept)
 
 
@@ -94,7 +95,7 @@ def layout(
     """The layout of `streams` (name → message type), less those that are hidden and those that only decode another.
 
     With a graph, what is drawn over an image is found by walking the graph upstream; without one, by the words that
-    names share. `static` and `hidden` add to what the graph says.
+    names share. `static` and `hidden` add to those of the graph.
     """
     hidden = {*hidden, *(graph.view.hide if graph is not None else ())}
     placing = frozenset(name for name, type_ in streams.items() if name in hidden and type_.SCHEMA in PLACE_FRAMES)
@@ -136,12 +137,12 @@ def plane_name(stream: str) -> str:
 
 
 def is_truth(stream: str) -> bool:
-    """Tells whether a stream's name says that it is ground truth (`true`, `truth`, `ground_truth`, `gt`)."""
+    """Returns whether a stream is ground truth by its name (`true`, `truth`, `ground_truth`, `gt`)."""
     return bool(_TRUTH & set(_words(stream)))
 
 
 def _calibration(image: str, infos: list[str], images: list[str], graph: Graph | None) -> str | None:
-    """The calibration of an image: of its own operator, else of an image it was made from, else of the same device.
+    """The calibration of an image: of the same operator, else of an image it was made from, else of the same device.
 
     What an operator makes of no image, such as a plot, is no camera's and has none."""
     if graph is not None and _drawn(image, graph):

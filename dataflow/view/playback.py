@@ -47,7 +47,7 @@ def from_recording(
 ) -> int:
     """Opens `sink` for the recorded `streams` (None: all that have a message type) and logs what they hold.
 
-    Static streams come first and whole; of the others, messages with start ≤ stamp ≤ end (ns). `graph` says what is
+    Static streams come first and whole; of the others, messages with start ≤ stamp ≤ end (ns). `graph` decides what is
     drawn over what, and what is hidden. Frames are placed by what is recorded of them, whatever is shown. The run's log
     is shown too where all streams are, and its scores where there is a graph; a bag has neither. Waits for the
     viewer instead of dropping. `progress` is called with each stamp. Returns how many messages were handed over; the

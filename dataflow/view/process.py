@@ -18,7 +18,7 @@ _START_TIMEOUT = 15.0  # seconds
 
 
 class ViewerError(RuntimeError):
-    """A viewer that cannot be had: says which, why, and what to use instead."""
+    """A viewer is unavailable; the message names it, the reason, and an alternative."""
 
 
 def executable() -> Path:
@@ -49,7 +49,7 @@ def display_problem() -> str | None:
 def start(arguments: Sequence[str], ports: Sequence[int], *, outlive: bool) -> subprocess.Popen[bytes]:
     """Starts Rerun and returns when it listens on `ports`; raises `ViewerError` if it ends or does not listen in time.
 
-    `outlive`: it stays when this process ends (a window that somebody looks at); otherwise, on Linux, the kernel ends
+    `outlive`: it stays when this process ends (a window in use); otherwise, on Linux, the kernel ends
     it with this process, however that dies.
     """
     command = [str(executable()), "--bind", LOOPBACK, *arguments]
@@ -86,7 +86,7 @@ def stop(child: subprocess.Popen[bytes]) -> None:
 
 
 def listening(port: int, host: str = LOOPBACK, timeout: float = 1.0) -> bool:
-    """Tells whether somebody accepts connections there."""
+    """Returns whether a server accepts connections there."""
     try:
         with socket.create_connection((host, port), timeout):
             return True

@@ -29,7 +29,7 @@ VIEWER_LOG = "/viewer/log"
 """Entity of what the viewer itself has to say."""
 
 ASSUMPTION_GRACE = 1_000_000_000
-"""Event time (ns) for which a frame may stay unplaced before the viewer says so."""
+"""Event time (ns) for which a frame may stay unplaced before the viewer reports it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class ViewOptions:
     - `jpeg_quality`: raw colour images are sent as JPEG of this quality, None: as they are (20 times the memory).
     - `depth_step`: depth is sent as 16-bit PNG in steps of so many metres (coarser only where the farthest would not
       fit); None: as float32. `depth_block`: side (pixels) of the squares that have one depth each; 1: every pixel.
-    - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log says so once.
+    - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log notes it once.
     - `point_step`: positions of a cloud's points are rounded to this, metres, which packs better; 0: not at all.
     - `point_shades`: colours that the values of a cloud's points are told apart by, which packs better; 0: all.
     - `kept_step`: side (m) of the cells in which points that stay are kept, one each; `kept_after`: clouds that must
@@ -211,7 +211,7 @@ class SceneState:
     def draw_frames(
         self, recording: rr.RecordingStream, changes: list[Change], stamp: int, *, static: bool = False
     ) -> None:
-        """Logs the changes of the tree. What is assumed is never static, so that what is given later replaces it."""
+        """Logs the changes of the tree. Assumed frames are never static, so that later ones replace them."""
         for change in changes:
             match change:
                 case Attach():
@@ -258,7 +258,7 @@ class SceneState:
         self._rows[frame] = at, given and not static
 
     def doubts(self, stamp: int) -> list[str]:
-        """Returns what to tell people about frames that nobody placed for a while; each once."""
+        """Returns messages about frames that no stream has placed for a while; each once."""
         words = []
         assumed = self.tree.assumed() if self._waiting else {}
         for frame, since in list(self._waiting.items()):

@@ -18,7 +18,7 @@ Summaries = Mapping[str, Mapping[str, Any]]
 
 
 def scores_of(summaries: Summaries, graph: Graph | None) -> Summaries:
-    """Returns those of operators without outputs, which only judge; of others the report of the run tells."""
+    """Returns those of operators without outputs, which only judge; those of others are in the report of the run."""
     nodes = graph.nodes if graph is not None else {}
     return {name: found for name, found in summaries.items() if found and not (name in nodes and nodes[name].outputs)}
 

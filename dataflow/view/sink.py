@@ -108,7 +108,7 @@ class ViewerSink:
         """Starts or reaches the viewer and lays out its views. Raises `ViewerError`.
 
         `streams`: name → message type. `static`: streams whose one message holds for all time, besides those that the
-        graph says. `hidden`: streams that are not shown, besides those that the graph hides; where they place frames,
+        graph names. `hidden`: streams that are not shown, besides those that the graph hides; where they place frames,
         these are placed all the same.
         """
         if self._recording is not None:
@@ -280,7 +280,7 @@ class ViewerSink:
         self._lay_out(recording)
 
     def _saved_layout(self, recording: rr.RecordingStream, graph: Graph | None) -> None:
-        """Takes the layout that the graph names, as somebody saved it from the viewer, in place of a derived one."""
+        """Takes the layout that the graph names, as saved from the viewer, in place of a derived one."""
         if graph is None or not graph.view.layout:
             return
         file = Path(graph.view.layout)
@@ -333,7 +333,7 @@ _abandoned: list[rr.RecordingStream] = []
 
 
 def _check_reachable(url: str) -> None:
-    """Rerun's `connect_grpc` returns at once and tries for ever; this says at once that nobody is there."""
+    """Rerun's `connect_grpc` returns at once and tries for ever; this raises at once where no server listens."""
     parts = urlsplit(url)
     if parts.path != "/proxy" or parts.hostname is None:
         raise ViewerError(f"viewer address {url!r}: expected rerun+http://HOST:PORT/proxy")

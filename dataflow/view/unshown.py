@@ -1,6 +1,6 @@
 """Poses of frames from streams that are not shown: taken where something shown needs them and nothing shown gives them.
 
-A stream that somebody hides must not take the frames of what is shown with it; nor must it bring frames of its own into
+A hidden stream must not take the frames of what is shown with it; nor must it bring its frames into
 the picture, or win a frame from a stream that is shown. Pure.
 """
 
@@ -13,7 +13,7 @@ from dataflow.view.frames import FrameTree, Matrix, Rank
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """A stream that is not shown says that a frame lies at `T_parent_child` (4×4) in `parent`."""
+    """The place of a frame by a stream that is not shown: `T_parent_child` (4×4) in `parent`."""
 
     parent: str
     T_parent_child: Matrix

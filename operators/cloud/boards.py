@@ -42,7 +42,7 @@ def with_contents(labels: Labels, points: Points, up: Array, core: int, fewest: 
     """Returns the labels (N,) of clusters, with new ones for the things in furniture.
 
     A large cluster is furniture where most of it lies in two or more surfaces that are level or upright and at right
-    angles to each other, one of them a board of `board` metres or more. What is left without them is clustered anew,
+    angles to each other, one of them a board of `board` metres or more. The remaining points are clustered anew,
     with the same reach and `core` as in `dbscan`; parts with `fewest` counts are things, all else stays furniture.
     """
     found = labels.copy()

@@ -40,7 +40,7 @@ class CloudFilter(Operator):
     upper: Corner | None = Param(None, doc="largest x, y, z of the box that is kept; no box if none", unit="m")
     voxel: float = Param(0.0, ge=0, live=True, doc="side of the voxels; 0 keeps all points", unit="m")
     outlier_neighbours: int = Param(
-        0, ge=0, le=200, live=True, doc="neighbours whose mean distance tells a statistical outlier; 0 removes none"
+        0, ge=0, le=200, live=True, doc="neighbours whose mean distance decides on statistical outliers; 0 removes none"
     )
     outlier_ratio: float = Param(
         2.0, gt=0, live=True, doc="standard deviations by which that distance may exceed the cloud's mean"

@@ -18,10 +18,10 @@ from operators.geometry.se3 import about_fixed_axes
 
 
 class CloudRegistration(Operator):
-    """Finds the rigid motion from a cloud to a target cloud of the same scene, or says that it failed, and why.
+    """Finds the rigid motion from a cloud to a target cloud of the same scene, or reports that it failed, and why.
 
-    Both clouds have their sensor at the origin of their frames: a motion is believed only where each sensor saw what
-    the other says, as far as it could, and where nothing hangs in what the other saw to be free. Clouds that share too
+    Both clouds have their sensor at the origin of their frames: a motion is accepted only where each sensor saw what
+    the other saw, as far as it could, and where nothing hangs in what the other saw to be free. Clouds that share too
     little, surfaces that leave a direction free, and two motions that explain the clouds as well are failures.
 
     Method: fast point feature histograms by Rusu, Blodow and Beetz, 2009; of their mutual matches those that agree, by

@@ -22,7 +22,7 @@ def unit(up: tuple[float, float, float]) -> Array:
 
 
 def told(pose: Pose | Odometry | None) -> bool:
-    """Tells whether there is a pose, and it is finite: one that is not tells nothing of up."""
+    """Returns whether there is a finite pose, without which up is unknown."""
     return pose is not None and bool(np.isfinite(pose.position).all() and np.isfinite(pose.orientation).all())
 
 
@@ -32,7 +32,7 @@ def gravity(
     """Returns up (3,) in the cloud's frame and the height of that frame's origin in the pose's frame, whose z is up.
 
     Without a finite pose they are `fallback` and 0. The pose may be of the cloud's own frame or of one that the
-    extrinsics relate to it; ValueError says where they do not.
+    extrinsics relate to it; ValueError where they do not.
     """
     T = standing(cloud, pose, extrinsics)
     return (fallback, 0.0) if T is None else (np.asarray(T[2, :3]), float(T[2, 3]))

@@ -1,4 +1,4 @@
-"""Planes along and across gravity in a cloud, by random sampling that knows which way is up.
+"""Planes along and across gravity in a cloud, by random sampling with a known direction of up.
 
 The up direction leaves one number open for a level plane and two for an upright one, so a sample is one point or two:
 few trials find every plane, and the noise of normals only decides who may vote. Fischler and Bolles, "Random sample
@@ -45,7 +45,7 @@ class Search:
     tilt: float
     """A plane leans by no more than this from level or upright."""
     gap: float
-    """Parts of a level plane farther apart than this are planes of their own."""
+    """Parts of a level plane farther apart than this are separate planes."""
     min_area: float
     """Smallest area that makes a plane, m²."""
     trials: int
@@ -79,7 +79,7 @@ class Scene:
 
     @classmethod
     def of_cloud(cls, cloud: NDArray[np.float32], up: Array, search: Search) -> Scene:
-        """`cloud` (N, 3) is finite, `up` (3,) a unit vector; `of` (N,) tells the voxel of each point."""
+        """`cloud` (N, 3) is finite, `up` (3,) a unit vector; `of` (N,) is the voxel of each point."""
         voxels = Voxels.by_size(cloud, search.voxel)
         points = voxels.means(cloud)
         normals = estimate_normals(points, neighbours=24, radius=6 * search.voxel, viewpoint=np.zeros(3))

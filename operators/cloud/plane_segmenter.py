@@ -28,7 +28,7 @@ _THICKNESS = 0.02  # metres, of a surface's box
 
 
 class PlaneSegmenter(Operator):
-    """Finds level and upright planes in a cloud and says which are floor, wall, table top or ceiling.
+    """Finds level and upright planes in a cloud and labels floor, wall, table top and ceiling.
 
     The cloud is in its sensor's frame. Up comes from `pose`, whose own frame has z up, else from the parameter `up`.
     The floor is the lowest level plane with next to nothing below it; its height is remembered, so that tables are
@@ -260,7 +260,7 @@ def _status(cloud: PointCloud, found: Mapping[str, int], floor_known: bool, lost
     if not floor_known:
         text += "; no floor so far, so level planes have no class"
     if lost:
-        text = "the pose is not finite, so nobody knows where up is, and no plane was looked for"
+        text = "the pose is not finite, so up is unknown, and no plane was looked for"
     level = Level.OK if found and floor_known else Level.WARN
     counts = {"points": cloud.count} | {name: found[name] for name in SURFACES}
     return counted_status("plane_segmenter", cloud.stamp, text, level, counts)

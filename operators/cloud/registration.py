@@ -78,7 +78,7 @@ class Registered:
     All but `rmse` (metres) is the worse of both directions: `overlap` is the share of a cloud that the other sensor
     should have seen, `fitness` the share of that which lies on the other cloud, `violation` the share of it that hangs
     in what the other sensor saw to be free, `agreement` the share that lies in the other cloud's surfaces. `settled`
-    tells whether the shared surfaces leave no direction free. `covariance` (6, 6) is of a right perturbation
+    is True where the shared surfaces leave no direction free. `covariance` (6, 6) is of a right perturbation
     (translation, rotation).
     """
 

@@ -53,7 +53,7 @@ def outlying(depth: Depth, size: int, ratio: float, deviations: float, support: 
 
     Such a pixel is farther from the window's median than `deviations` times the median deviation (scaled to a standard
     deviation) and than `ratio` of the depth, and fewer than `support` of its eight neighbours agree with it: edges and
-    thin things have neighbours of their own kind.
+    thin things have neighbours of the same kind.
     """
     w = inverse(depth)
     limit = np.float32(ratio) * w

@@ -30,9 +30,9 @@ LEAST_CONTRAST = 4.0  # standard deviation of grey levels below which an image s
 class MonoDepth(Operator):
     """Estimates which pixels of an image are near, with an ONNX model on one CPU thread; metric where depths are given.
 
-    One image tells no scale: `relative` is inverse depth up to a factor and a constant. Where `sparse` gives metric
+    One image has no scale: `relative` is inverse depth up to a factor and a constant. Where `sparse` gives metric
     depth at some pixels (a stereo pair's, a projected LiDAR's), both are fitted to it, robustly, image by image, and
-    `depth` is the whole image in metres; without agreement there is no `depth`, and `status` says so. An image that is
+    `depth` is the whole image in metres; without agreement no `depth`, and a warning in `status`. An image that is
     black or without contrast gives neither.
 
     The model takes one (1, 3, H, W) float32 input of RGB from 0 to 255 and gives one value per pixel, larger for

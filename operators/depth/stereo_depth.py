@@ -21,7 +21,7 @@ from operators.status import counted_status
 class StereoDepth(Operator):
     """Measures the depth of a rectified stereo pair at every pixel of the left image where both directions agree.
 
-    Pixels that only one camera sees, that look like others along their row, or that lie in small patches of their own
+    Pixels that only one camera sees, that look like others along their row, or that lie in small separate patches
     have no return. Depth is focal length times baseline over disparity; its error grows with its square. The images
     must be rectified: rows of the two correspond.
 

@@ -7,9 +7,7 @@ from dataflow.lazy import lazily
 if TYPE_CHECKING:
     from operators.detection.custom_detector import CustomDetector
     from operators.detection.drawing import draw_detections
-    from operators.detection.focus_detector import FocusDetector
     from operators.detection.onnx_detector import OnnxDetector
-    from operators.detection.reclassifier import Reclassifier
     from operators.detection.score_filter import ScoreFilter
     from operators.detection.torchvision_detector import TorchvisionDetector, TorchvisionRigDetector
 else:
@@ -18,9 +16,7 @@ else:
         {
             "custom_detector": ("CustomDetector",),
             "drawing": ("draw_detections",),
-            "focus_detector": ("FocusDetector",),
             "onnx_detector": ("OnnxDetector",),
-            "reclassifier": ("Reclassifier",),
             "score_filter": ("ScoreFilter",),
             "torchvision_detector": ("TorchvisionRigDetector", "TorchvisionDetector"),
         },
@@ -28,9 +24,7 @@ else:
 
 __all__ = [
     "CustomDetector",
-    "FocusDetector",
     "OnnxDetector",
-    "Reclassifier",
     "ScoreFilter",
     "TorchvisionDetector",
     "TorchvisionRigDetector",

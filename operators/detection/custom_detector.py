@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from dataflow.messages import Detections2D, Image
@@ -9,7 +12,7 @@ from dataflow.operator import In, Operator, Out, Param
 from operators.detection.custom.first_look import FirstLook
 from operators.detection.custom.refiner import Refiner
 from operators.network_input import three_channels
-from operators.weights import shipped
+from operators.weights import shipped, trained_in_simulation
 
 
 class CustomDetector(Operator):
@@ -32,6 +35,10 @@ class CustomDetector(Operator):
     score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes below are dropped")
     nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which a box of a class joins a stronger")
     max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
+
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        return trained_in_simulation(params["weights"] or shipped("detector.onnx"))
 
     def setup(self) -> None:
         """Loads the network. Raises FileNotFoundError or NetworkFileError."""

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.fit import FitMode
+from operators.image.letterbox import FitMode
 
 Size = tuple[int, int]
 """(width, height) in pixels."""
@@ -88,8 +88,28 @@ def decode_yolov8(outputs: Outputs, size: Size, threshold: float) -> Candidates:
     output = outputs[0]
     if output.ndim != 3 or output.shape[0] != 1 or output.shape[1] < 5:
         raise ValueError(f"a YOLOv8 output has shape (1, 4 + classes, N), got {output.shape}")
+    if output.shape[2] == 6 < output.shape[1]:
+        raise ValueError(f"{output.shape} is the output of an export with its suppression inside: decoder end2end")
+    if len(outputs) > 1 and outputs[1].ndim == 4:
+        raise ValueError(
+            f"outputs {output.shape} and {outputs[1].shape} are of a segmentation model, whose masks are not read: "
+            "export a model of the task detect"
+        )
     rows = output[0].T
     return _best_class(rows[:, :4], rows[:, 4:], threshold)
+
+
+def decode_end2end(outputs: Outputs, size: Size, threshold: float) -> Candidates:
+    """YOLOv10, YOLO26 and others exported with their suppression inside: (1, N, 6), corners in input pixels, score,
+    class."""
+    output = outputs[0]
+    if output.ndim != 3 or output.shape[0] != 1 or output.shape[2] != 6:
+        raise ValueError(f"an end-to-end output has shape (1, N, 6), got {output.shape}")
+    rows = output[0]
+    keep = rows[:, 4] >= threshold
+    return Candidates(
+        rows[keep, :4].astype(np.float32), rows[keep, 4].astype(np.float32), rows[keep, 5].astype(np.int32)
+    )
 
 
 def decode_ssd(outputs: Outputs, size: Size, threshold: float) -> Candidates:
@@ -131,12 +151,13 @@ def _ssd_pair(a: NDArray[Any], b: NDArray[Any]) -> bool:
     return bool(a.shape[1] == b.shape[1] and (a.shape[2] == 4) != (b.shape[2] == 4))
 
 
-DecoderName = Literal["fastestdet", "yolov5", "yolov8", "ssd", "torchvision"]
+DecoderName = Literal["fastestdet", "yolov5", "yolov8", "end2end", "ssd", "torchvision"]
 
 LAYOUTS: dict[DecoderName, Layout] = {
     "fastestdet": Layout(decode_fastestdet, bgr=True, fit="stretch", classes=lambda o: int(o[0].shape[1]) - 5),
     "yolov5": Layout(decode_yolov5, bgr=False, fit="letterbox", classes=lambda o: int(o[0].shape[2]) - 5),
     "yolov8": Layout(decode_yolov8, bgr=False, fit="letterbox", classes=lambda o: int(o[0].shape[1]) - 4),
+    "end2end": Layout(decode_end2end, bgr=False, fit="letterbox", classes=None),
     "ssd": Layout(
         decode_ssd,
         bgr=False,

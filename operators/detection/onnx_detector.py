@@ -10,8 +10,8 @@ from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.coco import COCO_CLASSES
 from operators.detection.decode import LAYOUTS, Candidates, DecoderName, Outputs
-from operators.detection.fit import Fit, FitMode
 from operators.detection.nms import class_wise_nms
+from operators.image.letterbox import Fit, FitMode
 from operators.inference import ModelError, Provider, open_session
 from operators.network_input import image_input, read_labels, three_channels
 

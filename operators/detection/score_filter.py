@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.some import rows_of
 
 
 class ScoreFilter(Operator):
@@ -33,7 +32,9 @@ class ScoreFilter(Operator):
         kept = detections.scores >= np.float32(self.min_score)
         if self.classes:
             kept &= self._wanted(detections.class_names)[detections.class_ids]
-        return rows_of(detections, kept)
+        return detections.replace(
+            **{name: value[kept] for name, value in detections.items() if isinstance(value, np.ndarray)}
+        )
 
     def _wanted(self, names: tuple[str, ...]) -> NDArray[np.bool_]:
         """Returns the class ids (C,) that are asked for."""

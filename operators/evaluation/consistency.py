@@ -54,7 +54,7 @@ def band(freedom: int) -> tuple[float, float]:
 
 
 def innovations(status: Diagnostics) -> Innovations:
-    """Returns what a filter's status tells of each sensor's innovations: the values `nis` and `freedom`."""
+    """Returns each sensor's innovations by a filter's status: the values `nis` and `freedom`."""
     found: Innovations = {}
     for k, name in enumerate(status.names):
         values = status.pairs(k)

@@ -32,7 +32,7 @@ class ConsistencyMetrics(Operator):
     whose variance is 0 or less (the height of a planar estimate) do not count; `planar` takes x, y and heading alone.
 
     With the status of the filter (EkfFusion's), the normalised innovations squared (NIS) of each sensor are judged the
-    same way: `nis` over freedom is 1 for a sensor that is as good as it says. Refused measurements are not in it.
+    same way: `nis` over freedom is 1 for a sensor with the right covariance. Refused measurements are not in it.
 
     Method: Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation", 2001, 5.4.
     """
@@ -40,7 +40,7 @@ class ConsistencyMetrics(Operator):
     estimate: In[Pose | Odometry] = In(doc="the poses to score, with covariance")
     ground_truth: Batch[Pose | Odometry] = Batch(doc="the true poses of the same child frame, in the same frame")
 
-    status: Sampled[Diagnostics] = Sampled(required=False, doc="the filter's status, which tells of innovations")
+    status: Sampled[Diagnostics] = Sampled(required=False, doc="the filter's status, with its innovations")
 
     planar: bool = Param(False, doc="score x, y and heading alone")
     apart: Duration = Param("1s", doc="time between samples that count as independent, for the band")

@@ -9,6 +9,7 @@ import numpy as np
 from dataflow.messages import Detections2D, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_points, yaw_of
 from dataflow.operator import Batch, In, Operator, Param, Sampled
+from operators.labels import LabelSpace, labels_file
 from operators.scene.scoring import NodeScore, PlainlySeen, RelationScore, score_nodes
 
 
@@ -16,7 +17,7 @@ class SceneGraphMetrics(Operator):
     """Counts which objects a scene graph has, and which relations, at every time at which the true graph is given.
 
     A node is an object where classes agree and the IoU of the upright boxes is `iou`. Objects count that were plainly
-    seen in several images; movers only while they are in view; others are ignored: neither a miss nor a false one. The
+    seen in several images; agents only while they are in view; others are ignored: neither a miss nor a false one. The
     graph's frame begins where its robot begins, the truth's in the world: both are brought together by where the robot
     was at the first graph, so what odometry loses later is in the figures. Node figures are those of the last graph,
     relations are over all.
@@ -32,9 +33,12 @@ class SceneGraphMetrics(Operator):
     visible: float = Param(0.6, ge=0, le=1, doc="share of an object that is visible where it is plainly seen")
     pixels: int = Param(200, ge=1, doc="and its pixels")
     images: int = Param(5, ge=1, doc="images in which an object is plainly seen that counts")
-    recent: float = Param(2.0, ge=0, doc="movers count that were in view so shortly before", unit="s")
+    recent: float = Param(2.0, ge=0, doc="agents count that were in view so shortly before", unit="s")
+    labels: str = Param("simulator", doc="label space: coco, simulator, or a YAML file; says which classes are agents")
 
     def setup(self) -> None:
+        """Raises FileNotFoundError or ValueError for a bad label space."""
+        self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._begin()
 
     def _begin(self) -> None:
@@ -61,7 +65,7 @@ class SceneGraphMetrics(Operator):
         if self._T_true_graph is None:
             self._T_true_graph = true_pose.matrix() @ invert(pose.matrix())
         mine = _moved(graph, self._T_true_graph)
-        must = self._seen.must(truth, self.recent)
+        must = self._seen.must(truth, self._labels, self.recent)
         self._last = score_nodes(mine, truth, must, self.iou)
         self._relations.add(mine, truth, self._last.match, must, self._last.ignored)
         self._graphs += 1

@@ -89,6 +89,19 @@ def match(estimate: Trajectory, truth: Trajectory, tolerance: int) -> Matches:
     )
 
 
+def few_matched(matches: Matches, estimate: Trajectory, truth: Trajectory, tolerance: int) -> str | None:
+    """Says why figures mean little where fewer than half of what could have a partner has one; None where enough
+    has."""
+    possible = min(len(estimate), len(truth))
+    if not possible or 2 * len(matches.estimate) >= possible:
+        return None
+    spans = [f"{t.stamps[0] * 1e-9:.3f} to {t.stamps[-1] * 1e-9:.3f} s" for t in (estimate, truth)]
+    return (
+        f"only {len(matches.estimate):,} of {possible:,} poses have a partner within {tolerance * 1e-6:g} ms: stamps "
+        f"of the estimate run from {spans[0]}, of the truth from {spans[1]}"
+    )
+
+
 def align(
     points: NDArray[np.float64], onto: NDArray[np.float64], *, scaled: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:

@@ -15,6 +15,7 @@ from operators.evaluation.trajectory import (
     PoseLog,
     Trajectory,
     absolute_error,
+    few_matched,
     match,
     path_length,
     relative_errors,
@@ -86,6 +87,8 @@ class TrajectoryMetrics(Operator):
             "path_m": path_length(matches.truth),
             "alignment": self.alignment,
         }
+        if (text := few_matched(matches, estimate, truth, self.tolerance)) is not None:
+            self._figures["matching"] = text
         if self._truths_not_finite:
             self._figures["truths_not_finite"] = self._truths_not_finite
         try:

@@ -32,7 +32,7 @@ class TrajectoryPlots(Operator):
 
     estimate: In[Pose | Odometry] = In(doc="the poses to score")
     ground_truth: Batch[Pose | Odometry] = Batch(doc="the true poses of the same child frame, not later than they are")
-    status: Sampled[Diagnostics] = Sampled(required=False, doc="the filter's status, which tells of innovations")
+    status: Sampled[Diagnostics] = Sampled(required=False, doc="the filter's status, with its innovations")
     error: Out[Number] = Out(doc="distance from the true position, m")
     turn: Out[Number] = Out(doc="angle from the true orientation, degrees")
     nees: Out[Number] = Out(doc="normalised error squared of the pose, over its degrees of freedom")

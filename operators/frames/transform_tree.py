@@ -17,7 +17,7 @@ _MAY_STILL_COME = ("unknown frame", "not connected", "too late")
 
 
 class TransformTree(Operator, merge=True):
-    """Joins fixed and moving transforms into one tree, and tells where one frame is in another at the stamps asked for.
+    """Joins fixed and moving transforms into one tree, and gives the pose of one frame in another when asked.
 
     A pose is asked for at the stamp of every message of `at`, and answered as soon as all transforms on the way are
     known at that stamp or after it: between two stamps they are interpolated on SE(3), at a constant twist. One answer

@@ -26,7 +26,7 @@ from dataflow.operator import Context, In, Operator, Out, Param, Sampled
 from operators.fusion.constraints import Constraints
 from operators.fusion.control import Command
 from operators.fusion.covariances import Unusable
-from operators.fusion.error_state import POSITION, Noise
+from operators.fusion.error_state import Noise
 from operators.fusion.filter_history import Measurement
 from operators.fusion.imu_dropout import ImuDropout
 from operators.fusion.inertial import InertialConfig, InertialSensor
@@ -34,7 +34,7 @@ from operators.fusion.initialisation import Prior, coasting_node, prior_of
 from operators.fusion.last_measurements import LastMeasurements
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.lever_arms import LeverArms
-from operators.fusion.output import diagnostics, figures, odometry_of
+from operators.fusion.output import diagnostics, figures, odometry_of, unmeasured, well_known
 from operators.fusion.sensor_settings import SensorSettings, errors_of, name_of, never_yields, unheard, use_of
 from operators.fusion.sensors import Surroundings, measurements, turning
 
@@ -328,7 +328,7 @@ class EkfFusion(Operator):
     def _odometry(self, stamp: int) -> Odometry | None:
         assert self._filter is not None
         state, rate = self._filter.estimate(stamp)
-        self._sure = self._sure or float(np.diag(state.covariance)[POSITION].max()) < self.sure**2
+        self._sure = self._sure or well_known(state.covariance, self.sure)
         if not self._sure:
             return None
         T_body_base = self._lever_arms.of(self.base_frame)
@@ -341,6 +341,7 @@ class EkfFusion(Operator):
         self._reported = stamp
         ignored = self._ignored + self._filter.ignored
         unused = {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
+        unused |= unmeasured(self._filter.estimate(stamp)[0].covariance)
         if self._dropout.lasts(stamp):
             unused["inertial sensor"] = "silent: the motion is bridged by what others see"
         return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, self._offsets(), unused)

@@ -18,6 +18,26 @@ Array = NDArray[np.float64]
 _I3 = np.eye(3)
 
 
+UNMEASURED = 500.0
+"""Standard deviation of a coordinate (m) that nothing has measured yet: half of what it begins with."""
+
+
+def well_known(covariance: Array, sigma: float) -> bool:
+    """Tells whether the position is known to `sigma` (m): its horizontal coordinates, and the height where anything
+    measures it."""
+    variances = np.diag(covariance)[POSITION]
+    measured = variances < UNMEASURED**2
+    return bool(measured[:2].all() and variances[measured].max() < sigma**2)
+
+
+def unmeasured(covariance: Array) -> dict[str, str]:
+    """Returns a warning where the height is of no use, since nothing has measured it."""
+    x, y, z = np.sqrt(np.diag(covariance)[POSITION])
+    if z < UNMEASURED or max(x, y) >= UNMEASURED:
+        return {}
+    return {"height": "nothing measures it (fixes without altitude): z of the odometry has no meaning"}
+
+
 def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame: str, child_frame: str) -> Odometry:
     """Returns pose and velocity of the base; `rate` is the gyroscope's reading (3,)."""
     R, lever, turn = state.rotation, T_body_base[:3, 3], T_body_base[:3, :3]

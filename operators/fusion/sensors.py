@@ -96,6 +96,7 @@ def _fix(name: str, fix: NavSatFix, settings: SensorSettings, around: Surroundin
     place = east_north_up(fix.latitude, fix.longitude, fix.altitude if high else around.origin[2], around.origin)
     if not high:
         place[2] = np.nan
+        around.ignored[f"{name}: altitude, which it does not give"] += 1
     known = np.isfinite(place)
     noise = white_part(covariance_of(name, fix.covariance, settings.sigma, "sigma"), settings.drift)
     return Position(place, around.place(fix.frame)[:3, 3]), noise[np.ix_(known, known)]

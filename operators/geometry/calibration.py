@@ -8,7 +8,7 @@ from dataflow.messages import CameraInfo, DepthImage, Image
 
 
 def told_again(known: CameraInfo | None, given: CameraInfo) -> bool:
-    """Tells whether a calibration says what is known already, whatever its stamp: many cameras send it with each image.
+    """Returns whether a calibration repeats the known one, whatever its stamp: many cameras send it with each image.
 
     None is known of nothing.
     """

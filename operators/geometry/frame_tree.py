@@ -168,7 +168,7 @@ def _check_finite(frame: str, child: str, T_frame_child: Matrix) -> None:
 
 
 def told_by(message: Transforms | Pose | Odometry) -> list[tuple[str, str, Matrix]]:
-    """Returns the transforms (parent, child, T_parent_child) that a message tells; a pose without child tells none."""
+    """Returns the transforms (parent, child, T_parent_child) of a message; a pose without child has none."""
     if isinstance(message, Transforms):
         return list(zip(message.frames, message.child_frames, message.matrices(), strict=True))
     return [(message.frame, message.child_frame, message.matrix())] if message.child_frame else []

@@ -10,7 +10,7 @@ from operators.geometry.pinhole import Pixels, Points
 from operators.geometry.se3 import Matrix
 
 CONFIDENCE = 0.999
-FEWEST = 5  # points: three give a pose, a fourth tells which of four it is, and the next is the first to confirm it
+FEWEST = 5  # points: three give a pose, a fourth decides which of four it is, and the next is the first to confirm it
 
 
 def agreed_pose(

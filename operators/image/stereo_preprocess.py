@@ -43,7 +43,7 @@ class StereoPreprocess(Operator):
 
     Where both calibrations hold P, those say how, with R where they turn; else the pair is rectified by `extrinsics`.
     Pixels that need not be sampled again pass bit for bit. Where the rectified cameras look elsewhere than the raw ones
-    their frames have names of their own; `frames` tells how they are turned.
+    their frames have new names; `frames` holds their rotations.
 
     Method: Bouguet's, as in Bradski and Kaehler, "Learning OpenCV", 2008.
     """
@@ -63,7 +63,7 @@ class StereoPreprocess(Operator):
     status: Out[Diagnostics] = Out(doc="the baseline; pixels that show nothing; a warning where half do not")
 
     keep: float = Param(
-        0.0, ge=0, le=1, doc="0 shows no pixel without image, 1 every pixel of the raw images; unless P says"
+        0.0, ge=0, le=1, doc="0 shows no pixel without image, 1 every pixel of the raw images; without P"
     )
     crop: tuple[int, int, int, int] | None = Param(
         None, doc="x, y, width and height of the part that is kept of both", unit="px"

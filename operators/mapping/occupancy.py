@@ -41,7 +41,7 @@ class GridSettings:
 class ColumnGrid:
     """Log-odds of occupancy in cubes of the map frame: columns over the cells of the floor, cut into slices.
 
-    A ray over a table says nothing of the table, so heights are kept apart until the grid is asked for its plan. Cubes
+    A ray over a table does not observe the table, so heights are kept apart until the grid is asked for its plan. Cubes
     that no ray has met are NaN. Moravec and Elfes, "High resolution maps from wide angle sonar", 1985; bounds and one
     change per cube and scan as in Hornung et al., "OctoMap", 2013.
     """

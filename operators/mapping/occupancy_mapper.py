@@ -34,7 +34,7 @@ class OccupancyMapper(Operator):
         required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
     )
     map: Out[OccupancyGrid] = Out(doc="the map so far: 0 free, 100 taken, -1 unknown")
-    status: Out[Diagnostics] = Out(doc="points and cells; a warning for a cloud or a pose that tells nothing")
+    status: Out[Diagnostics] = Out(doc="points and cells; a warning for a cloud or a pose that is unusable")
 
     resolution: float = Param(0.05, gt=0.005, doc="side of a cell", unit="m")
     layer: float = Param(

@@ -51,7 +51,7 @@ class TsdfMap(Operator):
     )
     mesh: Out[Mesh] = Out(doc="the surface so far, with normals and, where images came, colours")
     cloud: Out[PointCloud] = Out(doc="the vertices of the mesh")
-    status: Out[Diagnostics] = Out(doc="voxels told of, and blocks; a warning for an image that tells nothing")
+    status: Out[Diagnostics] = Out(doc="observed voxels, and blocks; a warning for an unusable image")
 
     voxel: float = Param(0.03, gt=0.002, doc="side of a voxel", unit="m")
     truncation: float = Param(3.0, ge=1, doc="voxels before and behind a surface that are told of")

@@ -12,22 +12,21 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Activity, Boxes3D, Classification, Odometry, Pose, SceneGraph
 from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.labels import LabelSpace, labels_file
 from operators.recognition.activity_model import ActivityModel
 from operators.recognition.activity_samples import STEP
-from operators.recognition.agent_features import AGENTS, DRINKS, AgentWindow, Surroundings
-from operators.recognition.in_hand import Hand, drinking
+from operators.recognition.agent_features import AgentWindow, Surroundings
 from operators.recognition.looks import Looks
-from operators.recognition.possible import possible
 from operators.recognition.scene_agents import mattering, seen_times
 from operators.scene.agents import UNKNOWN
 from operators.scene.bodies import Body
-from operators.weights import shipped
+from operators.weights import shipped, trained_in_simulation
 
 
 @dataclass
 class _Agent:
-    """State of one agent: its recent past, the network's state (2, L, W), what it does, since when (ns), its hand, and
-    the last looks at its posture.
+    """State of one agent: its recent past, the network's state (2, L, W), what it does, since when (ns), and the last
+    looks at its posture.
 
     `stepped` is the time (ns) of the graph whose step is the last in the state, None where there is none.
     """
@@ -37,7 +36,6 @@ class _Agent:
     stepped: int | None
     activity: str
     since: int
-    hand: Hand
     looks: Looks
 
 
@@ -51,10 +49,6 @@ class ActivityRecognizer(Operator):
 
     Where the postures of people are given, too, what they look like counts beside what the network says: the product of
     both, since they see different things.
-
-    What motion and surroundings exclude is not said: nobody sits down or stands up away from every seat, and a robot
-    that moves does not rest. Who has reached for a drink has it in hand for a while: one who then seems to stand
-    drinks, unless the drink is seen where it lay.
 
     Persons stand, walk, sit down, sit, stand up, reach or drink; balls roll or rest; robots drive or rest. Method:
     Hochreiter and Schmidhuber, "Long short-term memory", 1997; trained on simulated people (`dataflow train activity`).
@@ -72,14 +66,20 @@ class ActivityRecognizer(Operator):
     activities: Out[Activity] = Out(doc="a row an agent: activity, probabilities, what it is done to, since when")
 
     weights: str | None = Param(None, doc="network file of `dataflow train activity`; none means the shipped one")
+    labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives the roles of classes")
     least: float = Param(0.35, ge=0, lt=1, live=True, doc="probability below which an activity is unknown")
     posture: float = Param(1.0, ge=0, live=True, doc="how much postures count beside the network; 0 for not at all")
     memory: float = Param(1.5, ge=0, doc="time out of sight after which an activity is unknown", unit="s")
+
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        return trained_in_simulation(params["weights"] or shipped("activity.onnx"))
 
     def setup(self) -> None:
         """Opens the network. Raises FileNotFoundError or NetworkFileError."""
         file = self.use_file(str(shipped("activity.onnx")) if self.weights is None else self.weights)
         self._model = ActivityModel.open(file)
+        self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._classes = (*self._model.classes, UNKNOWN)
         self._counts: Counter[str] = Counter()
         self._begin()
@@ -99,11 +99,11 @@ class ActivityRecognizer(Operator):
         if robot is not None and robot.frame != nodes.frame:
             raise ValueError(f"the robot is in {robot.frame!r}, the nodes in {nodes.frame!r}")
         same = objects is not None and (objects.stamp, objects.frame) == (nodes.stamp, nodes.frame)
-        bodies, unusable = mattering(nodes, objects if same else None)
+        bodies, unusable = mattering(nodes, self._labels, objects if same else None)
         seen = seen_times(nodes)
         time = nodes.stamp * 1e-9
         self._around.update(time, bodies)
-        agents = sorted((b for b in bodies if b.label in AGENTS), key=lambda b: b.id)
+        agents = sorted((b for b in bodies if b.agent), key=lambda b: b.id)
         self._agents = {b.id: self._agents.get(b.id) or self._fresh(nodes.stamp) for b in agents}
         here = None if robot is None else robot.matrix()[:2, 3]
         looks = self._looks(postures) if postures is not None and postures.stamp == nodes.stamp else {}
@@ -114,8 +114,7 @@ class ActivityRecognizer(Operator):
             self._agents[body.id].looks.update(time, looks.get(body.id))
             vectors.append(window.vector(body, (nodes.stamp - seen[body.id]) * 1e-9, self._around, here))
         self._counts.update({"graphs": 1, "agents": len(agents), "unusable nodes": unusable})
-        drinks = {b.id: (b, seen[b.id] * 1e-9) for b in bodies if b.label in DRINKS}
-        return self._answer(nodes.stamp, agents, vectors, seen, drinks)
+        return self._answer(nodes.stamp, agents, vectors, seen)
 
     def on_reset(self, input: str) -> None:
         """The clock behind an input began anew: so do all agents."""
@@ -123,7 +122,7 @@ class ActivityRecognizer(Operator):
 
     def snapshot(self) -> Mapping[str, Any]:
         agents = [
-            [i, a.window.snapshot(), a.state, a.stepped, a.activity, a.since, a.hand.snapshot(), a.looks.snapshot()]
+            [i, a.window.snapshot(), a.state, a.stepped, a.activity, a.since, a.looks.snapshot()]
             for i, a in self._agents.items()
         ]
         return {"agents": agents, "around": self._around.snapshot(), "counts": dict(self._counts)}
@@ -131,10 +130,9 @@ class ActivityRecognizer(Operator):
     def restore(self, state: Mapping[str, Any]) -> None:
         self._begin()
         self._around.restore(state["around"])
-        for id, window, network, stepped, activity, since, hand, looks in state["agents"]:
+        for id, window, network, stepped, activity, since, *_, looks in state["agents"]:  # once there was more
             agent = self._fresh(int(since))
             agent.window.restore(window)
-            agent.hand.restore(hand)
             agent.looks.restore(looks)
             agent.state, agent.stepped = np.array(network, np.float32), None if stepped is None else int(stepped)
             agent.activity = str(activity)
@@ -146,7 +144,7 @@ class ActivityRecognizer(Operator):
         return dict(self._counts)
 
     def _fresh(self, stamp: int) -> _Agent:
-        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, Hand(), Looks())
+        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, Looks())
 
     def _looks(self, postures: Classification) -> dict[int, NDArray[np.float32]]:
         """Returns what each posture speaks for, by ids: probabilities (C,) of our activities.
@@ -162,20 +160,13 @@ class ActivityRecognizer(Operator):
         return dict(zip(postures.ids.tolist(), rows, strict=True))
 
     def _answer(
-        self,
-        stamp: int,
-        agents: list[Body],
-        vectors: list[NDArray[np.float32]],
-        seen: Mapping[int, int],
-        drinks: Mapping[int, tuple[Body, float]],
+        self, stamp: int, agents: list[Body], vectors: list[NDArray[np.float32]], seen: Mapping[int, int]
     ) -> Activity:
         probabilities = np.zeros((len(agents), len(self._classes)), np.float32)
         objects = np.full(len(agents), -1, np.int64)
         if agents:
             states = np.stack([self._agents[b.id].state for b in agents])
-            features = np.stack(vectors)
-            probabilities[:, :-1], states = self._model.step(features, states)
-            probabilities[:, :-1] *= possible(features, self._classes[:-1])
+            probabilities[:, :-1], states = self._model.step(np.stack(vectors), states)
             for k, body in enumerate(agents):
                 evidence = self._agents[body.id].looks.evidence(self.posture)
                 if evidence is not None:
@@ -187,8 +178,6 @@ class ActivityRecognizer(Operator):
             if agent.stepped is None or stamp - agent.stepped >= STEP * 1e9:
                 agent.state, agent.stepped = states[k], stamp
             fresh = stamp - seen[body.id] <= self.memory * 1e9
-            if self._holds(stamp, body, self._likeliest(probabilities[k], fresh), drinks):
-                probabilities[k, :-1] = drinking(probabilities[k, :-1], self._classes[:-1])
             activity = self._likeliest(probabilities[k], fresh)
             self._counts["unknown"] += activity == UNKNOWN
             if activity != agent.activity:
@@ -213,10 +202,3 @@ class ActivityRecognizer(Operator):
     def _likeliest(self, probabilities: NDArray[np.float32], fresh: bool) -> str:
         best = int(probabilities.argmax())
         return self._classes[best] if fresh and probabilities[best] >= self.least else UNKNOWN
-
-    def _holds(self, stamp: int, body: Body, activity: str, drinks: Mapping[int, tuple[Body, float]]) -> bool:
-        """Tells whether a person who seems to do something has a drink in hand."""
-        if body.label != "person" or "drinking" not in self._classes:
-            return False
-        reached = self._around.object_of(activity, body) if activity == "reaching" else -1
-        return self._agents[body.id].hand.update(stamp * 1e-9, activity, reached, drinks)

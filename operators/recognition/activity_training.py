@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from operators.learning.balance import class_weights
+from operators.learning.export import export_steps
 from operators.recognition.activity_network import LAYERS, ActivityNetwork, ActivityStep
 from operators.recognition.activity_samples import (
     LAG,
@@ -27,8 +29,7 @@ from operators.recognition.agent_features import NAMES
 from operators.recognition.episodes import Episode
 from operators.recognition.sensed_people import SensedTrack
 from operators.simulator.classes import ACTIVITIES
-from operators.training.balance import class_weights
-from operators.training.export import export_steps
+from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 KIND = "activity"
 TOLERANCE = 0.5
@@ -159,6 +160,7 @@ class ActivityTask:
             "lag": LAG,
             "training_episodes": self._episodes,
             "sensed_tracks": self._sensed,
+            TRAINED_ON: SIMULATOR,
             **facts,
         }
         step = ActivityStep(copy.deepcopy(network).cpu())

@@ -18,19 +18,15 @@ Array = NDArray[np.float64]
 WINDOW = 2.5
 """Seconds of the past from which motion is taken; what was before is in the state of the network."""
 
-AGENTS = ("person", "robot", "ball")
-RIGID = ("robot", "ball")
-"""Agents whose velocity in the map is told from few views; that of a person is mostly of limbs and of what hides."""
-SEATS, TABLES, DRINKS = ("chair",), ("table",), ("mug", "bottle")
-MATTERING = frozenset((*AGENTS, *SEATS, *TABLES, *DRINKS))
-"""Classes that features are made of; others change nothing."""
+MATTERING: frozenset[str] = frozenset(("agent", "seat", "support", "drink"))
+"""Roles of the classes that features are made of; others change nothing."""
 _SHORT, _LONG = 0.6, 1.6
 _BEFORE = 0.5  # seconds before its first look at which an agent is put by its velocity
 FAR = 3.0  # metres at which things are as good as not there
 _REACH = 1.2  # metres up to which something is done to a thing
 
 NAMES = (
-    *(f"is a {name}" for name in AGENTS),
+    *("is a person", "is a robot", "is a ball"),
     *("time known", "time since seen", "time step", "distance of the robot"),
     *("height of the top", "height of the bottom", "longer side", "shorter side", "height"),
     *("top below its highest", "top above its lowest", "longer side over its least", "shorter side over its least"),
@@ -66,8 +62,7 @@ class Surroundings:
 
     def update(self, time: float, things: Sequence[Body]) -> None:
         """Takes all things of one time, agents among them."""
-        groups = {"seat": SEATS, "table": TABLES, "drink": DRINKS}
-        self._now = {g: [b for b in things if b.label in labels] for g, labels in groups.items()}
+        self._now = {role: [b for b in things if role in b.roles] for role in ("seat", "support", "drink")}
         there = {b.id for b in self._now["drink"]}
         self._pasts = {i: past for i, past in self._pasts.items() if i in there}
         self._lowest = {i: z for i, z in self._lowest.items() if i in there}
@@ -124,7 +119,7 @@ class Surroundings:
         return away / FAR, closing, now.top - seat.bottom - 1.0, along
 
     def _table(self, now: Look, before: Look) -> tuple[float, float, float]:
-        apart, table = min(((_outside(b, now.center), b.id, b) for b in self._now["table"]), default=(FAR, 0, None))[
+        apart, table = min(((_outside(b, now.center), b.id, b) for b in self._now["support"]), default=(FAR, 0, None))[
             ::2
         ]
         if table is None or apart >= FAR:
@@ -161,7 +156,7 @@ class AgentWindow:
         """Takes where the agent is; times rise. The velocity of a rigid one that is new tells where it was before."""
         if self._looks:
             self._step = time - self._looks[-1].time
-        elif body.label in RIGID and body.velocity.any():
+        elif not body.person and body.velocity.any():  # that of a person is mostly of limbs and of what hides
             gone = _BEFORE * body.velocity * (1, 1, 0)
             self._looks.append(Look(time - _BEFORE, body.center - gone, body.size.copy()))
         self._begun = time if self._begun is None else self._begun
@@ -184,7 +179,7 @@ class AgentWindow:
         fast_long, rise_long = _slope(long)
         apart = 0.5 if robot is None else min(_flat(robot - now.center[:2]), 8.0) / 8
         values = [
-            *(float(body.label == name) for name in AGENTS),
+            *map(float, (body.person, not (body.person or "rolls" in body.roles), "rolls" in body.roles)),
             min(now.time - begun, 5.0) / 5, min(unseen, 3.0) / 3, min(self._step, 1.0), apart,
             now.top, body.bottom, float(sides[1]), float(sides[0]), float(now.size[2]),
             heights[1] - now.top, now.top - heights[0],

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, Image
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.network_input import three_channels
 
 MARGIN = 0.05

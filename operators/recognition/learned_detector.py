@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from operators.network_input import three_channels
 from operators.recognition.learned_object import LEAST, PROPOSALS, LearnedObject, LearnedObjectError
 from operators.recognition.proposals import F32, Glance, Trunk
 from operators.scene.map_file import learned_files, together
-from operators.weights import open_network, shipped
+from operators.weights import open_network, shipped, trained_in_simulation
 
 _MAYBE, _STEPS = 0.003, 2  # probability from which a box is drawn to the outline, and how often that is repeated
 
@@ -47,6 +48,10 @@ class LearnedDetector(Operator):
     learned_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="and those of learned ones")
     nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped")
     max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
+
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        return trained_in_simulation(params["weights"] or shipped("detector.onnx"))
 
     def setup(self) -> None:
         """Loads network and objects. Raises FileNotFoundError, NetworkFileError or LearnedObjectError."""

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from operators.training.backbone import IMAGENET_MEAN, IMAGENET_STD
+from operators.learning.backbone import IMAGENET_MEAN, IMAGENET_STD
 
 Architecture = Literal["plain", "residual"]
 FEATURES = 256

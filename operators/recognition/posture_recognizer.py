@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from dataflow.messages import Boxes3D, Classification, Clusters, Odometry, PointCloud, Pose, SceneGraph, Transforms
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
+from operators.labels import LabelSpace, labels_file
 from operators.recognition.posture_model import PostureModel
 from operators.recognition.scene_agents import seen_times
 from operators.recognition.silhouette import silhouette
-from operators.weights import shipped
+from operators.weights import shipped, trained_in_simulation
 
 F32 = NDArray[np.float32]
 
-_PERSON = "person"
 _LEAST = 10  # points of a person
 _APART = 0.5  # metres on the ground between a node and the points that are of it
 
@@ -47,11 +47,17 @@ class PostureRecognizer(Operator):
     postures: Out[Classification] = Out(doc="probabilities of what each person in view does, by the ids of the nodes")
 
     weights: str | None = Param(None, doc="network file of `dataflow train posture`; none means the shipped one")
+    labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives the roles of classes")
+
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        return trained_in_simulation(params["weights"] or shipped("posture.onnx"))
 
     def setup(self) -> None:
         """Opens the network. Raises FileNotFoundError or NetworkFileError."""
         file = self.use_file(str(shipped("posture.onnx")) if self.weights is None else self.weights)
         self._model = PostureModel.open(file)
+        self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._counts: Counter[str] = Counter()
 
     def process(
@@ -70,7 +76,7 @@ class PostureRecognizer(Operator):
         fresh = nodes.stamp == cloud.stamp == clusters.stamp == boxes.stamp
         if fresh:
             T_world_cloud = pose.matrix() @ transform_between(extrinsics, cloud.frame, pose.child_frame)
-            found = _silhouettes(nodes, boxes, clusters, cloud, T_world_cloud)
+            found = _silhouettes(nodes, boxes, clusters, cloud, T_world_cloud, self._labels)
         self._counts.update({"graphs": 1, "persons": len(found), "without a look of their own": int(not fresh)})
         names = self._model.classes
         probabilities = np.zeros((0, len(names)), np.float32)
@@ -98,10 +104,15 @@ class PostureRecognizer(Operator):
 
 
 def _silhouettes(
-    nodes: SceneGraph, boxes: Boxes3D, clusters: Clusters, cloud: PointCloud, T_world_cloud: NDArray[np.float64]
+    nodes: SceneGraph,
+    boxes: Boxes3D,
+    clusters: Clusters,
+    cloud: PointCloud,
+    T_world_cloud: NDArray[np.float64],
+    space: LabelSpace,
 ) -> list[tuple[int, F32]]:
     """Returns ids and silhouettes of the persons among the nodes that the look shows."""
-    persons = [k for k, label in enumerate(boxes.labels()) if label == _PERSON and k < clusters.count]
+    persons = [k for k, label in enumerate(boxes.labels()) if "person" in space.roles(label) and k < clusters.count]
     if not persons:
         return []
     finite = np.isfinite(cloud.points).all(axis=1)
@@ -113,7 +124,7 @@ def _silhouettes(
     found = []
     for row, (id, of) in enumerate(zip(nodes.ids.tolist(), nodes.class_ids.tolist(), strict=True)):
         label = nodes.class_names[of] if nodes.class_names else ""
-        if label != _PERSON or seen[id] != nodes.stamp or not middles:
+        if "person" not in space.roles(label) or seen[id] != nodes.stamp or not middles:
             continue
         place, size = nodes.positions[row], nodes.sizes[row]
         if not (np.isfinite(place).all() and np.isfinite(size).all()):

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from operators.learning.balance import class_weights
+from operators.learning.export import export_rows
 from operators.recognition.posture_data import POSTURES, Postures
 from operators.recognition.posture_model import KIND
 from operators.recognition.posture_network import DeployedPosture, PostureNetwork
 from operators.recognition.silhouette import HALF, MIDDLE, SIDE
-from operators.training.balance import class_weights
-from operators.training.export import export_rows
+from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 F32 = NDArray[np.float32]
 
@@ -79,6 +80,7 @@ class PostureTask:
             "half": HALF,
             "middle": MIDDLE,
             "training_silhouettes": self.samples,
+            TRAINED_ON: SIMULATOR,
             **facts,
         }
         example = {"silhouettes": torch.zeros(2, 3, SIDE, SIDE)}

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.custom.decode import decode_grid
-from operators.detection.fit import Fit
 from operators.detection.nms import class_wise_nms
+from operators.image.letterbox import Fit
 from operators.inference import open_session
 from operators.weights import NetworkFileError, open_network
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Boxes3D, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import yaw_of
-from operators.recognition.agent_features import AGENTS, MATTERING
+from operators.labels import LabelSpace
+from operators.recognition.agent_features import MATTERING
 from operators.recognition.tracked_people import Moment
 from operators.scene.bodies import Body
 
@@ -20,20 +21,21 @@ def seen_times(nodes: SceneGraph) -> dict[int, int]:
     return dict(zip(nodes.ids.tolist(), times.tolist(), strict=True))
 
 
-def mattering(nodes: SceneGraph, objects: Boxes3D | None = None) -> tuple[list[Body], int]:
+def mattering(nodes: SceneGraph, labels: LabelSpace, objects: Boxes3D | None = None) -> tuple[list[Body], int]:
     """Returns the nodes that features are made of as upright bodies, and how many of these are not usable.
 
     `objects` are boxes of the same ids that tell how fast the nodes are; without, all are taken to be still.
     """
-    labels = [nodes.class_names[c] if nodes.class_names else "" for c in nodes.class_ids.tolist()]
-    rows = [k for k, label in enumerate(labels) if label in MATTERING and nodes.ids[k] > 0]
+    names = [nodes.class_names[c] if nodes.class_names else "" for c in nodes.class_ids.tolist()]
+    roles = {name: labels.roles(name) for name in set(names)}
+    rows = [k for k, name in enumerate(names) if roles[name] & MATTERING and nodes.ids[k] > 0]
     finite = np.isfinite(nodes.positions).all(axis=1) & np.isfinite(nodes.sizes).all(axis=1)
     usable = np.asarray(finite & (nodes.sizes >= 0).all(axis=1), bool)
     yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
     velocities, still = _velocities(objects), np.zeros(3)
     bodies = [
-        Body(id, labels[k], nodes.positions[k], nodes.sizes[k], float(yaws[k]), velocities.get(id, still), agent)
-        for k, id, agent in ((k, int(nodes.ids[k]), labels[k] in AGENTS) for k in rows)
+        Body(i, name, nodes.positions[k], nodes.sizes[k], float(yaws[k]), velocities.get(i, still), roles[name])
+        for k, i, name in ((k, int(nodes.ids[k]), names[k]) for k in rows)
         if usable[k]
     ]
     return bodies, len(rows) - len(bodies)
@@ -50,11 +52,12 @@ def _velocities(objects: Boxes3D | None) -> dict[int, NDArray[np.float64]]:
 def scene_moments(
     graphs: Sequence[SceneGraph],
     robots: Sequence[Pose | Odometry],
+    labels: LabelSpace,
     objects: Sequence[Boxes3D | None] = (),
 ) -> Iterator[Moment]:
     """Yields scene graphs, with the robot at each, as the recogniser takes them; a row is the number of the graph."""
     for row, (nodes, robot) in enumerate(zip(graphs, robots, strict=True)):
-        bodies, _ = mattering(nodes, objects[row] if len(objects) else None)
+        bodies, _ = mattering(nodes, labels, objects[row] if len(objects) else None)
         seen = seen_times(nodes)
         unseen = {b.id: (nodes.stamp - seen[b.id]) * 1e-9 for b in bodies if b.agent}
         yield Moment(nodes.stamp * 1e-9, tuple(bodies), unseen, robot.matrix()[:2, 3], row)

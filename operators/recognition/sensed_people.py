@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Boxes3D, Odometry, Pose, SceneGraph
 from operators.recognition.activity_samples import LAG, STEP, sequences
-from operators.recognition.agent_features import AGENTS
 from operators.recognition.scene_agents import scene_moments
+from operators.recognition.tracked_people import simulated_labels
 from operators.scene.scoring import boxes_of
 
 _NEAR = 1.0  # metres on the ground between a node and the agent that it is of
@@ -50,7 +50,7 @@ def sensed_tracks(
     """
     of = [nearest_agents(graph, truth) for graph, truth in zip(graphs, truths, strict=True)]
     times = np.array([truth.stamp for truth in truths]) * 1e-9
-    moments = list(scene_moments(graphs, robots, objects))
+    moments = list(scene_moments(graphs, robots, simulated_labels(), objects))
     agents = sorted({body for moment in moments for body in moment.unseen})
     found = []
     for track in sequences(iter(moments), agents):
@@ -81,7 +81,7 @@ def nearest_agents(graph: SceneGraph, truth: SceneGraph) -> dict[int, int]:
         (float(np.hypot(*(mine[m][0] - true[t][0])[:2])), m, t)
         for m in mine
         for t in true
-        if m > 0 and labels[m] == names[t] and labels[m] in AGENTS
+        if m > 0 and labels[m] == names[t] and "agent" in simulated_labels().roles(labels[m])
     )
     of: dict[int, int] = {}
     for away, m, t in rows:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.labels import LabelSpace, labels_file
 from operators.recognition.agent_features import MATTERING
 from operators.recognition.episodes import Episode
 from operators.scene.bodies import Body
@@ -20,6 +23,14 @@ _RANGE = 6.5  # metres
 _FOCAL, _HALF_WIDTH, _HALF_HEIGHT = 0.85 * 640, 320.0, 240.0
 _USUAL = np.array([0.5, 0.59])  # sides of a person of whom one side was seen, metres
 _STILL = np.zeros(3)
+_LOST = {"drink": 0.6, "seat": 0.3, "support": 0.25}  # shares of things of these roles that maps lack at worst
+_LOST_ELSE = 0.2
+
+
+@lru_cache(maxsize=1)
+def simulated_labels() -> LabelSpace:
+    """Returns the label space of the simulated worlds, which episodes are of."""
+    return LabelSpace.read(Path(labels_file("simulator")))
 
 
 @dataclass(frozen=True)
@@ -37,7 +48,7 @@ class Moment:
 def true_moments(episode: Episode, stride: int) -> Iterator[Moment]:
     """Yields every so many rows as they are."""
     agents = set(episode.agents.tolist())
-    mattering = [k for k, label in enumerate(episode.labels) if label in MATTERING]
+    mattering = [k for k, label in enumerate(episode.labels) if simulated_labels().roles(label) & MATTERING]
     for row in range(0, len(episode.times), stride):
         bodies = tuple(_body(episode, row, k) for k in mattering)
         unseen = dict.fromkeys(sorted(agents), 0.0)
@@ -52,8 +63,9 @@ def tracked_moments(episode: Episode, stride: int, rng: Rng) -> Iterator[Moment]
     """
     agents = set(episode.agents.tolist())
     noise = _Noise(rng)
-    things = [k for k, label in enumerate(episode.labels) if label in MATTERING and int(episode.ids[k]) not in agents]
-    mapped = [k for k in things if rng.uniform() > noise.lost(episode.labels[k])]
+    roles = [simulated_labels().roles(label) for label in episode.labels]
+    things = [k for k, own in enumerate(roles) if own & MATTERING and int(episode.ids[k]) not in agents]
+    mapped = [k for k in things if rng.uniform() > noise.lost(roles[k])]
     offsets = {k: _thing_error(rng, noise, episode.boxes[0, k]) for k in mapped}
     resting = [k for k in mapped if rng.uniform() < 0.6 or not np.ptp(episode.boxes[:, k], axis=0).any()]
     still = {k: _shifted(_body(episode, 0, k), offsets[k]) for k in resting}
@@ -91,9 +103,9 @@ class _Noise:
         self.loses = rng.uniform(0, 1)
         self.top = -rng.uniform(0, 0.03)
 
-    def lost(self, label: str) -> float:
+    def lost(self, roles: frozenset[str]) -> float:
         """Returns the probability that a thing is not in the map."""
-        return self.loses * {"mug": 0.6, "bottle": 0.6, "chair": 0.3, "table": 0.25}.get(label, 0.2)
+        return self.loses * max((share for role, share in _LOST.items() if role in roles), default=_LOST_ELSE)
 
     def seen(self, body: Body, camera: Array, everywhere: bool) -> Body | None:
         """Returns an agent as it is seen, None where it is not."""
@@ -106,7 +118,7 @@ class _Noise:
             raised = rng.uniform(0.1, 0.5) * height
             bottom, height = bottom + raised, height - raised
         sides = np.sort(body.size[:2])
-        if body.label == "person" and rng.uniform() < self.one_sided:
+        if body.person and rng.uniform() < self.one_sided:
             keep = rng.uniform(0, 1)
             sides = keep * sides + (1 - keep) * _USUAL
         sides = np.maximum(sides + rng.normal(0, self.extent, 2), 0.05)
@@ -114,7 +126,7 @@ class _Noise:
         center += rng.normal(0, 1, 3) * np.array([self.place, self.place, 0.3 * self.place])
         size = np.array([sides[1], sides[0], max(height + self.top + rng.normal(0, 0.4 * self.extent), 0.05)])
         yaw = body.yaw + rng.normal(0, 0.3)
-        return Body(body.id, body.label, center, size, float(yaw), _STILL, agent=True)
+        return Body(body.id, body.label, center, size, float(yaw), _STILL, body.roles)
 
 
 def _shown(body: Body, camera: Array) -> tuple[float, float] | None:
@@ -139,9 +151,10 @@ def _thing_error(rng: Rng, noise: _Noise, box: NDArray[np.float32]) -> Array:
 
 
 def _shifted(body: Body, error: Array) -> Body:
-    return Body(body.id, body.label, body.center + error[:3], np.maximum(body.size + error[3:], 0.03), body.yaw, _STILL)
+    return replace(body, center=body.center + error[:3], size=np.maximum(body.size + error[3:], 0.03))
 
 
 def _body(episode: Episode, row: int, k: int) -> Body:
     box = episode.boxes[row, k].astype(np.float64)
-    return Body(int(episode.ids[k]), episode.labels[k], box[:3], box[3:6], float(box[6]), _STILL)
+    label = episode.labels[k]
+    return Body(int(episode.ids[k]), label, box[:3], box[3:6], float(box[6]), _STILL, simulated_labels().roles(label))

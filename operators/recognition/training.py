@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from operators.learning.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
+from operators.learning.balance import class_weights
+from operators.learning.export import export_network
 from operators.recognition.dataset import ClassificationData, LabelledImage
 from operators.recognition.network import Architecture, ClassifierNetwork, DeployedClassifier
-from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
-from operators.training.balance import class_weights
-from operators.training.export import export_network
 
 KIND = "classifier"
 STEP = 32

@@ -73,9 +73,9 @@ def activity_of(body: Body, motion: Motion, relations: Mapping[Relation, float])
     speed = float(np.hypot(*body.velocity[:2]))
     if len(motion.past) < 3:
         return UNKNOWN, 0.3, -1
-    if body.label == "ball":
+    if "rolls" in body.roles:
         return ("rolling", _sure(speed, _ROLLING), -1) if speed > _ROLLING else ("resting", _sure(_ROLLING, speed), -1)
-    if body.label != "person":
+    if not body.person:
         return ("driving", _sure(speed, _DRIVING), -1) if speed > _DRIVING else ("resting", _sure(_DRIVING, speed), -1)
     of = {p: (score, o) for (s, p, o), score in relations.items() if s == body.id}
     rise = motion.rise()

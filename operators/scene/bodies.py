@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.labels import LabelSpace
+
 Array = NDArray[np.float64]
 _STILL = np.zeros(3)
 _STILL.flags.writeable = False
@@ -17,7 +19,7 @@ _STILL.flags.writeable = False
 
 @dataclass(frozen=True)
 class Body:
-    """A node: centre (3,), full size (3,) and heading of its upright box, and its velocity (3,), m/s."""
+    """A node: centre (3,), full size (3,) and heading of its upright box, velocity (3,), m/s, roles of its class."""
 
     id: int
     label: str
@@ -25,7 +27,15 @@ class Body:
     size: Array
     yaw: float
     velocity: Array
-    agent: bool = False
+    roles: frozenset[str] = frozenset()
+
+    @property
+    def agent(self) -> bool:
+        return "agent" in self.roles
+
+    @property
+    def person(self) -> bool:
+        return "person" in self.roles
 
     @cached_property
     def bottom(self) -> float:
@@ -74,7 +84,8 @@ class Body:
 class BodyMemory:
     """Makes bodies of boxes; one whose box is as it was is the same body, so that what was worked out of it stays."""
 
-    def __init__(self) -> None:
+    def __init__(self, labels: LabelSpace) -> None:
+        self._labels = labels
         self._known: dict[int, tuple[str, bytes, Body]] = {}
 
     def update(
@@ -87,7 +98,8 @@ class BodyMemory:
             box = rows[k].tobytes()
             known = before.get(id)
             if known is None or known[:2] != (label, box):
-                body = Body(id, label, centers[k].copy(), sizes[k].copy(), float(yaws[k]), _STILL)
+                roles = self._labels.roles(label)
+                body = Body(id, label, centers[k].copy(), sizes[k].copy(), float(yaws[k]), _STILL, roles)
                 known = (label, box, body)
             self._known[id] = known
         return [body for _, _, body in self._known.values()]

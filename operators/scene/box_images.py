@@ -1,4 +1,4 @@
-"""Images of upright boxes in several views, and of those of their sides that show in a case."""
+"""Images of upright boxes in several views."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _AROUND = np.radians(22.5 + 45 * np.arange(8))
@@ -19,42 +18,12 @@ def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
 
     `rounded` (K,) says which hold something of round outline.
     """
-    rows = _with_log_sizes(boxes)
+    rows = boxes.copy()
+    rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
     image = images(rows, P[:, None], CORNERS)[:, 0]
     if rounded.any():
         image[rounded] = images(rows[rounded], P[:, None], ELLIPSE)[:, 0]
     return image
-
-
-def spine_boxes(boxes: Array, P: Array, eye: Array, fronts: Array) -> Array:
-    """Returns the same of the spines alone of things that stand in cases with `fronts` (K,), seen from `eye` (3,)."""
-    return spines(_with_log_sizes(boxes), P[:, None], eye[None], fronts)[:, 0]
-
-
-def _with_log_sizes(boxes: Array) -> Array:
-    rows = boxes.copy()
-    rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
-    return rows
-
-
-def spines(rows: Array, P: Array, eyes: Array, front: Array | float) -> Array:
-    """Returns the image boxes (K, V, 4) of those sides of boxes (K, 7) along `front` that `eyes` (V, 3) see.
-
-    Boxes are as in `images`; `front` is a heading, rad, or one for each box (K,).
-    """
-    across = lies_across(rows, front)
-    deep = rows.copy()  # turned by a quarter where that lets its second axis lie along the front
-    deep[~across, 3], deep[~across, 4] = rows[~across, 4], rows[~across, 3]
-    deep[~across, 6] += np.pi / 2
-    low, high = (images(deep, P, CORNERS[CORNERS[:, 1] == side]) for side in (-0.5, 0.5))
-    way = eyes[None, :, :2] - deep[:, None, :2]
-    before = np.cos(deep[:, 6, None]) * way[..., 1] > np.sin(deep[:, 6, None]) * way[..., 0]
-    return np.where(before[..., None], high, low)
-
-
-def lies_across(rows: Array, front: Array | float) -> Mask:
-    """Tells of boxes (K, 7) whether their first axis lies across a heading."""
-    return np.asarray(np.abs(np.cos(rows[:, 6] - front)) < np.sqrt(0.5))
 
 
 def images(rows: Array, P: Array, outline: Array) -> Array:

@@ -13,10 +13,8 @@ from rich.table import Table
 
 from dataflow.messages import Activity, SceneGraph
 from dataflow.messages.scene_summary import (
-    AGENTS,
     agents_in_words,
     carriers_in_words,
-    class_names,
     spaced,
     summarize,
 )
@@ -80,7 +78,7 @@ def show(
         raise typer.Exit(2) from None
     names = graph.names()
     if json:
-        content = as_json(graph)
+        content = as_json(graph, activities)
         if matches is not None:
             content["query"] = query
             content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
@@ -175,18 +173,17 @@ def _told(found: list[tuple[float, Event]], *, json: bool) -> None:
 
 def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since: float) -> None:
     """Prints who does what, what carries what, the strongest other relations, and what to ask next."""
-    told, names = summarize(graph, most=8), graph.names()
+    told, names = summarize(graph, activities, most=8), graph.names()
     out = Console(highlight=False)
     out.print(
         f"[bold]{graph.count} nodes, {len(graph.subjects)} relations[/bold] at {since:.1f} s, in {escape(graph.frame)}"
     )
-    agents = {i for i, name in enumerate(class_names(graph)) if name in AGENTS}
     who = [(row.name, row.text) for row in agents_in_words(graph, told, activities)]
     what = [(row.name, row.text) for row in carriers_in_words(graph, told)]
     others = [
         (names[r.subject], f"{spaced(r.predicate)} {names[r.object]} {r.score:.2f}")
         for r in told.telling
-        if r.subject not in agents
+        if r.subject not in told.agents
     ]
     for title, rows in (("who does what", who), ("what carries what", what), ("strongest other relations", others)):
         if rows:

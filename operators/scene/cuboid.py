@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.box_images import CORNERS, ELLIPSE, images, lies_across, spines
-from operators.scene.class_sizes import Usual
+from operators.labels import SizePrior
+from operators.scene.box_images import CORNERS, ELLIPSE, images
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,7 +27,6 @@ _STRAYING, _STRAYING_RAW = 1 / 40, 1 / 10  # of points on each side are others' 
 _ASKEW = 8.0  # cost of lying otherwise than most things around
 _TURN, _TURN_ALONG = 0.1, 0.03  # radians by which the heading that points show strays, and that of a room
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
-_SIDES = np.array([True, False, True, False])  # of an image box, that neighbours hide
 _SIZES = 4  # residuals, the last ones, that compare heading and sizes with what is known
 _ALIKE = 6  # views that tell as much as more do, since their errors are alike
 _ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
@@ -52,13 +51,12 @@ def fit_cuboid(
     start: Box,
     views: Sequence[ImageView],
     points: Array,
-    usual: Sequence[Usual],
+    usual: Sequence[SizePrior],
     before: tuple[int, Box] | None = None,
     heading: float | None = None,
     noise: float = 0.0,
     *,
     raw: bool = False,
-    front: float | None = None,
 ) -> tuple[int, Box, Array]:
     """Returns the upright box that agrees best with image boxes, with points (N, 3) of its surface, and with its class.
 
@@ -70,17 +68,11 @@ def fit_cuboid(
     only that one is tried. Last comes by how many standard deviations each view's edges stray from that box (V,).
 
     `noise` is that of ranges at one metre, m; it grows by the square. Points are `raw` that are of single views.
-    `front` is the heading of the front of the case that the thing stands in, either way along it, if it does: then its
-    spine is there, and its image ends anywhere between the sides of its spine and its own, since others hide the rest.
     After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
-    logs, spreads, along, spine = _priors(tuple(usual))
-    spine = spine & (front is not None)
+    logs, spreads, along = _priors(tuple(usual))
     ways = len(logs)
     eyes = np.stack([v.eye for v in views])
-    if before is not None and front is not None and spine[before[0] % ways]:
-        center, size, yaw = before[1]
-        before = None if _shows_cover(np.array([[*center, *size, yaw]]), front)[0] else before
     if before is None:
         x, forms = _starts(start, eyes, logs), np.arange(ways)
         if heading is not None:
@@ -88,17 +80,13 @@ def fit_cuboid(
             x = np.concatenate([x, _starts(_along(points, turned), eyes, logs)])
             forms = np.concatenate([forms[~along], forms + ways])
             x = x[forms]
-        if front is not None:
-            usually = np.concatenate([x[:, :3], logs[forms % ways], x[:, 6:]], axis=1)
-            shown = ~(spine[forms % ways] & _shows_cover(usually, front))
-            x, forms = x[shown], forms[shown]
         headings = x[:, 6].copy()
     else:
         form, box = before
         form += ways if heading is not None and form < ways and along[form] else 0  # it settled before that was known
         forms, x = np.array([form]), np.array([[*box[0], *np.log(box[1]), box[2]]])
         headings = np.array([_nearest_turn(box[2], heading if heading is not None and form >= ways else start[2])])
-    logs, spreads, spine = logs[forms % ways], spreads[forms % ways], spine[forms % ways]
+    logs, spreads = logs[forms % ways], spreads[forms % ways]
     turns = np.where(along[forms % ways] & (forms >= ways), _TURN_ALONG, _TURN)
     outline = ELLIPSE if usual and usual[0].round else CORNERS
     inset = usual[0].inset if usual else 0.0
@@ -114,9 +102,6 @@ def fit_cuboid(
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
         flat = rows.reshape(-1, 7)
         image = images(flat, P, outline) - boxes
-        if front is not None and spine.any():
-            own = np.repeat(spine, rows.shape[1])[:, None, None] & _SIDES
-            image = np.where(own, _nearer(image, spines(flat, P, eyes, front) - boxes), image)
         image = (image * weights).reshape(len(flat), -1)
         image[np.isnan(image)] = 0.0
         turn = ((rows[..., 6] - headings[:, None]) / turns[:, None]).reshape(-1, 1)
@@ -131,7 +116,7 @@ def fit_cuboid(
         if turn == _CHOICE and len(x) > 1:
             kept = np.argsort(_cost(r) + askew, kind="stable")[:2]
             x, r, J, headings, logs, spreads = (a[kept] for a in (x, r, J, headings, logs, spreads))
-            forms, askew, turns, spine = forms[kept], askew[kept], turns[kept], spine[kept]
+            forms, askew, turns = forms[kept], askew[kept], turns[kept]
         weighted = J * _influence(r)[:, None]
         A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
         step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
@@ -159,16 +144,6 @@ def _influence(r: Array) -> Array:
     return np.asarray(weights)
 
 
-def _shows_cover(rows: Array, front: float) -> Mask:
-    """Tells of boxes (K, 7) whether the longer of their sides on the ground lies across the heading of a front."""
-    return np.asarray(lies_across(rows, front) == (rows[:, 3] > rows[:, 4]))
-
-
-def _nearer(own: Array, other: Array) -> Array:
-    """Returns how far places are from the nearer of two, given how far from each; 0 between them."""
-    return np.where(own * other < 0, 0.0, np.where(np.abs(other) < np.abs(own), other, own))
-
-
 def _nearest_turn(yaw: float, towards: float) -> float:
     """Returns the heading nearest to `yaw` that is `towards` or turned from it by quarters."""
     return float(yaw + np.remainder(towards - yaw + np.pi / 4, np.pi / 2) - np.pi / 4)
@@ -184,21 +159,21 @@ def _along(points: Array, yaw: float) -> Box:
 
 
 @lru_cache(maxsize=64)  # as many classes
-def _priors(usual: tuple[Usual, ...]) -> tuple[Array, Array, Mask, Mask]:
+def _priors(usual: tuple[SizePrior, ...]) -> tuple[Array, Array, Mask]:
     """Returns the usual log sizes (A, 3), their spreads, with the sides on the ground either way round, and which of
-    them (A,) always lie along the room and which show their spines.
+    them (A,) always lie along the room.
     """
     rows = []
     for each in usual:
         a, b, c = each.size
-        rows.append(((a, b, c), each.spread, each.along, each.spine))
+        rows.append(((a, b, c), each.spread, each.along))
         if b > 1.3 * a:
             turned = (each.spread[1], each.spread[0], each.spread[2])
-            rows.append(((b, a, c), turned, each.along, each.spine))
+            rows.append(((b, a, c), turned, each.along))
     if not rows:
-        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0), False, False))
-    sizes, spreads, along, spine = (np.array(each) for each in zip(*rows, strict=True))
-    return np.log(sizes), spreads, along, spine
+        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0), False))
+    sizes, spreads, along = (np.array(each) for each in zip(*rows, strict=True))
+    return np.log(sizes), spreads, along
 
 
 def _starts(start: Box, eyes: Array, logs: Array) -> Array:

@@ -8,41 +8,41 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.class_sizes import Usual
+from operators.labels import LabelSpace, SizePrior
 from operators.scene.map_object import MapObject
 from operators.scene.matching import LARGE
 
 Array = NDArray[np.float64]
 _SMALL, _STILL = 0.5, 0.2  # metres, and metres a second
-_ODD = 4.0  # spreads from the usual size, beyond which nothing of a class is
+_ODD = 4.0  # spreads above the usual size, from which an object is doubted
 
 
 class Kinds:
     """Tells of objects and classes what follows from which classes move and which sizes are usual."""
 
+    @classmethod
+    def of(cls, labels: LabelSpace, classes: Sequence[str]) -> Kinds:
+        """Returns what a label space has about the classes of a map, by their numbers."""
+        movers, carriers, portable = (labels.indices(classes, role) for role in ("agent", "person", "portable"))
+        usual = {k: labels.sizes(name) for k, name in enumerate(classes) if labels.sizes(name)}
+        return cls(movers, usual, carriers, portable)
+
     def __init__(
         self,
         movers: Iterable[int],
-        usual: Mapping[int, Sequence[Usual]],
-        telling: Mapping[int, float] | None = None,
+        usual: Mapping[int, Sequence[SizePrior]],
         carriers: Iterable[int] = (),
         portable: Iterable[int] = (),
     ) -> None:
-        """`telling` says how much a label counts, where that is not 1; `carriers` may hold what is `portable`."""
+        """`carriers` may hold what is `portable`."""
         self.carriers, self.portable = frozenset(carriers), frozenset(portable)
-        self.movers, self.usual, self._telling = frozenset(movers), dict(usual), dict(telling or {})
-        self._cases = frozenset(i for i, usual in self.usual.items() if any(u.case for u in usual))
-        self._spines = frozenset(i for i, usual in self.usual.items() if any(u.spine for u in usual))
+        self.movers, self.usual = frozenset(movers), dict(usual)
         self._largest = {i: max((max(u.size) for u in self.usual.get(i, ())), default=0.0) for i in self.movers}
         self._most = {
             i: [[size * math.exp(_ODD * spread) for size, spread in zip(u.size, u.spread, strict=True)] for u in usual]
             for i, usual in self.usual.items()
             if usual and i not in self.movers
         }
-
-    def vote(self, class_id: int, score: float) -> float:
-        """Returns how much a label with a score counts for its class."""
-        return score * self._telling.get(class_id, 1.0)
 
     def is_mover(self, object: MapObject) -> bool:
         """Tells whether an object is of a class that moves by itself; small ones do only while they are moved."""
@@ -67,24 +67,23 @@ class Kinds:
     def is_round(self, object: MapObject) -> bool:
         return any(u.round for u in self.usual.get(object.class_id, ()))
 
-    def in_rows(self, class_id: int) -> bool:
-        """Tells whether things of a class often stand side by side."""
-        return any(u.rows for u in self.usual.get(class_id, ()))
-
-    def is_case(self, object: MapObject) -> bool:
-        """Tells whether things stand in an object side by side."""
-        return object.class_id in self._cases
-
-    def shows_spine(self, object: MapObject) -> bool:
-        """Tells whether things of an object's class show their spines where they stand in a case."""
-        return object.class_id in self._spines
-
     def foot(self, object: MapObject) -> float:
         """Returns how much of an object's foot may be hidden, metres; 0 where its class does not stand on the floor."""
         return max((u.foot for u in self.usual.get(object.class_id, ())), default=0.0)
 
-    def may_be_so_large(self, object: MapObject) -> bool:
-        """Tells whether an object has a size that things of its class may have, seen in part or whole."""
+    def doubt(self, object: MapObject, label: float) -> float:
+        """Returns the share, in [0, 1), of an object's existence that its class puts in doubt; 0 for none.
+
+        Half where no thing of the class is usually so large, seen in part or whole. A class whose things are small and
+        leave their places is often called so by mistake: where its mean label is below `label`, what that lacks.
+        """
+        kept = 1.0 if self.has_usual_size(object) else 0.5
+        if object.label < label and self.may_leave(object):
+            kept *= object.label / label
+        return 1 - kept
+
+    def has_usual_size(self, object: MapObject) -> bool:
+        """Returns whether no side is more than four spreads above a usual one; True where the class has none."""
         most = self._most.get(object.class_id)
         if most is None:
             return True

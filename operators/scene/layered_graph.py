@@ -24,8 +24,6 @@ class GraphSettings:
     begin: float = 0.5
     end: float = 0.25
     smoothing: float = 0.4
-    agents: tuple[str, ...] = ("person", "robot", "ball")
-    goals: tuple[str, ...] = ("chair", "table", "mug", "bottle", "door", "shelf")
     trust: float = 1.0
     memory: float = 2.0
     elsewhere: float = 2.5
@@ -82,7 +80,7 @@ class LayeredGraph:
     def update(self, stamp: int, things: Sequence[Body], T_world_robot: Array | None) -> Snapshot:
         """Takes the objects of one time, which may have surfaces among them, and the robot's pose."""
         s, time = self._settings, stamp * 1e-9
-        bodies = [b if b.agent == (b.label in s.agents) else replace(b, agent=not b.agent) for b in things]
+        bodies = list(things)
         for k, body in enumerate(bodies):
             if body.agent:
                 motion = self._motions.setdefault(body.id, Motion())
@@ -93,12 +91,9 @@ class LayeredGraph:
         vanished = self._known - ids
         self._forget(vanished)
         now = relations_of(bodies, T_world_robot, s.rules, self._pairs)
-        people = [b for b in bodies if b.agent and b.label == "person"]
-        by_id = {b.id: b for b in bodies}
-        on = [(s, o) for (s, p, o) in now if p == "on" and o != FLOOR] if people else []
-        supports = {s: by_id[o] for s, o in on if s in by_id and o in by_id}
-        wanted = [b for b in bodies if b.label in s.goals]
-        goals = {b.id: self._goals_of(time, b, wanted, supports, now) for b in people}
+        people = [b for b in bodies if b.person]
+        wanted = [b for b in bodies if "goal" in b.roles]
+        goals = {b.id: self._goals_of(time, b, wanted, now) for b in people}
         held, began, ended = self._hysteresis.update(stamp, now)
         for agent, likely in goals.items():
             sure = {i: p for i, p in likely.items() if i >= 0 and p >= s.least_goal}
@@ -135,15 +130,10 @@ class LayeredGraph:
         return GoalInference(s.trust, s.memory, s.elsewhere)
 
     def _goals_of(
-        self,
-        time: float,
-        agent: Body,
-        wanted: Sequence[Body],
-        supports: Mapping[int, Body],
-        now: Mapping[Relation, float],
+        self, time: float, agent: Body, wanted: Sequence[Body], now: Mapping[Relation, float]
     ) -> dict[int, float]:
         free = [b for b in wanted if (agent.id, "sitting_on", b.id) not in now]
-        return self._goals.setdefault(agent.id, self._inference()).update(time, agent, free, supports)
+        return self._goals.setdefault(agent.id, self._inference()).update(time, agent, free)
 
     def _act(self, stamp: int, agent: Body, held: Mapping[Relation, float], goals: Mapping[int, float]) -> Act:
         activity, score, object = activity_of(agent, self._motions[agent.id], held)

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from operators.labels import LabelSpace
+
 KIND, VERSION = "semantic map", 1
 
 
@@ -61,11 +63,11 @@ class SavedMap:
             np.savez_compressed(handle, **arrays)
         partial.replace(path)
 
-    def begun(self, stamp: int, classes: Sequence[str], movers: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    def begun(self, stamp: int, classes: Sequence[str], labels: LabelSpace) -> tuple[dict[str, Any], dict[str, Any]]:
         """Returns the states of objects and surfaces from which a map goes on at `stamp`, with these names of classes.
 
-        What moves by itself (`movers`) is not there any more, nor is what had vanished; times that are not before
-        `stamp` become so. Raises ValueError where a class of the map is not among `classes`.
+        Agents are not there any more, nor is what had vanished; times that are not before `stamp` become so. Raises
+        ValueError where a class of the map is not among `classes`.
         """
         lacking = [name for name in self.classes if name not in classes]
         if lacking:
@@ -75,7 +77,7 @@ class SavedMap:
         for each in self.objects["objects"]:
             votes = np.zeros(max(len(classes), 1))
             votes[place] = each["votes"]
-            if not classes or classes[int(votes.argmax())] not in movers:
+            if not classes or "agent" not in labels.roles(classes[int(votes.argmax())]):
                 objects.append({**_before(each, stamp), "votes": votes, "velocity": np.zeros(3)})
         surfaces = [_before(each, stamp) for each in self.surfaces["surfaces"]]
         kept = {**self.objects, "objects": objects, "gone": [], "stamp": None}

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from dataflow.messages import Boxes3D, PointCloud, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw, quaternion_to_matrix, transform_points
 from operators.scene.map_object import MapObject
-from operators.scene.map_surface import CEILING, FLOOR, SURFACES, TABLETOP, WALL, MapSurface
+from operators.scene.map_surface import CEILING, FLOOR, SURFACES, WALL, MapSurface
 from operators.scene.relations import FLOOR as FLOOR_ID
-from operators.scene.relations import SURFACE
+from operators.scene.relations import SURFACE, TABLETOP
 from operators.scene.surface_map import SeenSurface
 
 Array = NDArray[np.float64]
@@ -54,9 +54,13 @@ def nodes_of(
     frame: str,
     classes: tuple[str, ...],
     objects: Sequence[MapObject],
+    scores: Sequence[float],
     surfaces: Sequence[MapSurface],
 ) -> SceneGraph:
-    """Returns objects and surfaces as nodes without relations; surfaces have the ids that `surface_id` gives them."""
+    """Returns objects, with their scores, and surfaces as nodes without relations.
+
+    Surfaces have the ids that `surface_id` gives them.
+    """
     names = (*classes, *(s for s in SURFACES if s not in classes)) if surfaces else classes
     entries: list[MapObject | MapSurface] = [*objects, *surfaces]
     boxes = [each.box for each in entries]
@@ -71,7 +75,7 @@ def nodes_of(
         positions=np.array([center for center, _, _ in boxes]).reshape(-1, 3),
         sizes=np.array([size for _, size, _ in boxes]).reshape(-1, 3),
         orientations=quaternion_from_yaw(np.array([yaw for _, _, yaw in boxes])).reshape(-1, 4),
-        scores=np.array([each.score for each in entries], np.float32),
+        scores=np.array([*scores, *(s.score for s in surfaces)], np.float32),
         last_seen=np.array([each.seen for each in entries], np.int64),
         subjects=np.zeros(0, np.int32),
         objects=np.zeros(0, np.int32),

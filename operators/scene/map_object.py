@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.labels import SizePrior
 from operators.scene.cells import Cells, standing_box
-from operators.scene.class_sizes import Usual
 from operators.scene.cuboid import ImageView, fit_cuboid
 
 Array = NDArray[np.float64]
@@ -128,18 +128,16 @@ class MapObject:
 
     def fit(
         self,
-        usual: Mapping[int, Sequence[Usual]],
+        usual: Mapping[int, Sequence[SizePrior]],
         heading: float | None = None,
         noise: float = 0.0,
         floor: float | None = None,
         others: Sequence[Cells] = (),
-        front: float | None = None,
     ) -> None:
         """Puts the box around what is surely the object's and not `others`', in agreement with its images and class.
 
         `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square. How high
         it reaches over the `floor`, if that is known, tells which of the ways in which its class stands is its own.
-        `front` is the heading of the front of the case that it stands in, if it does.
         """
         self.fresh = 0
         sure = self.cells.sure(others)
@@ -157,11 +155,11 @@ class MapObject:
         if self.images:
             before = (self.form, self.box) if self.form >= 0 else None
             some = sure[:: -(-len(sure) // _POINTS)]
-            form, box, strays = fit_cuboid(box, self.images, some, known, before, heading, noise, raw=raw, front=front)
+            form, box, strays = fit_cuboid(box, self.images, some, known, before, heading, noise, raw=raw)
             of_others = strays > _STRAYS
             if len(self.images) >= _ENOUGH and of_others.any() and of_others.sum() <= len(of_others) // 3:
                 self.images = [v for v, other in zip(self.images, of_others.tolist(), strict=True) if not other]
-                form, box, _ = fit_cuboid(box, self.images, some, known, None, heading, noise, raw=raw, front=front)
+                form, box, _ = fit_cuboid(box, self.images, some, known, None, heading, noise, raw=raw)
             self.form = form if len(self.images) >= _SETTLED else -1
         elif known:
             stands = floor is not None and all(u.foot > 0 for u in known)
@@ -212,7 +210,7 @@ def _most_alike(ways: Sequence[Array]) -> int:
     return int(np.argmax(near[:-1].max(axis=1)))
 
 
-def completed(box: tuple[Array, Array, float], view: Array, usual: Usual) -> tuple[Array, Array, float]:
+def completed(box: tuple[Array, Array, float], view: Array, usual: SizePrior) -> tuple[Array, Array, float]:
     """Returns a box that is as deep as usual where only its near side was seen.
 
     `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. Of the usual

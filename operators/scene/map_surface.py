@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.cells import Cells, standing_box
+from operators.scene.relations import TABLETOP
 
 Array = NDArray[np.float64]
 
-FLOOR, WALL, TABLETOP, CEILING = "floor", "wall", "tabletop", "ceiling"
+FLOOR, WALL, CEILING = "floor", "wall", "ceiling"
 SURFACES = (FLOOR, WALL, TABLETOP, CEILING)
 """Classes of surfaces."""
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.box_images import image_boxes, spine_boxes
+from operators.scene.box_images import image_boxes
 from operators.scene.cells import Cells, standing_box
 from operators.scene.cuboid import ImageView
 from operators.scene.map_object import MapObject
@@ -27,8 +27,8 @@ _SLACK = 0.02  # of the distance, by which points stray
 class MapSettings:
     """Lengths in metres, times in seconds, evidence in log odds; noise of ranges at one metre, grows by the square.
 
-    `label` is the mean of what labels of its class count, over its views, from which a mug, a bottle or a ball is
-    given: other things are often called so, but not surely.
+    `label` is the mean of what labels of its class count, over its views, below which a small thing that moves or is
+    carried is doubted: other things are often called so, but not surely.
     """
 
     voxel: float = 0.03
@@ -54,8 +54,7 @@ class MapSettings:
 class Observation:
     """One object as seen once: points (N, 3) in the world, class, score, and mean colour (3,) in [0, 1] if known.
 
-    `image` is what the image shows of it, where there is one; those of one time share `P`. Where its box holds more
-    than the object, `part` is what is the object's.
+    `image` is what the image shows of it, where there is one; those of one time share `P`.
     """
 
     points: Array
@@ -63,12 +62,6 @@ class Observation:
     score: float
     color: Array | None = None
     image: ImageView | None = None
-    part: ImageView | None = None
-
-    @property
-    def own_image(self) -> ImageView | None:
-        """Image of the object alone."""
-        return self.image if self.part is None else self.part
 
 
 def alike_mover(each: Observation, cells: Cells, object: MapObject, stamp: int, s: MapSettings) -> float:
@@ -131,30 +124,18 @@ class InImages:
         return InImage(float(self.iou[observation, object]), float(self.within[observation, object]))
 
 
-def in_image(
-    seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_], fronts: Array | None = None
-) -> InImages | None:
-    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without any.
-
-    What stands in a case with a front, a heading in `fronts` (M,), else NaN, may show its spine alone.
-    """
+def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> InImages | None:
+    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without any."""
     if not len(rows) or any(each.image is None for each in seen):
         return None
     images = [each.image for each in seen if each.image is not None]
     boxes = np.stack([image.box for image in images])
     known = image_boxes(rows, images[0].P, rounded)
-    in_case = np.flatnonzero(np.isfinite(fronts)) if fronts is not None else np.zeros(0, np.intp)
-    spines = known[in_case]
-    if fronts is not None and len(in_case):
-        spines[:, ::2] = spine_boxes(rows[in_case], images[0].P, images[0].eye, fronts[in_case])[:, ::2]
     beyond = ~np.stack([image.edges for image in images])
     for k, edge in np.argwhere(beyond).tolist():  # what reaches beyond the image is cut off there
         cut = np.maximum if edge < 2 else np.minimum
-        for each in (known, spines):
-            each[:, edge % 2 :: 2] = cut(each[:, edge % 2 :: 2], boxes[k, edge])
+        known[:, edge % 2 :: 2] = cut(known[:, edge % 2 :: 2], boxes[k, edge])
     iou = np.nan_to_num(overlap(boxes, known))
-    if len(in_case):
-        iou[:, in_case] = np.maximum(iou[:, in_case], np.nan_to_num(overlap(boxes, spines)))
     low = np.maximum(boxes[:, None, :2], known[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], known[None, :, 2:])
     areas = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6).prod(axis=1)

@@ -28,8 +28,8 @@ from operators.cloud.filtering import in_range
 from operators.cloud.gravity import gravity, unit
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
+from operators.labels import LabelSpace, labels_file
 from operators.scene.lifting import Lifted, LiftSettings, Seen, lift
-from operators.scene.named_classes import unknown_classes
 from operators.status import counted_status
 
 _MOST_GRAIN = 4.0  # pixels
@@ -61,8 +61,8 @@ class ObjectLifter(Operator):
     status: Out[Diagnostics] = Out(doc="detections with and without an object; a warning where all are without")
 
     min_score: float = Param(0.3, ge=0, le=1, live=True, doc="weaker detections are not lifted")
-    bodies: list[str] = Param(["person"], doc="classes of which masks tell more than the edges of boxes do")
-    min_body_score: float = Param(0.2, ge=0, le=1, live=True, doc="weaker detections of these, with masks, are not")
+    labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives the roles of classes")
+    min_body_score: float = Param(0.2, ge=0, le=1, live=True, doc="weaker detections of persons with masks are not")
     min_points: int = Param(8, ge=5, live=True, doc="fewest points of an object")
     min_overlap: float = Param(0.3, gt=0, le=1, live=True, doc="least IoU of an object's image with its box")
     max_range: float = Param(6.0, gt=0, live=True, doc="farther points are not used", unit="m")
@@ -74,7 +74,8 @@ class ObjectLifter(Operator):
     )
 
     def setup(self) -> None:
-        """Raises ValueError for an up of length 0."""
+        """Raises ValueError for an up of length 0, FileNotFoundError or ValueError for a bad label space."""
+        self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._up = unit(self.up)
         self._counts: Counter[str] = Counter()
 
@@ -89,8 +90,6 @@ class ObjectLifter(Operator):
     ) -> dict[str, Any]:
         """Raises ValueError where the calibration is of another image or no transform relates the frames."""
         _check(detections, image_info)
-        if "unknown classes" not in self._counts:
-            self._counts["unknown classes"] = unknown_classes(self, ("bodies",), detections.class_names)
         up, _ = gravity(cloud, pose, extrinsics, self._up)
         usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
         points = cloud.points[usable].astype(np.float64)
@@ -98,7 +97,7 @@ class ObjectLifter(Operator):
         T_image_cloud = transform_between(extrinsics, cloud.frame, detections.frame)
         seen = _seen(points, T_image_cloud, image_info, masks, up)
         names = detections.labels()
-        body = np.array([masks is not None and name in self.bodies for name in names], bool)
+        body = np.array([masks is not None and "person" in self._labels.roles(name) for name in names], bool)
         least = np.where(body, np.float32(self.min_body_score), np.float32(self.min_score))
         rows = np.flatnonzero(detections.scores >= least)
         known = {} if masks is None else {name: k for k, name in enumerate(masks.class_names)}

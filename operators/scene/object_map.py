@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.carrying import carried
-from operators.scene.cases import front_of, fronts, stands
 from operators.scene.cells import Cells
-from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, WHOLE, MapObject
@@ -30,7 +28,6 @@ from operators.scene.matching import (
 from operators.scene.merging import are_one, may_be_one, merge, smaller_in_place
 from operators.scene.presence import has_left, look_at
 from operators.scene.range_view import RangeView
-from operators.scene.side_by_side import image_of_part, largest_part
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
@@ -44,32 +41,17 @@ class ObjectMap:
     An observation is of the object of its class whose box, seen from where it was seen, covers its own in the image,
     and to which its points are near; of a large one whose voxels it shares; of another class only where both cover each
     other. Colour decides near ties. Two objects that come to share their place, of one class or not, are one, unless
-    they are seen beside each other. Things in a case may show their spines alone. What a view shows of things that
-    stand in rows ends where it looks between two of them. Places that a view looks through lose voxels; an object whose
+    they are seen beside each other. Places that a view looks through lose voxels; an object whose
     place is empty, or that is in plain view and not detected, loses evidence and at last goes. If one of its class and
     size appears elsewhere, that is the same object, moved.
-    `movers` are classes whose place is that of their last view; they are joined by predicted place. Small ones (a ball)
-    are as other things are until a view looks through their place and one of their class is near.
+    The place of what moves by itself is that of its last view; it is joined by predicted place. Small ones (a ball) are
+    as other things are until a view looks through their place and one of their class is near.
 
     After Hughes et al., "Hydra", 2022, and Gu et al., "ConceptGraphs", 2024; existence as in occupancy grids.
     """
 
-    def __init__(
-        self,
-        classes: int,
-        movers: Iterable[int],
-        settings: MapSettings,
-        usual: Mapping[int, Sequence[Usual]] | None = None,
-        telling: Mapping[int, float] | None = None,
-        carriers: Iterable[int] = (),
-        portable: Iterable[int] = (),
-    ) -> None:
-        """`usual` are the sizes of classes whose size is known, `telling` how much their labels count, where not 1.
-
-        What is `portable` may be in the hands of `carriers`.
-        """
-        self._settings, self._classes = settings, classes
-        self._kinds = Kinds(movers, usual or {}, telling, carriers, portable)
+    def __init__(self, classes: int, kinds: Kinds, settings: MapSettings) -> None:
+        self._settings, self._classes, self._kinds = settings, classes, kinds
         self.objects: dict[int, MapObject] = {}
         self.gone: dict[int, tuple[int, MapObject]] = {}
         self.moved = 0
@@ -77,7 +59,6 @@ class ObjectMap:
         self._stamp: int | None = None
         self._room, self._updates = RoomHeading(), 0
         self._heading: float | None = None
-        self._cases: list[MapObject] = []
         self.floor: float | None = None
         """Height of the floor, where it is known: what stands on it reaches down to it."""
 
@@ -90,7 +71,6 @@ class ObjectMap:
             self._room.add(view.points)
         self._updates += 1
         self._heading = self._room.angle
-        self._cases = [o for o in self.objects.values() if self._kinds.is_case(o) and self._is_sure(o)]
         seen = [self._alone(each, view) for each in seen]
         cells = Cells.of_each([each.points for each in seen], s.voxel)
         joined = self._joined(seen, cells, stamp, view)
@@ -115,21 +95,17 @@ class ObjectMap:
         return self._heading
 
     def confirmed(self) -> list[MapObject]:
-        """Returns the objects that are surely there, by rising id."""
-        s, sure = self._settings, [o for _, o in sorted(self.objects.items()) if self._is_sure(o)]
-        called = (o for o in sure if o.label >= s.label or not self._kinds.may_leave(o))
-        return [o for o in called if self._kinds.may_be_so_large(o)]
+        """Returns the objects that were seen often enough, whatever their size and class, by rising id."""
+        return [o for _, o in sorted(self.objects.items()) if self._is_sure(o)]
+
+    def doubt(self, object: MapObject) -> float:
+        """Returns the share of an object's existence that its size or a weak label puts in doubt, in [0, 1)."""
+        return self._kinds.doubt(object, self._settings.label)
 
     def _alone(self, each: Observation, view: RangeView) -> Observation:
-        """Returns an observation without what is behind the thing, or is another one of its class beside it."""
+        """Returns an observation without what is behind the thing."""
         points = self._kinds.near_side(each.points, each.class_id, view.origin, self._settings.range_noise)
-        part = None
-        if self._heading is not None and self._kinds.in_rows(each.class_id):
-            part = largest_part(points, self._heading, view, self._settings.margin)
-        if part is None:
-            return replace(each, points=points)
-        own = None if each.image is None else image_of_part(each.image, points, part)
-        return replace(each, points=points[part], part=own)
+        return replace(each, points=points)
 
     def _joined(
         self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int, view: RangeView
@@ -151,8 +127,7 @@ class ObjectMap:
         compared = np.flatnonzero(here.any(axis=0)).tolist()
         boxes = np.column_stack([centers, sizes, [o.yaw for o in known]])[compared]
         near_by = [known[j] for j in compared]
-        in_case = np.where([stands(o) for o in near_by], fronts(near_by, self._cases, self._kinds), np.nan)
-        images = in_image(seen, boxes, np.array([self._kinds.is_round(o) for o in near_by], bool), in_case)
+        images = in_image(seen, boxes, np.array([self._kinds.is_round(o) for o in near_by], bool))
         for k, n in np.argwhere(here[:, compared]).tolist():
             j, image = compared[n], None if images is None else images.of(k, n)
             value[k, j] = alike(seen[k], cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
@@ -179,7 +154,7 @@ class ObjectMap:
         object.view = direction * object.views if mover else object.view + direction
         before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
         voted = object.class_id
-        object.vote(each.class_id, self._kinds.vote(each.class_id, each.score))
+        object.vote(each.class_id, each.score)
         told = min(stamp - object.seen, WHOLE)
         object.told += told
         gain = told / WHOLE * _log_odds(each.score, self._settings.gain)
@@ -197,7 +172,7 @@ class ObjectMap:
             return
         object.cells.add(cells)
         object.velocity = np.zeros(3)
-        image = each.own_image
+        image = each.image
         new = image is not None and object.look(image, cells.points) and len(object.images) not in (2, 4)
         if object.class_id != voted:
             object.form = -1
@@ -206,8 +181,7 @@ class ObjectMap:
 
     def _fit(self, object: MapObject) -> None:
         s, others = self._settings, smaller_in_place(object, self.objects.values(), self._kinds, self._settings)
-        front = front_of(object, self._cases, self._kinds)
-        object.fit(self._kinds.usual, self._heading, s.range_noise, self.floor, others, front)
+        object.fit(self._kinds.usual, self._heading, s.range_noise, self.floor, others)
         if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
             object.stand_on(self.floor, foot)
 
@@ -216,13 +190,13 @@ class ObjectMap:
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
-        votes[each.class_id] = self._kinds.vote(each.class_id, each.score)
+        votes[each.class_id] = each.score
         made = MapObject(self._next, cells, votes, _log_odds(each.score, self._settings.gain), stamp, stamp)
         if each.color is not None:
             made.color = each.color
         made.view = _direction(eye, cells)
         made.center = cells.middle
-        image = each.own_image
+        image = each.image
         if image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
             made.look(image, cells.points)
         self._fit(made)

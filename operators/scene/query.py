@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dataflow.messages import SceneGraph
-from dataflow.messages.scene_summary import AGENTS
+from dataflow.messages import Activity, SceneGraph
+from dataflow.messages.scene_summary import summarize
 from operators.scene.map_surface import SURFACES
 from operators.scene.relations import FLOOR, INVERSES, PREDICATES, ROBOT, ROOM
 
@@ -168,13 +168,16 @@ def _named(graph: SceneGraph, node: int, name: str) -> bool:
     return name in (label, f"{label} {int(graph.ids[node])}", *graph.labels[node : node + 1])
 
 
-def as_json(graph: SceneGraph) -> dict[str, Any]:
-    """Returns the graph as plain data: nodes by layer with box and score, relations with theirs; metres, ns."""
-    names, scores = graph.names(), graph.relation_scores
+def as_json(graph: SceneGraph, activities: Activity | None = None) -> dict[str, Any]:
+    """Returns the graph as plain data: nodes by layer with box and score, relations with theirs; metres, ns.
+
+    Nodes that have one of the `activities`, or act in a relation, are agents.
+    """
+    names, scores, agents = graph.names(), graph.relation_scores, summarize(graph, activities).agents
     nodes = []
     for k in range(graph.count):
         id, label = int(graph.ids[k]), graph.class_names[graph.class_ids[k]] if graph.class_names else ""
-        layer = _LAYERS.get(id) or ("surface" if label in SURFACES else "agent" if label in AGENTS else "object")
+        layer = _LAYERS.get(id) or ("surface" if label in SURFACES else "agent" if k in agents else "object")
         nodes.append(
             {
                 "id": id,

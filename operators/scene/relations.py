@@ -42,6 +42,9 @@ AT_ONCE = frozenset({"left_of", "in_front_of"})
 
 _STEEP = 12.5  # by so much the score of these rises, by the share of the larger difference by which it leads
 
+TABLETOP = "tabletop"
+"""Class of the surfaces above the floor on which things stand."""
+
 SURFACE = -10
 """Ids below this are surfaces other than the floor: walls, table tops, ceilings."""
 
@@ -57,9 +60,6 @@ class RelationRules:
     hand: float = 0.35
     small: float = 0.4
     closing: float = 0.2
-    containers: tuple[str, ...] = ("shelf", "bin", "box")
-    tops: tuple[str, ...] = ("tabletop",)
-    seats: tuple[str, ...] = ("chair",)
 
 
 def relations_of(
@@ -74,7 +74,7 @@ def relations_of(
     boxes.update(bodies)
     found: dict[Relation, float] = {}
     things = sorted((b for b in bodies if b.id > FLOOR), key=lambda b: b.id)
-    tops = [b for b in bodies if b.id < SURFACE and b.label in rules.tops]
+    tops = [b for b in bodies if b.id < SURFACE and b.label == TABLETOP]
     floor = next((b for b in bodies if b.id == FLOOR), None)
     held: set[int] = set()
     centers = np.array([b.center for b in things]).reshape(-1, 3)
@@ -90,7 +90,7 @@ def relations_of(
     for body in things:
         if body.id not in held and body.id not in sitting:
             _placed(found, body, stacks[body.id], floor, boxes, rules)
-            if body.label != "person":
+            if not body.person:
                 _on_top(found, body, tops, boxes, rules)
     seen: dict[int, list[float]] = {}
     if T_world_robot is not None:
@@ -147,7 +147,7 @@ def _placed(
         if not upon and min(body.top, other.top) <= max(body.bottom, other.bottom):
             continue
         share = boxes.share(body, other)
-        if other.label in rules.containers and other.volume > 1.5 * body.volume and share > 0.3:
+        if "container" in other.roles and other.volume > 1.5 * body.volume and share > 0.3:
             inside = min(body.top, other.top) - max(body.bottom, other.bottom)
             deep = inside / max(float(body.size[2]), 1e-3)
             if deep > 0.5 and body.height < other.top - 0.02:
@@ -195,7 +195,7 @@ def _stacked(found: dict[Relation, float], first: Body, second: Body, boxes: Box
         found[first.id, "above", second.id] = 1 - 0.5 * between / rules.above
     if second.top > first.top and second.bottom < first.bottom + 0.1 and not second.agent:
         share = boxes.share(first, second)  # it stands beneath a table: within its box
-        if share > 0.4 and second.label not in rules.containers and first.top < second.top - rules.touch:
+        if share > 0.4 and "container" not in second.roles and first.top < second.top - rules.touch:
             found[first.id, "under", second.id] = share
 
 
@@ -238,12 +238,12 @@ def _contact(
     """Finds what an agent sits on and what it holds; returns the ids of what is held."""
     held = set()
     for other in others:
-        if other.label in rules.seats and person.label == "person":
-            away = float(np.hypot(*(person.center - other.center)[:2]))
+        if "seat" in other.roles and person.person:
+            away = _from_middle(person.center, other)
             low = person.top - other.bottom < 1.5
             if away < 0.45 and low:
                 found[person.id, "sitting_on", other.id] = 1 - away
-        elif float(other.size.max()) <= rules.small and person.label == "person":
+        elif float(other.size.max()) <= rules.small and person.person:
             supported = any(
                 abs(other.bottom - b.top) < rules.touch and boxes.share(other, b) > 0.3
                 for b in things
@@ -254,6 +254,18 @@ def _contact(
                 found[person.id, "holding", other.id] = 1 - boxes.gap(person, other) / rules.hand
                 held.add(other.id)
     return held
+
+
+def _from_middle(place: Array, seat: Body) -> float:
+    """Returns how far a place is on the ground from the line in the middle of a seat on which persons sit, metres.
+
+    It is as long as the seat is longer than wide: persons sit anywhere along a bench.
+    """
+    c, s = np.cos(seat.yaw), np.sin(seat.yaw)
+    x, y = (place - seat.center)[:2].tolist()
+    along, across = abs(c * x + s * y), abs(c * y - s * x)
+    longer = float(seat.size[0] - seat.size[1]) / 2
+    return float(np.hypot(max(along - max(longer, 0.0), 0.0), max(across - max(-longer, 0.0), 0.0)))
 
 
 def _moving(found: dict[Relation, float], agent: Body, other: Body, rules: RelationRules) -> None:

@@ -14,10 +14,12 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
+from operators.labels import LabelSpace, labels_file
 from operators.scene.agents import ACTIVITIES, UNKNOWN
 from operators.scene.bodies import Body, BodyMemory
+from operators.scene.known_classes import warn_of_unknown
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
-from operators.scene.named_classes import unknown_classes
+from operators.scene.map_surface import SURFACES
 from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
 
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
@@ -64,34 +66,29 @@ class SceneGraphBuilder(Operator):
     )
     near: float = Param(0.5, gt=0, doc="gap up to which things are near each other", unit="m")
     side: float = Param(0.15, gt=0, doc="least difference for left_of and in_front_of", unit="m")
-    agents: list[str] = Param(["person", "robot", "ball"], doc="classes that act")
-    containers: list[str] = Param(["shelf", "bin", "box"], doc="classes that hold things inside")
-    goals: list[str] = Param(
-        ["chair", "table", "mug", "bottle", "door", "shelf"], doc="classes that a person may be going to"
-    )
+    labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives the roles of classes")
     fresh: float = Param(0.5, ge=0, doc="age up to which a recognised activity counts", unit="s")
 
     def setup(self) -> None:
-        """Raises ValueError for an end that is not below the beginning."""
+        """Raises ValueError for an end that is not below the beginning, or a bad label space; FileNotFoundError."""
         if self.end >= self.begin:
             raise ValueError(f"end {self.end} must be below begin {self.begin}")
         self._counts: Counter[str] = Counter()
+        self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._begin()
 
     def _begin(self) -> None:
-        rules = RelationRules(near=self.near, side=self.side, containers=tuple(self.containers))
+        rules = RelationRules(near=self.near, side=self.side)
         self._graph = LayeredGraph(
             GraphSettings(
                 begin=self.begin,
                 end=self.end,
                 smoothing=self.smoothing,
-                agents=tuple(self.agents),
-                goals=tuple(self.goals),
                 rules=rules,
             )
         )
         self._names: dict[int, str] = {}
-        self._bodies = BodyMemory()
+        self._bodies = BodyMemory(self._labels)
 
     def process(
         self,
@@ -109,9 +106,8 @@ class SceneGraphBuilder(Operator):
             if self.robot_frame is not None:
                 T = T @ transform_between(extrinsics, self.robot_frame, robot.child_frame)
         if "unknown classes" not in self._counts:
-            self._counts["unknown classes"] = unknown_classes(
-                self, ("agents", "containers", "goals"), nodes.class_names
-            )
+            things = [name for name in nodes.class_names if name not in SURFACES]
+            self._counts["unknown classes"] = warn_of_unknown(self, self._labels, things)
         usable = _usable(nodes)
         bodies, unusable = self._bodies_of(nodes, usable), nodes.count - len(usable)
         now = self._graph.update(nodes.stamp, bodies, T)

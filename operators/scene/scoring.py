@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, SceneGraph
 from dataflow.messages.geometry import yaw_of
+from operators.labels import LabelSpace
 from operators.scene.box_overlap import upright_iou
 from operators.scene.relations import FLOOR
 
@@ -18,7 +19,6 @@ Array = NDArray[np.float64]
 Box = tuple[Array, Array, float]
 Triple = tuple[int, str, int]
 
-MOVERS = ("person", "robot", "ball")
 PREDICATES = ("on", "in", "sitting_on", "holding", "near", "left_of", "in_front_of")
 """Relations that are scored: those that the simulator's truth has too."""
 
@@ -43,15 +43,15 @@ class PlainlySeen:
         """Returns the ids of objects that were seen so often by now."""
         return {i for i, n in self._plain.items() if n >= self._images}
 
-    def must(self, truth: SceneGraph, recent: float = 2.0) -> set[int]:
+    def must(self, truth: SceneGraph, labels: LabelSpace, recent: float = 2.0) -> set[int]:
         """Returns the ids of objects that a map must have at the time of the true graph.
 
-        Those that were seen so often by then; movers only where they were in view in the last `recent` seconds.
+        Those that were seen so often by then; agents only where they were in view in the last `recent` seconds.
         """
         names = dict(zip(truth.ids.tolist(), (truth.class_names[c] for c in truth.class_ids), strict=True))
         since = truth.stamp - round(recent * 1e9)
         known = (i for i in self.countable() if i in names)
-        return {i for i in known if names[i] not in MOVERS or self.last[i] >= since}
+        return {i for i in known if "agent" not in labels.roles(names[i]) or self.last[i] >= since}
 
 
 @dataclass(frozen=True)

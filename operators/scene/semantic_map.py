@@ -27,13 +27,14 @@ from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_po
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import in_range
 from operators.geometry.extrinsics import transform_between
-from operators.scene.class_sizes import CLASS_SIZES, TELLING
+from operators.labels import LabelSpace, labels_file
 from operators.scene.cuboid import ImageView
+from operators.scene.kinds import Kinds
+from operators.scene.known_classes import warn_of_unknown
 from operators.scene.map_file import LearnedFile, SavedMap, learned_files, together
 from operators.scene.map_nodes import nodes_of, seen_surfaces
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings, Observation
-from operators.scene.named_classes import unknown_classes
 from operators.scene.object_map import ObjectMap
 from operators.scene.range_view import RangeView
 from operators.scene.surface_map import SurfaceMap
@@ -46,11 +47,12 @@ class SemanticMap(Operator):
     """Accumulates objects and surfaces in the world, each with class, box, existence and when it was last seen.
 
     What a view shows is joined to the map by place, class and colour; two entries that come to share their place and
-    are not seen beside each other are one. Books in a shelf show their spines, and others hide the rest of them. Each
-    view also says where nothing is: an object whose place is empty goes, and one of its class, size and colour that
-    appears elsewhere takes its id, moved and not doubled. Classes that move by themselves are followed instead, and
-    forgotten after a while out of sight. Everything else is kept while it is out of sight. Surfaces are joined by their
-    planes and by where they lie; there is one floor, and people stand on it.
+    are not seen beside each other are one. Each view also says where nothing is: an object whose place is empty goes,
+    and one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move
+    by themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is
+    out of sight. What is seen often enough is given, whatever its size: where no thing of its class is so large, or
+    where a small class was seldom surely detected, it is doubted, which halves its score or lowers it by what the label
+    lacks. Surfaces are joined by their planes and by where they lie; there is one floor, and people stand on it.
 
     With `save` the map is written at the end, and with it the classes that were learned for it; `map_file` begins with
     such a map, in whose frame the pose must be. What moves by itself is not taken over.
@@ -76,12 +78,17 @@ class SemanticMap(Operator):
     surfaces: Sampled[Boxes3D] = Sampled(
         required=False, doc="the cloud's surfaces, as PlaneSegmenter finds them; not used where of another stamp"
     )
-    objects: Out[Boxes3D] = Out(doc="the objects that are surely there, in the map's frame; scores are probabilities")
+    objects: Out[Boxes3D] = Out(
+        doc="the objects that were seen often enough, in the map's frame; scores are probabilities of existence, "
+        "lowered for what is doubted"
+    )
     nodes: Out[SceneGraph] = Out(
         doc="the same objects as nodes without relations, with when each was last seen; and the surfaces, whose ids "
         "are 0 (the floor) and from -11 down"
     )
-    status: Out[Diagnostics] = Out(doc="objects by what became of them; a warning for a view without points")
+    status: Out[Diagnostics] = Out(
+        doc="objects by what became of them, doubted ones too; a warning for a view without points"
+    )
 
     voxel: float = Param(0.03, gt=0.005, le=0.2, doc="side of the voxels that objects consist of", unit="m")
     overlap: float = Param(0.25, gt=0, le=1, doc="share of a view's points that are near those of the object it is of")
@@ -92,10 +99,8 @@ class SemanticMap(Operator):
     views: int = Param(3, ge=1, doc="and views from which it was seen; those less than 0.1 s after another count less")
     missed: float = Param(0.12, ge=0, doc="evidence that a view in which it is plain but not detected takes")
     plain: float = Param(0.03, gt=0, doc="angle of view from which an object should be detected", unit="rad")
-    movers: list[str] = Param(["person", "robot", "ball"], doc="classes that move by themselves")
-    carriers: list[str] = Param(["person"], doc="classes that have things in their hands")
-    portable: list[str] = Param(["mug", "bottle"], doc="classes of such things")
-    mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which such objects are forgotten", unit="s")
+    labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives roles and sizes of classes")
+    mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which agents are forgotten", unit="s")
     move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
     surface_views: int = Param(2, ge=1, doc="views of a surface from which it is given")
     max_range: float = Param(6.0, gt=0, doc="farther points are not used", unit="m")
@@ -106,8 +111,9 @@ class SemanticMap(Operator):
     )
 
     def setup(self) -> None:
-        """Raises FileNotFoundError or ValueError for a saved map that is none, or has voxels of another size."""
+        """Raises FileNotFoundError or ValueError for a bad label space or map, or a map with voxels of another size."""
         self._counts: Counter[str] = Counter()
+        self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._known = None if self.map_file is None else SavedMap.read(Path(self.use_file(self.map_file)))
         if self._known is not None and self._known.voxel != self.voxel:
             raise ValueError(f"{self.map_file} has voxels of {self._known.voxel} m, but voxel is {self.voxel}")
@@ -164,8 +170,10 @@ class SemanticMap(Operator):
             parts = seen_surfaces(surfaces, cloud, T, self.max_range)
             self._surfaces.update(cloud.stamp, parts, view, known.heading)
         objects, planes = known.confirmed(), self._surfaces.confirmed
+        scores = [o.score * (1 - known.doubt(o)) for o in objects]
         counts = {
             "objects": len(objects),
+            "doubted": sum(known.doubt(o) > 0 for o in objects),
             "tentative": len(known.objects) - len(objects),
             "seen now": sum(o.seen == cloud.stamp for o in objects),
             "moved": known.moved,
@@ -175,10 +183,10 @@ class SemanticMap(Operator):
         self._counts["views"] += 1
         self._counts["views without points"] += not len(points)
         self._counts["objects"], self._counts["moved"] = len(objects), known.moved
-        self._counts["surfaces"] = len(planes)
+        self._counts["doubted"], self._counts["surfaces"] = counts["doubted"], len(planes)
         return {
-            "objects": self._boxes(cloud.stamp, objects),
-            "nodes": nodes_of(cloud.stamp, self._frame, self._classes, objects, planes),
+            "objects": self._boxes(cloud.stamp, objects, scores),
+            "nodes": nodes_of(cloud.stamp, self._frame, self._classes, objects, scores, planes),
             "status": _status(cloud.stamp, counts),
         }
 
@@ -220,7 +228,7 @@ class SemanticMap(Operator):
     def _opened(self, boxes: Boxes3D, pose: Pose | Odometry) -> ObjectMap:
         if self._map is None:
             self._classes, self._frame = boxes.class_names, pose.frame
-            self._counts["unknown classes"] = unknown_classes(self, ("movers", "carriers", "portable"), self._classes)
+            self._counts["unknown classes"] = warn_of_unknown(self, self._labels, self._classes)
             self._map = self._made()
             if self._known is not None and self._known.objects:
                 self._take_up(self._known, boxes.stamp)
@@ -235,7 +243,7 @@ class SemanticMap(Operator):
         if saved.frame != self._frame:
             raise ValueError(f"the pose is in {self._frame!r}, {self.map_file} in {saved.frame!r}")
         assert self._map is not None
-        objects, surfaces = saved.begun(stamp, self._classes, self.movers)
+        objects, surfaces = saved.begun(stamp, self._classes, self._labels)
         self._map.restore(objects)
         self._surfaces.restore(surfaces)
 
@@ -251,13 +259,7 @@ class SemanticMap(Operator):
             mover_memory=self.mover_memory,
             move_memory=self.move_memory,
         )
-        movers = [k for k, name in enumerate(self._classes) if name in self.movers]
-        usual = {k: CLASS_SIZES[name] for k, name in enumerate(self._classes) if name in CLASS_SIZES}
-        telling = {k: TELLING[name] for k, name in enumerate(self._classes) if name in TELLING}
-        carriers, portable = (
-            [k for k, name in enumerate(self._classes) if name in names] for names in (self.carriers, self.portable)
-        )
-        return ObjectMap(max(len(self._classes), 1), movers, settings, usual, telling, carriers, portable)
+        return ObjectMap(max(len(self._classes), 1), Kinds.of(self._labels, self._classes), settings)
 
     def _observation(
         self,
@@ -272,7 +274,7 @@ class SemanticMap(Operator):
         class_id = int(boxes.class_ids[k]) if self._classes else 0
         return Observation(points, class_id, float(boxes.scores[k]), color, image)
 
-    def _boxes(self, stamp: int, objects: list[MapObject]) -> Boxes3D:
+    def _boxes(self, stamp: int, objects: list[MapObject], scores: list[float]) -> Boxes3D:
         return Boxes3D(
             stamp=stamp,
             frame=self._frame,
@@ -280,7 +282,7 @@ class SemanticMap(Operator):
             centers=np.array([o.center for o in objects]).reshape(-1, 3),
             sizes=np.array([o.size for o in objects]).reshape(-1, 3),
             orientations=quaternion_from_yaw(np.array([o.yaw for o in objects])).reshape(-1, 4),
-            scores=np.array([o.score for o in objects], np.float32),
+            scores=np.array(scores, np.float32),
             class_ids=np.array([o.class_id for o in objects], np.int32),
             ids=np.array([o.id for o in objects], np.int64),
             velocities=np.array([o.velocity for o in objects]).reshape(-1, 3),

@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
+from operators.learning.augmentation import Variation, recolored
+from operators.learning.files import TrainingFileError
+from operators.learning.second_stage import Columns, SecondTask, answered
 from operators.segmentation.border_network import BorderNetwork, DeployedBorders
 from operators.segmentation.borders import (
     BLOCK,
@@ -31,9 +34,6 @@ from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
 from operators.segmentation.labelled import enlarged
 from operators.segmentation.score import confusion, mean_iou
 from operators.segmentation.scores import best_classes
-from operators.training.augmentation import Variation, recolored
-from operators.training.files import TrainingFileError
-from operators.training.second import Columns, SecondTask, answered
 from operators.weights import open_network
 
 _ROWS, _KEPT = 900_000, 1500

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.weights import Network, SecondNetwork, open_second
 
 KIND = "borders"

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError, read_utf8
+from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError, origin_of, read_utf8
 
 VOID = 255
 _MASKS = ("masks", "annotations", "labels")
@@ -46,12 +46,14 @@ class MaskedImage:
 
 @dataclass(frozen=True)
 class SegmentationData:
-    """Class names, images to train on and images to score on; `notes` says what was assumed in reading them."""
+    """Class names, images to train on and images to score on; `notes` holds the assumptions of reading them, `origin`
+    what made them (see `origin_of`)."""
 
     classes: tuple[str, ...]
     training: tuple[MaskedImage, ...]
     validation: tuple[MaskedImage, ...]
     notes: tuple[str, ...] = ()
+    origin: str = ""
 
 
 def read_segmentation_data(folder: Path, seed: int = 0) -> SegmentationData:
@@ -110,6 +112,6 @@ def _divided(folder: Path, names: tuple[str, ...], pairs: list[MaskedImage], see
         training = validation
         notes = (
             *notes,
-            "all images are for validation: they are trained on too, so the score says little",
+            "all images are for validation: they are trained on too, so the score means little",
         )
-    return SegmentationData(names, tuple(training), tuple(validation), notes)
+    return SegmentationData(names, tuple(training), tuple(validation), notes, origin_of(folder))

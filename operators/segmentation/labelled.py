@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.inference import ModelError
 
 VOID = 255
@@ -19,7 +19,7 @@ VOID = 255
 def least_of(
     names: Sequence[str], threshold: float, by_class: Mapping[str, float], where: str
 ) -> NDArray[np.float32] | float:
-    """Returns the least confidence of each class (C,), or of all where no class has one of its own.
+    """Returns the least confidence of each class (C,), or of all where no class has a separate one.
 
     Raises ModelError for a class that the model does not know, and a share that is none.
     """

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from operators.training.backbone import Backbone, ConvNorm, MobileNetV2, SeparableConv
+from operators.learning.backbone import Backbone, ConvNorm, MobileNetV2, SeparableConv
 
 _LEVELS = ((16, 64, 64), (8, 48, 48), (4, 32, 24), (2, 16, 24))
 """(stride, channels taken from the backbone, channels after merging) on the way back."""
@@ -21,8 +21,8 @@ class ClassDecoder(nn.Module):
     """Feature maps by stride → class scores (N, C, H, W) at stride 2, before the softmax.
 
     The deepest map is weighed by the scene as a whole, as in LR-ASPP (Howard et al. 2019), then enlarged and merged
-    with finer maps step by step, since a mug is a few pixels wide. What is finer than its cells, the map of stride 4
-    tells in four answers a cell, where arithmetic is cheaper than at stride 2. A score is for the upper left pixel of
+    with finer maps step by step, since a mug is a few pixels wide. For detail finer than its cells, the map of stride 4
+    has four answers a cell, where arithmetic is cheaper than at stride 2. A score is for the upper left pixel of
     its cell.
     """
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.inference import ModelError
 from operators.network_input import Color, Labels, color
 from operators.weights.network_file import KEY

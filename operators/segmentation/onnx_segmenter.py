@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Image, SegmentationMap
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.fit import Fit, FitMode
+from operators.image.letterbox import Fit, FitMode
 from operators.inference import ModelError, Provider, open_session
 from operators.network_input import image_input, read_labels, three_channels
 from operators.segmentation.drawing import draw_segmentation

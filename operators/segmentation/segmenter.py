@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.network_input import three_channels
 from operators.segmentation.borders import Borders, scored
 from operators.segmentation.labelled import VOID, enlarged, labelled, least_of
 from operators.segmentation.scores import best_classes, probability
-from operators.weights import NetworkFileError, open_network, shipped
+from operators.weights import NetworkFileError, open_network, shipped, trained_in_simulation
 
 
 class Segmenter(Operator):
@@ -24,7 +24,7 @@ class Segmenter(Operator):
 
     The network works on its own input size; its answer is enlarged to the image without inventing classes. Where the
     file has a second network (training adds one), the borders between classes are looked at once more, in the image's
-    own pixels. Without a file, the network that comes with the project is used; it knows the simulated worlds.
+    own pixels. Without a file, the network that comes with the project is used; it was trained on simulated worlds.
     """
 
     stateless = True
@@ -36,6 +36,10 @@ class Segmenter(Operator):
     confidence_threshold: float = Param(0.0, ge=0, le=1, live=True, doc="pixels below become void (255)")
     class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")
     with_confidence: bool = Param(False, live=True, doc="also give the confidence of every pixel")
+
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        return trained_in_simulation(params["weights"] or shipped("segmenter.onnx"))
 
     def setup(self) -> None:
         """Loads the network. Raises FileNotFoundError, NetworkFileError, or ModelError for unknown classes."""

@@ -28,7 +28,7 @@ class _Segmentation(Operator, abstract=True):
 
     model: str = Param("lraspp_mobilenet_v3_large", doc="a segmentation model of torchvision")
     weights: str = Param(DEFAULT, doc="torchvision's weights by name, from its cache; nothing is downloaded")
-    checkpoint: str | None = Param(None, doc="weights of your own in place of them: a file of torch.save")
+    checkpoint: str | None = Param(None, doc="custom weights in place of them: a file of torch.save")
     device: str = Param("cpu", doc="cpu, cuda, cuda:1 or mps")
     half: bool = Param(False, doc="compute in half precision; on a GPU alone")
     side: int = Param(520, ge=0, doc="shorter side of what the network sees; 0 leaves the image as it is", unit="px")
@@ -107,7 +107,7 @@ class TorchvisionRigSegmenter(_Segmentation, merge=True):
 
     Maps are those that TorchvisionSegmenter gives camera by camera, but for ties. A camera without an image at a stamp
     is left out of that call; images of different sizes go through the network by size. More than six cameras: a class
-    of your own, derived from this one, with more outputs.
+    derived from this one, with more outputs.
     """
 
     images: In[Image] = In(many=True, doc="RGB or grey images of all cameras, told apart by their frames")

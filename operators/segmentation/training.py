@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from operators.learning.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
+from operators.learning.backbone import BACKBONES, Backbone, load_backbone
+from operators.learning.export import export_network
+from operators.learning.network_weights import begin_with, fitting_facts, sample_images
 from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
 from operators.segmentation.network import WIDEST, DeployedSegmenter, ScoringSegmenter, SegmentationNetwork, enlarged
 from operators.segmentation.score import confusion, mean_iou
 from operators.segmentation.scores import MOST_CLASSES
-from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
-from operators.training.backbone import BACKBONES, Backbone, load_backbone
-from operators.training.export import export_network
-from operators.training.network_weights import begin_with, fitting_facts, sample_images
+from operators.weights.network_file import TRAINED_ON
 
 KIND = "segmenter"
 MULTIPLE = 16
@@ -124,6 +125,7 @@ class SegmenterTask:
             "width": self.size[0],
             "height": self.size[1],
             "training_images": self.samples,
+            **({TRAINED_ON: self.data.origin} if self.data.origin else {}),
             **facts,
         }
         if len(self.data.classes) <= MOST_CLASSES:

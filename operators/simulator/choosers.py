@@ -1,4 +1,4 @@
-"""Persons who choose: a counter with drinks, chairs beside it, and somebody who goes from one to another.
+"""Persons who choose: a counter with drinks, chairs beside it, and a person who goes from one to another.
 
 Where such a person goes next is not known from where it is: there are four drinks and two seats, and the way to most of
 them leads past others.

@@ -34,7 +34,7 @@ def mounted(mount: Mount) -> Array:
 
 
 class Mounted(Protocol):
-    """A sensor with a mount, and the error of the calibration that tells it."""
+    """A sensor with a mount, and the error of its calibration."""
 
     @property
     def mount(self) -> Mount: ...

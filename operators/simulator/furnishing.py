@@ -1,6 +1,6 @@
 """Puts things into a room: walls with pictures, desks with what lies on them, filled shelves, and heaps of boxes.
 
-A wall has a frame of its own: origin on the floor at the wall's middle, x into the room, y along the wall. All
+A wall has a frame: origin on the floor at the wall's middle, x into the room, y along the wall. All
 functions add to a `Builder` and state what was put on what.
 """
 

@@ -84,7 +84,7 @@ def seat_person(builder: Builder, rng: Rng, place: Place, path: Array, timeline:
 
 
 def carry(builder: Builder, person: Person, id: int, shape: Shape, label: str, T: Array, on: int) -> None:
-    """A thing that lies on another one and that a person takes and puts back, as its script says."""
+    """A thing that lies on another one and that a person takes and puts back by a script."""
     acts, timeline = person.timeline.acts, person.timeline
     first = next(k for k, act in enumerate(acts) if act.object == id and act.activity == "reaching")
     reached = sum(act.seconds for act in acts[: first + 1])

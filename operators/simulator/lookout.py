@@ -29,11 +29,11 @@ def watching(world: World, camera: ColorCamera) -> World:
     """Returns a world whose robot stands on its round where the camera sees most of the people who choose.
 
     That is known from the still things, the ways of those people and all that they choose from; what they choose, and
-    when, has no part in it. Raises ValueError where nobody chooses, ImportError without Open3D.
+    when, has no part in it. Raises ValueError without persons who choose, ImportError without Open3D.
     """
     points = _to_see(world)
     if not len(points):
-        raise ValueError("nobody chooses among things here, so there is nobody to watch: give people: 3 or 4")
+        raise ValueError("no person here chooses among things, so there is none to watch: give people: 3 or 4")
     mount = camera.mount or world.camera_mount
     places = world.path.outline(_PLACES)
     eyes = np.column_stack([places, np.full(len(places), mount[2])])

@@ -1,4 +1,4 @@
-"""Things as meshes: what shading knows of each triangle, and each thing in a place of its own."""
+"""Things as meshes: what shading needs of each triangle, and each thing in a separate place."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Mesh:
 
 
 class Apart:
-    """The same things, each in a place of its own, far from all others: what each alone would look like."""
+    """The same things, each in a separate place, far from all others: what each alone would look like."""
 
     def __init__(self, still: Mesh, moving: Mesh, build: Callable[[Array, NDArray[np.int64]], Scene]) -> None:
         self._build = build

@@ -8,7 +8,7 @@ from types import ModuleType
 
 
 def open3d() -> ModuleType:
-    """The `open3d` module. Raises ImportError that says what to install."""
+    """The `open3d` module. Raises ImportError with what to install."""
     try:
         ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
     except OSError:

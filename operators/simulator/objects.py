@@ -115,5 +115,5 @@ def monitor(rng: Rng) -> Shape:
 
 
 def keyboard(rng: Rng) -> Shape:
-    """A keyboard in front of whoever looks along +x; it counts as part of the table it lies on."""
+    """A keyboard in front of a person who looks along +x; it counts as part of the table it lies on."""
     return box((0.14, 0.44, 0.018), Material("plain", dark(rng), tile=0.2), top=Material("keys", tile=0), cell=0.5)

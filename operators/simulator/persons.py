@@ -132,7 +132,7 @@ class Person:
 
 
 def person_doing(thing: int, person: Person, t: float) -> Doing:
-    """Returns what a person's script says."""
+    """Returns a person's script."""
     act, _, began = person.timeline.at(t)
     return Doing(thing, act.activity, began, act.goal, act.object)
 

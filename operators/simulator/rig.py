@@ -44,7 +44,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class FrameNames:
-    """Of the frames that have names of their own choice."""
+    """Of the frames whose names are chosen by parameters."""
 
     world: str
     odometry: str

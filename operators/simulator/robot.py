@@ -1,4 +1,4 @@
-"""A simulated robot in an indoor world of its own, with every sensor and the truth about everything."""
+"""A simulated robot in a generated indoor world, with every sensor and the truth about everything."""
 
 from __future__ import annotations
 
@@ -67,12 +67,14 @@ class SimulatedRobot(Source):
 
     Worlds: `office`, `corridor` (a ring that returns to its start), `table_top`, and `yard`, half of it outdoors. The
     same seed and parameters give the same bytes, whatever the machine's load, the number of threads or what else is
-    switched on: every measurement has random numbers of its own. Sensors other than the cameras are off until they are
+    switched on: every measurement has separate random numbers. Sensors other than the cameras are off until they are
     given a rate.
 
     Stamps are exact: measurement k of a sensor is at first_stamp + phase + k / rate. A faulty clock (`delay`) shows
     what was so long before the stamp; truth that belongs to an image describes what the image shows.
     """
+
+    simulated = True
 
     image: Out[Image] = Out(doc="colour")
     image_jpeg: Out[CompressedImage] = Out(doc="the same as JPEG")

@@ -241,7 +241,7 @@ class Builder:
         return Builder(_next=self._next)
 
     def keep(self, draft: Builder) -> bool:
-        """Adds a draft's still things, unless one stands in a lane; tells whether it did."""
+        """Adds a draft's still things, unless one stands in a lane; returns whether it did."""
         if any(lane.gap(thing.vertices(0.0)[:, :2]) < 0 for thing in draft.things for lane in self.lanes):
             return False
         self.things += draft.things

@@ -36,12 +36,12 @@ class Placed(Sensor):
 
     mount_error: Mount = Field(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        description="where it really is, seen from where its calibration says: a wrong calibration",
+        description="where it really is, seen from where its calibration puts it: a wrong calibration",
     )
 
 
 class Camera(Placed):
-    """A sensor with a calibration of its own."""
+    """A sensor with a separate calibration."""
 
     focal_error: float = Field(
         0.0, gt=-0.5, lt=1, description="the calibration's focal length is too long by this share"
@@ -245,7 +245,7 @@ class Sensors:
     gnss: Gnss
 
     def mounted(self) -> dict[str, Lidar | Inertial | Magnetometer | Radar | Landmarks | Gnss]:
-        """Those with a mount of their own, by frame."""
+        """Those with a separate mount, by frame."""
         return {
             "lidar": self.lidar,
             "imu": self.inertial,

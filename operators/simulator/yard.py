@@ -128,7 +128,7 @@ def _fence(builder: Builder, rng: Rng, length: float, half: float) -> None:
 
 
 def _inhabit(builder: Builder, rng: Rng, back: Wall, length: float, half: float) -> None:
-    """Somebody who walks at the back of the hall; in the yard another, a ball and a robot, each along its fence."""
+    """A person who walks at the back of the hall; in the yard another, a ball and a robot, each along its fence."""
     reach = back.length / 2 - 1.6
     add_walker(builder, rng, np.array([back.place(0.9, s * reach)[:2, 3] for s in (-1.0, -0.3, 0.4, 1.0)]))
     y = half - 1.1

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from operators.sources.synthetic_rgbd import SyntheticRgbd
     from operators.sources.victoria_park import VictoriaPark
     from operators.sources.video import VideoFile, Webcam
-else:  # most need a library of their own, which a graph without them need not load
+else:  # most need a separate library, which a graph without them need not load
     __getattr__, __dir__ = lazily(
         __name__,
         {

@@ -41,7 +41,7 @@ class BroadImu(Source):
     """Reads one HDF5 file of the BROAD benchmark.
 
     Sample k is stamped first_stamp + k / rate. The benchmark scores the phase of movement alone: `truth_of: movement`
-    gives the truth there only, so that whoever scores against it does as the benchmark does.
+    gives the truth there only, so that scores are those of the benchmark.
     Laidig et al., "BROAD: a benchmark for robust inertial orientation estimation", 2021.
     """
 

@@ -1,4 +1,4 @@
-"""Stamps of frames that have none of their own."""
+"""Stamps of frames without stamps."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class RecordedSource(Source, abstract=True):
     def setup(self) -> None:
         """Raises RuntimeError: there is nothing to run."""
         raise RuntimeError(
-            f"{type(self).__name__} stands for streams of a recording and has none of its own: replay one into the "
+            f"{type(self).__name__} stands for streams of a recording and has no data: replay one into the "
             "graph with `dataflow replay RECORDING --graph GRAPH`"
         )
 

@@ -115,10 +115,12 @@ def list_tum(folder: Path) -> Dataset:
     """`rgb.txt`, `depth.txt`, `groundtruth.txt`: stamps in seconds, pairs by nearest stamp within 20 ms.
 
     A frame's stamp is its colour image's. Depth is registered to colour, 5000 units a metre; without
-    `camera-intrinsics.txt` both have the dataset's default of 525 px around (319.5, 239.5).
+    `camera-intrinsics.txt` both have the dataset's default of 525 px around (319.5, 239.5). Rows of NaN in
+    `groundtruth.txt` are moments without a known pose; a truth of which no row is near an image is an error.
     """
     images, depths = _tum_list(folder / "rgb.txt", 1), _tum_list(folder / "depth.txt", 1)
     truth = _tum_list(folder / "groundtruth.txt", 7) if (folder / "groundtruth.txt").is_file() else []
+    truth = [(stamp, words) for stamp, words in truth if "nan" not in " ".join(words).lower()]
     stamps = [stamp for stamp, _ in images]
     try:
         poses = dict(mutually_nearest(stamps, [stamp for stamp, _ in truth], _TUM_GAP))
@@ -127,6 +129,12 @@ def list_tum(folder: Path) -> Dataset:
         raise SourceError(f"{folder}: {error}") from None
     if not pairs:
         raise SourceError(f"{folder}: no image of rgb.txt is within 20 ms of one of depth.txt")
+    if truth and not poses:
+        raise SourceError(
+            f"{folder / 'groundtruth.txt'}: none of its {len(truth):,} poses is within 20 ms of an image: its times "
+            f"run from {truth[0][0] * 1e-9:.3f} to {truth[-1][0] * 1e-9:.3f} s, those of rgb.txt from "
+            f"{stamps[0] * 1e-9:.3f} to {stamps[-1] * 1e-9:.3f} s"
+        )
     frames = []
     for i, j in pairs:
         stamp, (image,) = images[i]

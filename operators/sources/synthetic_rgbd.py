@@ -21,6 +21,8 @@ class SyntheticRgbd(Source):
     and k alone.
     """
 
+    simulated = True
+
     image: Out[Image] = Out(doc="colour")
     depth: Out[DepthImage] = Out(doc="depth, metres; 0 beyond max_depth")
     image_info: Out[CameraInfo] = Out(static=True, doc="calibration of the colour camera")

@@ -37,8 +37,8 @@ class VictoriaPark(Source):
     covariance is that of the step that led to it.
 
     No truth comes with it: the file holds odometry and sightings alone. Where the truck was is known only by satellite
-    fixes that the original logs have for parts of the way; the trees were never surveyed. What estimates are compared
-    with is the optimum over all measurements of the file, which another solver finds.
+    fixes that the original logs have for parts of the way; the trees were never surveyed. Estimates are compared
+    with the optimum over all measurements of the file, which another solver finds.
     """
 
     odometry: Out[Odometry] = Out(doc="dead reckoning, with the twist and the covariance of each step")

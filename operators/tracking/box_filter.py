@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -78,15 +81,44 @@ class BoxFilter:
         return np.asarray(spread**2)
 
 
+class FilterpyBoxFilter(BoxFilter):
+    """The same filter run by filterpy: equal to rounding, at several times the time."""
+
+    def predict(self, seconds: float) -> None:
+        """Moves on by a time; sizes stay above one pixel."""
+        F, steps = _motion(seconds)
+        spread = _accelerations(self._noise, self.mean[3, 0])
+        for i in range(4):
+            moved = kalman().predict(self.mean[i], self.covariance[i], F, spread[i] * steps)
+            self.mean[i], self.covariance[i] = moved
+        self.mean[2:, 0] = np.maximum(self.mean[2:, 0], 1.0)
+
+    def update(self, box: Array, score: float) -> None:
+        """Takes a measured box (x1, y1, x2, y2)."""
+        R = self._measured(score) * self.mean[3, 0] ** 2
+        for i, measured in enumerate(_middle(box)):
+            seen = kalman().update(self.mean[i], self.covariance[i], measured, R[i : i + 1, None], np.eye(1, 2))
+            self.mean[i], self.covariance[i] = seen
+        self.mean[2:, 0] = np.maximum(self.mean[2:, 0], 1.0)
+
+
+@cache
+def kalman() -> ModuleType:
+    """Returns `filterpy.kalman`, imported at the first call, since it loads much of scipy."""
+    return import_module("filterpy.kalman")
+
+
 def predict(filters: Sequence[BoxFilter], noise: BoxNoise, seconds: float) -> None:
-    """Moves filters of one noise on by a time, all at once; sizes stay above one pixel."""
+    """Moves filters of one noise on by a time; all at once but where filterpy runs them. Sizes stay above one pixel."""
     if not filters:
         return
-    F = np.array([[1.0, seconds], [0.0, 1.0]])
-    steps = np.array([[seconds**4 / 4, seconds**3 / 2], [seconds**3 / 2, seconds**2]])
+    if isinstance(filters[0], FilterpyBoxFilter):
+        for filter in filters:
+            filter.predict(seconds)
+        return
+    F, steps = _motion(seconds)
     means, covariances = np.stack([f.mean for f in filters]), np.stack([f.covariance for f in filters])
-    shares = np.array([noise.acceleration, noise.acceleration, noise.growth, noise.growth])
-    spread = (shares * means[:, 3, 0, None]) ** 2
+    spread = _accelerations(noise, means[:, 3, 0, None])
     means = means @ F.T
     means[:, 2:, 0] = np.maximum(means[:, 2:, 0], 1.0)
     covariances = F @ covariances @ F.T + spread[..., None, None] * steps
@@ -99,6 +131,17 @@ def boxes_of(filters: Sequence[BoxFilter]) -> Array:
     means = np.array([f.mean[:, 0] for f in filters]).reshape(-1, 4)
     middle, half = means[:, :2], means[:, 2:] / 2
     return np.concatenate([middle - half, middle + half], axis=1)
+
+
+def _motion(seconds: float) -> tuple[Array, Array]:
+    """Returns the transition (2, 2) of a value and its rate, and the noise (2, 2) of unit white acceleration."""
+    step = np.array([seconds**2 / 2, seconds])
+    return np.array([[1.0, seconds], [0.0, 1.0]]), np.outer(step, step)
+
+
+def _accelerations(noise: BoxNoise, heights: Array | float) -> Array:
+    """Returns the variances (..., 4) of the accelerations for boxes of these heights (..., 1), in pixels²/s⁴."""
+    return np.asarray((np.array([noise.acceleration, noise.acceleration, noise.growth, noise.growth]) * heights) ** 2)
 
 
 def _middle(box: Array) -> Array:

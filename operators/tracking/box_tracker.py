@@ -25,6 +25,7 @@ class BoxTrackerSettings:
     `strong` parts detections into those that may begin a track and those that only continue one; `birth` is the least
     score that begins one. Overlaps are least IoUs of each stage; `reach` grows boxes by this share of their size in the
     last stage. Evidence is the sum of the log odds of a track's detections; it falls by `fade` a second unseen.
+    `filter` is the class of the Kalman filters.
     """
 
     strong: float = 0.5
@@ -38,6 +39,7 @@ class BoxTrackerSettings:
     memory: float = 2.0
     appearance: float = 0.3
     noise: BoxNoise = field(default_factory=BoxNoise)
+    filter: type[BoxFilter] = BoxFilter
 
 
 @dataclass
@@ -124,7 +126,7 @@ class BoxTracker:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._next, self._stamp = int(state["next"]), state["stamp"]
-        self.tracks = [_unpacked(each, self._settings.noise) for each in state["tracks"]]
+        self.tracks = [_unpacked(each, self._settings) for each in state["tracks"]]
 
     def _match(
         self,
@@ -179,7 +181,7 @@ class BoxTracker:
     def _begin(self, stamp: int, box: Array, score: float, class_id: int, feature: Array | None) -> None:
         evidence = _log_odds(score)
         state = TrackState.CONFIRMED if evidence >= self._settings.confirm else TrackState.TENTATIVE
-        filter = BoxFilter(box, score, self._settings.noise)
+        filter = self._settings.filter(box, score, self._settings.noise)
         self.tracks.append(BoxTrack(self._next, filter, class_id, evidence, stamp, stamp, state, feature=feature))
         self._next += 1
 
@@ -205,8 +207,8 @@ def _packed(track: BoxTrack) -> dict[str, Any]:
     return plain | {"state": int(track.state), "filter": track.filter.snapshot()}
 
 
-def _unpacked(state: Mapping[str, Any], noise: BoxNoise) -> BoxTrack:
-    filter = BoxFilter(np.array([0.0, 0, 1, 1]), 1.0, noise)
+def _unpacked(state: Mapping[str, Any], settings: BoxTrackerSettings) -> BoxTrack:
+    filter = settings.filter(np.array([0.0, 0, 1, 1]), 1.0, settings.noise)
     filter.restore(state["filter"])
     plain = {key: state[key] for key in ("id", "class_id", "evidence", "born", "seen", "hits")}
     feature = None if state["feature"] is None else np.array(state["feature"])

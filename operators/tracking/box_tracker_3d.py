@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import TrackState
 from operators.tracking.assignment import assign
+from operators.tracking.box_filter import kalman
 
 Array = NDArray[np.float64]
 _GATE = 11.34  # 99 % of chi-square with 3 degrees of freedom
@@ -129,8 +130,8 @@ class BoxTracker3D:
         F = np.eye(6)
         F[:3, 3:] = seconds * np.eye(3)
         G = np.concatenate([np.eye(3) * seconds**2 / 2, np.eye(3) * seconds])
-        track.mean = F @ track.mean
-        track.covariance = F @ track.covariance @ F.T + self._settings.acceleration**2 * (G @ G.T)
+        Q = self._settings.acceleration**2 * (G @ G.T)
+        track.mean, track.covariance = kalman().predict(track.mean, track.covariance, F, Q)
 
     def _noise(self, found: Solids, k: int) -> Array:
         floor = np.eye(3) * (self._settings.position * (2 - found.scores[k])) ** 2
@@ -152,12 +153,8 @@ class BoxTracker3D:
         return {rows[a]: columns[b] for a, b in assign(value, allowed)}
 
     def _see(self, track: SolidTrack, stamp: int, found: Solids, k: int) -> None:
-        S = track.covariance[:3, :3] + self._noise(found, k)
-        K = np.linalg.solve(S, track.covariance[:3, :]).T
-        track.mean = track.mean + K @ (found.centers[k] - track.mean[:3])
-        IKH = np.eye(6)
-        IKH[:, :3] -= K
-        track.covariance = IKH @ track.covariance @ IKH.T + K @ self._noise(found, k) @ K.T
+        seen = kalman().update(track.mean, track.covariance, found.centers[k], self._noise(found, k), np.eye(3, 6))
+        track.mean, track.covariance = seen
         score = float(found.scores[k])
         share = score / (track.size_weight + score)
         track.yaw = self._heading(track, float(found.yaws[k]), share)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from dataflow.messages import Detections2D, Diagnostics, FeatureVector, Tracks, 
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.status import counted_status
-from operators.tracking.box_filter import BoxNoise, boxes_of
+from operators.tracking.box_filter import BoxFilter, BoxNoise, FilterpyBoxFilter, boxes_of
 from operators.tracking.box_tracker import BoxTrack, BoxTracker, BoxTrackerSettings
 
 Array = NDArray[np.float64]
@@ -45,6 +45,7 @@ class MultiObjectTracker(Operator):
     appearance: float = Param(0.3, ge=0, le=1, doc="weight of the likeness of vectors beside that of boxes")
     position_noise: float = Param(0.03, gt=0, doc="standard deviation of a box's middle, share of its height")
     acceleration: float = Param(4.0, gt=0, doc="standard deviation of its acceleration", unit="heights/s²")
+    filter: Literal["numpy", "filterpy"] = Param("numpy", doc="what runs the Kalman filters; filterpy takes longer")
 
     def setup(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -62,6 +63,7 @@ class MultiObjectTracker(Operator):
                 weak_overlap=self.weak_overlap,
                 appearance=self.appearance,
                 noise=noise,
+                filter=FilterpyBoxFilter if self.filter == "filterpy" else BoxFilter,
             )
         )
         self._view: tuple[str, int, int] | None = None

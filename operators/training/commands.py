@@ -14,30 +14,18 @@ from operators.training.console import Data, Json, SplitSeed, friendly, out_cons
 from operators.training.evaluation import evaluate
 from operators.training.options import (
     Backbone,
-    Batch,
-    Bfloat16,
-    Device,
-    Epochs,
-    Every,
-    Flip,
     Frozen,
+    ImageTraining,
     Initial,
-    Overwrite,
-    Rate,
-    Resume,
-    Seed,
     Size,
-    Strength,
-    Threads,
     Width,
-    Workers,
+    takes,
 )
 from operators.training.people_commands import train_activity, train_posture
 from operators.training.refining import BORDERS, REFINER, BorderEpochs, RefinerEpochs, command_of, train_second
-from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data, variation_of
+from operators.training.running import input_size, prepare, report, tell_data
 from operators.training.torchvision_command import train_torchvision
 from operators.training.trunk_command import train_trunk
-from operators.training.views_commands import train_focus, train_reclassifier
 
 __all__ = ["evaluate", "train"]
 
@@ -53,42 +41,29 @@ train = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
-for name, command in (
-    ("activity", train_activity), ("focus", train_focus), ("posture", train_posture),
-    ("reclassifier", train_reclassifier), ("torchvision", train_torchvision), ("trunk", train_trunk),
-):  # fmt: skip
-    train.command(name)(command)
+train.command("activity")(train_activity)
+train.command("posture")(train_posture)
+train.command("torchvision")(train_torchvision)
+train.command("trunk")(train_trunk)
 for each in (REFINER, BORDERS):
     train.command(each.kind)(command_of(each))
 
 
 @train.command("detector")
+@takes(ImageTraining, epochs=100)
 def train_detector(
     data: Data,
+    options: ImageTraining,
     classes: Annotated[
         str | None, typer.Option(metavar="A,B,...", help="Only these classes of the data, in this order.")
     ] = None,
-    epochs: Epochs = 100,
     out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("detector.onnx"),
-    resume: Resume = False,
-    overwrite: Overwrite = False,
     size: Size = None,
-    batch: Batch = 16,
-    learning_rate: Rate = 1e-3,
-    seed: Seed = 0,
     width: Width = 1.0,
     backbone_weights: Backbone = None,
     frozen_stride: Frozen = None,
     initial: Initial = None,
-    flip: Flip = True,
-    variation: Strength = 1.0,
     refiner_epochs: RefinerEpochs = 8,
-    evaluate_every: Every = 1,
-    workers: Workers = 2,
-    threads: Threads = None,
-    device: Device = None,
-    bfloat16: Bfloat16 = False,
-    json: Json = False,
 ) -> None:
     """Train a grid detector on a folder in COCO or YOLO format.
 
@@ -102,56 +77,39 @@ def train_detector(
       dataflow train detector DATA --out out/mine.onnx --resume
     """
     with friendly():
-        keep_earlier(out, resume, overwrite)
+        options.keep_earlier(out)
         from operators.detection.custom.folder import read_detection_data
         from operators.detection.custom.training import DetectorTask
-        from operators.training.loop import Settings
 
-        read = read_detection_data(data, seed)
+        read = read_detection_data(data, options.seed)
         read = read if classes is None else read.only([name.strip() for name in classes.split(",") if name.strip()])
         task = DetectorTask(
             read,
             input_size(size, [image.file for image in read.training[:20]]),
-            seed=seed,
+            seed=options.seed,
             width=width,
-            variation=variation_of(flip, variation),
+            variation=options.changes,
             backbone=backbone_weights,
         )
         prepare(task, backbone_weights, frozen_stride, initial)
-        tell_data(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
-        settings = Settings(
-            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
-            device=device, bfloat16=bfloat16,
-        )  # fmt: skip
-        outcome = run_task(task, settings, out, resume, json)
-        second = train_second(REFINER, read, out, settings, refiner_epochs, task.variation, resume, json)
-    report(outcome, "operators.detection:CustomDetector", json, seconds={"refiner": second})
+        tell_data(read, task.size, options.json)
+        outcome = options.run(task, out)
+        second = train_second(REFINER, read, out, options, refiner_epochs)
+    report(outcome, "operators.detection:CustomDetector", options.json, seconds={"refiner": second})
 
 
 @train.command("segmenter")
+@takes(ImageTraining, epochs=60)
 def train_segmenter(
     data: Data,
-    epochs: Epochs = 60,
+    options: ImageTraining,
     out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("segmenter.onnx"),
-    resume: Resume = False,
-    overwrite: Overwrite = False,
     size: Size = None,
-    batch: Batch = 16,
-    learning_rate: Rate = 1e-3,
-    seed: Seed = 0,
     width: Width = 1.0,
     backbone_weights: Backbone = None,
     frozen_stride: Frozen = None,
     initial: Initial = None,
-    flip: Flip = True,
-    variation: Strength = 1.0,
     border_epochs: BorderEpochs = 10,
-    evaluate_every: Every = 1,
-    workers: Workers = 2,
-    threads: Threads = None,
-    device: Device = None,
-    bfloat16: Bfloat16 = False,
-    json: Json = False,
 ) -> None:
     """Train a segmenter on a folder with images/, masks/ (PNGs of class ids, 255 void) and classes.txt.
 
@@ -162,52 +120,35 @@ def train_segmenter(
       dataflow train segmenter DATA --out out/segmenter.onnx
     """
     with friendly():
-        keep_earlier(out, resume, overwrite)
+        options.keep_earlier(out)
         from operators.segmentation.dataset import read_segmentation_data
         from operators.segmentation.training import SegmenterTask
-        from operators.training.loop import Settings
 
-        read = read_segmentation_data(data, seed)
+        read = read_segmentation_data(data, options.seed)
         task = SegmenterTask(
             read,
             input_size(size, [image.image for image in read.training[:20]]),
-            seed=seed,
+            seed=options.seed,
             width=width,
-            variation=variation_of(flip, variation),
+            variation=options.changes,
             backbone=backbone_weights,
         )
         prepare(task, backbone_weights, frozen_stride, initial)
-        tell_data(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
-        settings = Settings(
-            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
-            device=device, bfloat16=bfloat16,
-        )  # fmt: skip
-        outcome = run_task(task, settings, out, resume, json)
-        second = train_second(BORDERS, read, out, settings, border_epochs, task.variation, resume, json)
-    report(outcome, "operators.segmentation:Segmenter", json, seconds={"borders": second})
+        tell_data(read, task.size, options.json)
+        outcome = options.run(task, out)
+        second = train_second(BORDERS, read, out, options, border_epochs)
+    report(outcome, "operators.segmentation:Segmenter", options.json, seconds={"borders": second})
 
 
 @train.command("classifier")
+@takes(ImageTraining, epochs=40, batch=32)
 def train_classifier(
     data: Data,
-    epochs: Epochs = 40,
+    options: ImageTraining,
     out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("classifier.onnx"),
-    resume: Resume = False,
-    overwrite: Overwrite = False,
     size: Annotated[str, typer.Option(metavar="WxH", help="Input size, multiples of 32.")] = "96x96",
     residual: Annotated[bool, typer.Option(help="Carry what comes into each block around it.")] = False,
-    batch: Batch = 32,
-    learning_rate: Rate = 1e-3,
-    seed: Seed = 0,
     initial: Initial = None,
-    flip: Flip = True,
-    variation: Strength = 1.0,
-    evaluate_every: Every = 1,
-    workers: Workers = 2,
-    threads: Threads = None,
-    device: Device = None,
-    bfloat16: Bfloat16 = False,
-    json: Json = False,
 ) -> None:
     """Train a recognition network on a folder of images sorted by class (DATA/cat/*.jpg, DATA/dog/*.jpg ...).
 
@@ -220,54 +161,37 @@ def train_classifier(
       dataflow train classifier DATA --residual --size 128x128
     """
     with friendly():
-        keep_earlier(out, resume, overwrite)
+        options.keep_earlier(out)
+        from operators.learning.backbone import start_from
         from operators.recognition.dataset import read_classification_data
         from operators.recognition.training import ClassifierTask
-        from operators.training.backbone import start_from
-        from operators.training.loop import Settings
 
-        read = read_classification_data(data, seed)
+        read = read_classification_data(data, options.seed)
         task = ClassifierTask(
             read,
             input_size(size, ()),
-            seed=seed,
-            variation=variation_of(flip, variation),
+            seed=options.seed,
+            variation=options.changes,
             architecture="residual" if residual else "plain",
         )
         if initial is not None:
             start_from(task.network, initial)
-        tell_data(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
-        settings = Settings(
-            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
-            device=device, bfloat16=bfloat16,
-        )  # fmt: skip
-        outcome = run_task(task, settings, out, resume, json)
-    report(outcome, "operators.recognition:ImageClassifier", json)
+        tell_data(read, task.size, options.json)
+        outcome = options.run(task, out)
+    report(outcome, "operators.recognition:ImageClassifier", options.json)
 
 
 @train.command("pair")
+@takes(ImageTraining, epochs=100)
 def train_pair(
     data: Data,
-    epochs: Epochs = 100,
+    options: ImageTraining,
     out: Annotated[Path, typer.Option(help="The folder to write to.")] = Path("networks"),
-    resume: Resume = False,
-    overwrite: Overwrite = False,
     size: Size = None,
-    batch: Batch = 16,
-    learning_rate: Rate = 1e-3,
-    seed: Seed = 0,
     width: Width = 1.0,
     initial: Initial = None,
-    flip: Flip = True,
-    variation: Strength = 1.0,
     refiner_epochs: RefinerEpochs = 8,
     border_epochs: BorderEpochs = 10,
-    evaluate_every: Every = 1,
-    workers: Workers = 2,
-    threads: Threads = None,
-    device: Device = None,
-    bfloat16: Bfloat16 = False,
-    json: Json = False,
 ) -> None:
     """Train a detector and a segmenter that learn together, on a folder with both boxes (COCO) and masks.
 
@@ -281,32 +205,32 @@ def train_pair(
     """
     with friendly():
         file = out / "pair.onnx"
-        keep_earlier(file, resume, overwrite)
+        options.keep_earlier(file)
         from operators.detection.custom.folder import read_detection_data
         from operators.segmentation.dataset import read_segmentation_data
-        from operators.training.loop import Settings
         from operators.training.pair import DETECTOR, SEGMENTER, PairTask
 
-        boxes, masks = read_detection_data(data, seed), read_segmentation_data(data, seed)
+        boxes, masks = read_detection_data(data, options.seed), read_segmentation_data(data, options.seed)
         task = PairTask(
             boxes,
             masks,
             input_size(size, [image.file for image in boxes.training[:20]]),
-            seed=seed,
+            seed=options.seed,
             width=width,
-            variation=variation_of(flip, variation),
+            variation=options.changes,
         )
         prepare(task, None, 0, initial)
-        tell_data(boxes.notes, len(boxes.training), len(boxes.validation), masks.classes, task.size, json)
-        settings = Settings(
-            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
-            device=device, bfloat16=bfloat16,
-        )  # fmt: skip
-        outcome = run_task(task, settings, file, resume, json)
-        refiner = train_second(REFINER, boxes, out / DETECTOR, settings, refiner_epochs, task.variation, resume, json)
-        borders = train_second(BORDERS, masks, out / SEGMENTER, settings, border_epochs, task.variation, resume, json)
+        tell_data(boxes, task.size, options.json, masks.classes)
+        outcome = options.run(task, file)
+        refiner = train_second(REFINER, boxes, out / DETECTOR, options, refiner_epochs)
+        borders = train_second(BORDERS, masks, out / SEGMENTER, options, border_epochs)
     seconds = {"refiner": refiner, "borders": borders}
-    report(outcome, "operators.detection:CustomDetector and operators.segmentation:Segmenter", json, seconds=seconds)
+    report(
+        outcome,
+        "operators.detection:CustomDetector and operators.segmentation:Segmenter",
+        options.json,
+        seconds=seconds,
+    )
 
 
 @train.command("quantize")

@@ -20,9 +20,9 @@ class Writable(Protocol):
     def write(self, file: Path) -> None: ...
 
 
-def worlds(first: int, count: int, kinds: Sequence[str] = KINDS) -> list[Chosen]:
+def worlds(first: int, count: int) -> list[Chosen]:
     """Returns `count` worlds (kind, seed, people), kinds and numbers of people in turn."""
-    return [(kinds[k % len(kinds)], first + k, (3, 3, 4, 2)[(k // len(kinds)) % 4]) for k in range(count)]
+    return [(KINDS[k % len(KINDS)], first + k, (3, 3, 4, 2)[(k // len(KINDS)) % 4]) for k in range(count)]
 
 
 def file_of(folder: Path, world: Chosen) -> Path:

@@ -1,14 +1,26 @@
-"""Options that the training commands share."""
+"""Options that the training commands share, and the run that they describe."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-Epochs = Annotated[int, typer.Option(min=1, help="Passes through the training images.")]
-Batch = Annotated[int, typer.Option(min=1, help="Images a step.")]
+from operators.training.console import Json, err_console
+
+if TYPE_CHECKING:
+    from operators.learning.augmentation import Variation
+    from operators.learning.loop import Outcome, Settings, Task
+
+Epochs = Annotated[int, typer.Option(min=1, help="Passes through the training data.")]
+Batch = Annotated[
+    int, typer.Option(min=1, help="Samples a step; of second networks chunks, of 32 boxes or 64 blocks each.")
+]
 Rate = Annotated[float, typer.Option("--learning-rate", min=1e-7, help="Largest learning rate.")]
 Seed = Annotated[int, typer.Option(min=0, help="Decides everything random.")]
 Size = Annotated[
@@ -43,10 +55,101 @@ Strength = Annotated[
     float, typer.Option("--variation", min=0, max=2, help="Strength of the random changes of training images.")
 ]
 Every = Annotated[int, typer.Option(min=1, help="Score after every so many epochs.")]
-Workers = Annotated[int, typer.Option(min=1, help="Threads that prepare images.")]
+Workers = Annotated[int, typer.Option(min=1, help="Threads that prepare what is learned from.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads that compute. Default: one a core.")]
 Device = Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1 ... Default: a GPU where there is one.")]
 Bfloat16 = Annotated[
     bool,
     typer.Option(help="Compute convolutions in bfloat16: twice as fast on processors that have it, slower on others."),
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """The options of every training command."""
+
+    epochs: Epochs
+    resume: Resume = False
+    overwrite: Overwrite = False
+    batch: Batch = 16
+    learning_rate: Rate = 1e-3
+    seed: Seed = 0
+    evaluate_every: Every = 1
+    workers: Workers = 2
+    threads: Threads = None
+    device: Device = None
+    json: Json = False
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the training loop."""
+        from operators.learning.loop import Settings
+
+        return Settings(**{f.name: getattr(self, f.name) for f in fields(Settings) if hasattr(self, f.name)})
+
+    def keep_earlier(self, out: Path, suffix: str = ".onnx") -> None:
+        """Raises FileExistsError where an earlier training would be lost, ValueError for a file of another suffix."""
+        if out.suffix != suffix:
+            raise ValueError(f"--out {str(out)!r} should end in {suffix}")
+        self.keep_files((out, out.with_suffix(".pt")))
+
+    def keep_files(self, files: Iterable[Path]) -> None:
+        """Raises FileExistsError where files of an earlier training would be lost."""
+        there = [str(file) for file in files if file.exists()]
+        if there and not (self.resume or self.overwrite):
+            raise FileExistsError(f"{' and '.join(there)} exist already: give --resume, --overwrite or another --out")
+
+    def run(self, task: Task, out: Path) -> Outcome:
+        """Trains with a progress bar, or without one where output is for programs; writes the network to `out`."""
+        from operators.learning.loop import train
+        from operators.training.progress import TrainingBar
+
+        if self.json:
+            return train(task, self.settings, out, resume=self.resume)
+        with TrainingBar(err_console) as bar:
+            return train(task, self.settings, out, resume=self.resume, progress=bar)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageTraining(Training):
+    """Also the options of what learns from images."""
+
+    flip: Flip = True
+    variation: Strength = 1.0
+    bfloat16: Bfloat16 = False
+
+    @property
+    def changes(self) -> Variation:
+        """The random changes of training images."""
+        from operators.learning.augmentation import Variation
+
+        return Variation(flip=0.5 if self.flip else 0.0).times(self.variation)
+
+
+def takes(kind: type[Training], **defaults: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Makes a command of a function with an argument `options` of this kind, whose fields become options of the command
+    line; `defaults` replace those of the kind."""
+
+    def made(function: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(function, eval_str=True)
+        hints = get_type_hints(kind, include_extras=True)
+        shared = {
+            f.name: inspect.Parameter(
+                f.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=defaults.get(f.name, inspect.Parameter.empty if f.default is MISSING else f.default),
+                annotation=hints[f.name],
+            )
+            for f in fields(kind)
+        }
+
+        @functools.wraps(function)
+        def command(**given: Any) -> None:
+            options = kind(**{name: given.pop(name) for name in shared})
+            function(options=options, **given)
+
+        others = [p.replace(kind=p.KEYWORD_ONLY) for name, p in own.parameters.items() if name != "options"]
+        command.__signature__ = own.replace(parameters=[*others, *shared.values()])  # type: ignore[attr-defined]
+        return command
+
+    return made

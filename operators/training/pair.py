@@ -18,11 +18,11 @@ from operators.detection.custom.dataset import DataError, DetectionData
 from operators.detection.custom.loss import Truth
 from operators.detection.custom.network import FINE_STRIDES
 from operators.detection.custom.training import DetectorTask, truth_of
+from operators.learning.augmentation import Variation, fitted, tensor_of, varied, warp
+from operators.learning.backbone import Backbone
+from operators.learning.network_weights import begin_with, sample_images
 from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
 from operators.segmentation.training import SegmenterTask
-from operators.training.augmentation import Variation, fitted, tensor_of, varied, warp
-from operators.training.backbone import Backbone
-from operators.training.network_weights import begin_with, sample_images
 
 DETECTOR, SEGMENTER = "detector.onnx", "segmenter.onnx"
 _CHANNELS = 64

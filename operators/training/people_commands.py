@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.progress import track
 
-from operators.training.console import Json, friendly
-from operators.training.making import Chosen, Processes, Worlds, followed, tell
-from operators.training.options import Device, Every, Overwrite, Rate, Resume, Seed, Threads, Workers
-from operators.training.running import keep_earlier, report, run_task
+from operators.training.console import err_console, friendly
+from operators.training.options import Training, takes
+from operators.training.running import report
 
 if TYPE_CHECKING:
     from operators.recognition.episodes import Episode
 
+Worlds = Annotated[int, typer.Option(min=1, help="Worlds to train on.")]
+Chosen = Annotated[int, typer.Option("--validation", min=1, help="Worlds by which the best epoch is chosen.")]
+Processes = Annotated[int, typer.Option(min=1, help="Worlds made at once.")]
 Folder = Annotated[Path, typer.Argument(help="Folder of episodes; those that it lacks are made.", show_default=False)]
 Silhouettes = Annotated[
     Path, typer.Argument(help="Folder of silhouettes; those that it lacks are made.", show_default=False)
@@ -26,12 +30,12 @@ Sensed = Annotated[
 ]
 SensedChosen = Annotated[Path | None, typer.Option(help="Folder of such tracks by which the best epoch is chosen too.")]
 Repeats = Annotated[int, typer.Option(min=1, help="Times that each of the sensed tracks is taken.")]
-Epochs = Annotated[int, typer.Option(min=1, help="Passes through the tracks.")]
-Batch = Annotated[int, typer.Option(min=1, help="Tracks a step.")]
 
 
+@takes(Training, epochs=10, batch=32, learning_rate=3e-3, workers=1, threads=1, device="cpu")
 def train_activity(
     data: Folder,
+    options: Training,
     worlds: Worlds = 40,
     validation: Chosen = 12,
     processes: Processes = 1,
@@ -39,17 +43,7 @@ def train_activity(
     sensed: Sensed = None,
     sensed_validation: SensedChosen = None,
     repeats: Repeats = 8,
-    epochs: Epochs = 10,
     out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("activity.onnx"),
-    resume: Resume = False,
-    overwrite: Overwrite = False,
-    batch: Batch = 32,
-    learning_rate: Rate = 3e-3,
-    seed: Seed = 0,
-    evaluate_every: Every = 1,
-    threads: Annotated[int, typer.Option(min=1, help="Threads that compute.")] = 1,
-    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ...")] = "cpu",
-    json: Json = False,
 ) -> None:
     """Train the activity network, two LSTM layers, on people of simulated worlds.
 
@@ -63,43 +57,29 @@ def train_activity(
       dataflow train activity out/episodes --worlds 10 --epochs 3 --out out/activity.onnx
     """
     with friendly():
-        keep_earlier(out, resume, overwrite)
+        options.keep_earlier(out)
         from operators.recognition.activity_training import ActivityTask
         from operators.recognition.sensed_people import read_tracks
-        from operators.training.loop import Settings
 
-        training, choosing = _episodes(data, worlds, validation, processes, json)
+        training, choosing = _episodes(data, worlds, validation, processes, options.json)
         parts = [read_tracks(folder) if folder else [] for folder in (sensed, sensed_validation)]
         task = ActivityTask(
-            training, choosing, sensed=parts[0], sensed_validation=parts[1], repeats=repeats, seed=seed,
+            training, choosing, sensed=parts[0], sensed_validation=parts[1], repeats=repeats, seed=options.seed,
             variations=variations,
         )  # fmt: skip
-        tell(f"{task.samples} tracks of {worlds} worlds to train on, {validation} worlds to choose by", json)
-        settings = Settings(
-            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=1, threads=threads,
-            device=device,
-        )  # fmt: skip
-        outcome = run_task(task, settings, out, resume, json)
-    report(outcome, "operators.recognition:ActivityRecognizer", json)
+        _tell(f"{task.samples} tracks of {worlds} worlds to train on, {validation} worlds to choose by", options.json)
+        outcome = options.run(task, out)
+    report(outcome, "operators.recognition:ActivityRecognizer", options.json)
 
 
+@takes(Training, epochs=10, batch=128, learning_rate=3e-3, workers=1)
 def train_posture(
     data: Silhouettes,
+    options: Training,
     worlds: Worlds = 160,
     validation: Chosen = 8,
     processes: Processes = 1,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes through the silhouettes.")] = 10,
     out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("posture.onnx"),
-    resume: Resume = False,
-    overwrite: Overwrite = False,
-    batch: Annotated[int, typer.Option(min=2, help="Silhouettes a step.")] = 128,
-    learning_rate: Rate = 3e-3,
-    seed: Seed = 0,
-    evaluate_every: Every = 1,
-    workers: Workers = 1,
-    threads: Threads = None,
-    device: Device = None,
-    json: Json = False,
 ) -> None:
     """Train the posture network on silhouettes of people in simulated worlds.
 
@@ -113,22 +93,21 @@ def train_posture(
       dataflow train posture out/silhouettes --worlds 20 --epochs 4 --out out/posture.onnx
     """
     with friendly():
-        keep_earlier(out, resume, overwrite)
+        if options.batch < 2:
+            raise ValueError("--batch: normalisation needs 2 silhouettes a step or more")
+        options.keep_earlier(out)
         from operators.recognition.posture_training import PostureTask
         from operators.training import made_worlds
-        from operators.training.loop import Settings
         from operators.training.simulated_postures import TRAINING, VALIDATION, read_postures, write_postures
 
         parts = made_worlds.worlds(TRAINING, worlds), made_worlds.worlds(VALIDATION, validation)
-        followed(write_postures(data, [*parts[0], *parts[1]], processes), worlds + validation, json)
-        task = PostureTask(read_postures(data, parts[0]), read_postures(data, parts[1]), seed=seed)
-        tell(f"{task.samples} silhouettes of {worlds} worlds to train on, {validation} worlds to choose by", json)
-        settings = Settings(
-            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
-            device=device,
-        )  # fmt: skip
-        outcome = run_task(task, settings, out, resume, json)
-    report(outcome, "operators.recognition:PostureRecognizer", json)
+        _followed(write_postures(data, [*parts[0], *parts[1]], processes), worlds + validation, options.json)
+        task = PostureTask(read_postures(data, parts[0]), read_postures(data, parts[1]), seed=options.seed)
+        _tell(
+            f"{task.samples} silhouettes of {worlds} worlds to train on, {validation} worlds to choose by", options.json
+        )
+        outcome = options.run(task, out)
+    report(outcome, "operators.recognition:PostureRecognizer", options.json)
 
 
 def _episodes(
@@ -140,5 +119,17 @@ def _episodes(
 
     parts = worlds(TRAINING, training), worlds(VALIDATION, validation)
     made = write_episodes(folder, [*parts[0], *parts[1]], processes)
-    followed(made, training + validation, quiet)
+    _followed(made, training + validation, quiet)
     return read_episodes(folder, parts[0]), read_episodes(folder, parts[1])
+
+
+def _followed(made: Iterator[int], total: int, quiet: bool) -> None:
+    """Makes worlds, with a progress bar unless output is for programs."""
+    for _ in made if quiet else track(made, total=total, description="worlds", console=err_console):
+        pass
+
+
+def _tell(text: str, quiet: bool) -> None:
+    """Says what is learned from, unless output is for programs."""
+    if not quiet:
+        err_console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from operators.detection.custom.assessment import assess as assess_detector
 from operators.detection.custom.folder import read_detection_data
 from operators.detection.custom.training import KIND as DETECTOR
+from operators.learning.augmentation import fitted, tensor_of, warp
+from operators.learning.files import whole
 from operators.segmentation.assessment import assess as assess_segmenter
 from operators.segmentation.dataset import read_segmentation_data
 from operators.segmentation.scores import MOST_CLASSES
 from operators.segmentation.training import KIND as SEGMENTER
-from operators.training.augmentation import fitted, tensor_of, warp
-from operators.training.files import whole
 from operators.weights.network_file import KEY, SECOND, NetworkFileError, read_facts, training_seed
 
 INT8 = "int8"

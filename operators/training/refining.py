@@ -12,21 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
-from operators.training.console import Data, Json, friendly
-from operators.training.options import Device, Every, Flip, Overwrite, Rate, Resume, Seed, Strength, Threads, Workers
-from operators.training.running import keep_files, run_task, tell_data, tell_scores, told_of, variation_of
+from operators.training.console import Data, friendly
+from operators.training.options import ImageTraining, takes
+from operators.training.running import tell_data, tell_scores, told_of
 
 if TYPE_CHECKING:
     from operators.detection.custom.dataset import DetectionData
+    from operators.learning.augmentation import Variation
+    from operators.learning.loop import Outcome, Task
     from operators.segmentation.dataset import SegmentationData
-    from operators.training.augmentation import Variation
-    from operators.training.loop import Outcome, Settings, Task
     from operators.weights import Network
 
 First = Annotated[Path, typer.Argument(help="The first network's file (.onnx).", show_default=False)]
 Out = Annotated[Path | None, typer.Option(help="The file to write. Default: WEIGHTS itself.")]
-Passes = Annotated[int, typer.Option("--epochs", min=1, help="Passes through what the training images show.")]
-Chunks = Annotated[int, typer.Option("--batch", min=1, help="Chunks a step, of 32 boxes or of 64 blocks each.")]
 RefinerEpochs = Annotated[
     int, typer.Option(min=0, help="Passes of the refiner, which looks at each found box once more; 0 leaves it away.")
 ]
@@ -118,32 +116,23 @@ class Borders(Second):
 REFINER, BORDERS = Refiner(), Borders()
 
 
-def train_second(
-    second: Second,
-    data: Any,
-    first: Path,
-    settings: Settings,
-    epochs: int,
-    variation: Variation,
-    resume: bool,
-    quiet: bool,
-) -> Outcome | None:
+def train_second(second: Second, data: Any, first: Path, options: ImageTraining, epochs: int) -> Outcome | None:
     """The last step of a first network's training: its second one, by so many passes; None without any."""
     if epochs == 0 or not second.suits(data):
         return None
-    own = replace(settings, epochs=epochs, batch=second.batch, learning_rate=second.learning_rate, bfloat16=False)
-    return add_second(second.task(data, first, settings.seed, variation), first, first, own, resume, quiet)
+    own = replace(options, epochs=epochs, batch=second.batch, learning_rate=second.learning_rate, bfloat16=False)
+    return add_second(second.task(data, first, own.seed, own.changes), first, first, own)
 
 
-def add_second(task: Task, first: Path, out: Path, settings: Settings, resume: bool, quiet: bool) -> Outcome:
+def add_second(task: Task, first: Path, out: Path, options: ImageTraining) -> Outcome:
     """Trains a second network, and writes the file of the first with it to `out`, which may be the same.
 
     Beside `out` stays its checkpoint, `.refiner.pt` or `.borders.pt`, from which `resume` goes on where it is there.
     """
-    from operators.training.export import attach_second
+    from operators.learning.export import attach_second
 
     alone = out.with_suffix(f".{task.kind}.onnx")
-    outcome = run_task(task, settings, alone, resume and alone.with_suffix(".pt").exists(), quiet)
+    outcome = replace(options, resume=options.resume and alone.with_suffix(".pt").exists()).run(task, alone)
     attach_second(first, alone, out)
     alone.unlink()
     return outcome
@@ -152,41 +141,19 @@ def add_second(task: Task, first: Path, out: Path, settings: Settings, resume: b
 def command_of(second: Second) -> Callable[..., None]:
     """Makes the command that trains second networks of a kind alone."""
 
-    def train_alone(
-        weights: First,
-        data: Data,
-        out: Out = None,
-        epochs: Passes = second.epochs,
-        resume: Resume = False,
-        overwrite: Overwrite = False,
-        batch: Chunks = second.batch,
-        learning_rate: Rate = second.learning_rate,
-        seed: Seed = 0,
-        flip: Flip = True,
-        variation: Strength = 1.0,
-        evaluate_every: Every = 1,
-        workers: Workers = 2,
-        threads: Threads = None,
-        device: Device = None,
-        json: Json = False,
-    ) -> None:
+    @takes(ImageTraining, epochs=second.epochs, batch=second.batch, learning_rate=second.learning_rate)
+    def train_alone(weights: First, data: Data, options: ImageTraining, out: Out = None) -> None:
         with friendly():
             out = weights if out is None else out
             written = (out, out.with_suffix(f".{second.kind}.pt"))
-            keep_files([file for file in written if file != weights], resume, overwrite)
-            from operators.training.loop import Settings
+            options.keep_files([file for file in written if file != weights])
             from operators.weights import open_network
 
             network = open_network(weights, second.first)
-            read = second.read(data, seed, network)
-            tell_data(read.notes, len(read.training), len(read.validation), read.classes, network.size, json)
-            settings = Settings(
-                epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers,
-                threads=threads, device=device,
-            )  # fmt: skip
-            task = second.task(read, weights, seed, variation_of(flip, variation))
-            outcome = add_second(task, weights, out, settings, resume, json)
-        if json:
+            read = second.read(data, options.seed, network)
+            tell_data(read, network.size, options.json)
+            outcome = add_second(second.task(read, weights, options.seed, options.changes), weights, out, options)
+        if options.json:
             typer.echo(jsonlib.dumps({"weights": str(out), second.kind: told_of(outcome)}))
         else:
             tell_scores(out, outcome)

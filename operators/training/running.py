@@ -1,12 +1,12 @@
-"""Shared steps of the training commands: input sizes, earlier files, the run with its progress bar, the report."""
+"""Shared steps of the training commands: input sizes, first weights, what was read, the report."""
 
 from __future__ import annotations
 
 import json as jsonlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import typer
 from rich.markup import escape
@@ -16,22 +16,10 @@ from operators.training.console import err_console, out_console, print_notes, sc
 if TYPE_CHECKING:
     from torch import nn
 
-    from operators.training.augmentation import Variation
-    from operators.training.backbone import Backbone as Extractor
-    from operators.training.loop import Outcome, Settings, Task
+    from operators.learning.backbone import Backbone as Extractor
+    from operators.learning.loop import Outcome
 
 _LONGEST_SIDE, _MULTIPLE = 384, 32
-
-
-def run_task(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -> Outcome:
-    """Trains with a progress bar, or without one where output is for programs."""
-    from operators.training.loop import train
-    from operators.training.progress import TrainingBar
-
-    if quiet:
-        return train(task, settings, out, resume=resume)
-    with TrainingBar(err_console) as bar:
-        return train(task, settings, out, resume=resume, progress=bar)
 
 
 class FineTuned(Protocol):
@@ -44,16 +32,9 @@ class FineTuned(Protocol):
     def begin_with(self, file: Path) -> None: ...
 
 
-def variation_of(flip: bool, strength: float) -> Variation:
-    """The random changes of training images, of so much strength."""
-    from operators.training.augmentation import Variation
-
-    return Variation(flip=0.5 if flip else 0.0).times(strength)
-
-
 def prepare(task: FineTuned, weights: Path | None, frozen_stride: int | None, initial: Path | None) -> None:
     """Gives a network its first weights and freezes the part of the backbone that came with them."""
-    from operators.training.backbone import start_from
+    from operators.learning.backbone import start_from
 
     if initial is not None and initial.suffix == ".onnx":
         task.begin_with(initial)
@@ -63,15 +44,27 @@ def prepare(task: FineTuned, weights: Path | None, frozen_stride: int | None, in
     task.backbone.freeze(frozen_stride if frozen_stride is not None else 4 if given else 0)
 
 
-def tell_data(
-    notes: Sequence[str], training: int, validation: int, classes: Sequence[str], size: tuple[int, int], quiet: bool
-) -> None:
-    """Tells what was read, before the first epoch."""
-    print_notes(notes, quiet)
+class Read(Protocol):
+    """Data that were read from a folder."""
+
+    @property
+    def notes(self) -> Sequence[str]: ...
+    @property
+    def training(self) -> Sequence[Any]: ...
+    @property
+    def validation(self) -> Sequence[Any]: ...
+    @property
+    def classes(self) -> Sequence[str]: ...
+
+
+def tell_data(read: Read, size: tuple[int, int], quiet: bool, classes: Sequence[str] | None = None) -> None:
+    """Prints what was read, before the first epoch."""
+    print_notes(read.notes, quiet)
     if quiet:
         return
+    classes = read.classes if classes is None else classes
     named = ", ".join(classes[:12]) + (" ..." if len(classes) > 12 else "")
-    counts = f"{training} images to train on, {validation} to score on"
+    counts = f"{len(read.training)} images to train on, {len(read.validation)} to score on"
     told = f"{counts}; {len(classes)} classes: {named}; input {size[0]}x{size[1]}"
     err_console.print(told, highlight=False, markup=False, soft_wrap=True)
 
@@ -135,17 +128,3 @@ def input_size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:
     extents = (min(1.0, ratio) * _LONGEST_SIDE, min(1.0, 1 / ratio) * _LONGEST_SIDE)
     width, height = (max(_MULTIPLE, round(extent / _MULTIPLE) * _MULTIPLE) for extent in extents)
     return width, height
-
-
-def keep_earlier(out: Path, resume: bool, overwrite: bool, suffix: str = ".onnx") -> None:
-    """Keeps an earlier training from being lost."""
-    if out.suffix != suffix:
-        raise ValueError(f"--out {str(out)!r} should end in {suffix}")
-    keep_files((out, out.with_suffix(".pt")), resume, overwrite)
-
-
-def keep_files(files: Iterable[Path], resume: bool, overwrite: bool) -> None:
-    """Raises FileExistsError where files of an earlier training would be lost."""
-    there = [str(file) for file in files if file.exists()]
-    if there and not (resume or overwrite):
-        raise FileExistsError(f"{' and '.join(there)} exist already: give --resume, --overwrite or another --out")

@@ -23,9 +23,11 @@ from rich.console import Console
 from rich.progress import track
 
 from dataflow.messages import Detections2D, Image, SegmentationMap
+from operators.detection.custom.dataset import ORIGIN
 from operators.simulator.classes import CLASSES, THINGS
 from operators.simulator.robot import SimulatedRobot
 from operators.simulator.worlds import INDOOR
+from operators.weights.network_file import SIMULATOR
 
 VGA, QVGA = (640, 480), (320, 240)
 """Width and height of the images: of worlds with even seeds, of the others."""
@@ -126,6 +128,7 @@ def write_data(
     for name in ("images", "masks", "boxes", "annotations"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     (folder / "classes.txt").write_text("\n".join(CLASSES) + "\n", encoding="utf-8")
+    (folder / ORIGIN).write_text(f"{SIMULATOR}\n", encoding="utf-8")
     every, written = [*training, *validation], 0
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
         for k, count in enumerate(pool.imap(partial(_write_world, folder, frames), every)):

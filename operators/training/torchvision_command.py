@@ -7,35 +7,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from operators.training.console import Data, Json, friendly, print_notes
-from operators.training.options import (
-    Batch,
-    Bfloat16,
-    Device,
-    Every,
-    Flip,
-    Overwrite,
-    Rate,
-    Resume,
-    Seed,
-    Strength,
-    Threads,
-    Workers,
-)
-from operators.training.running import input_size, keep_earlier, report, run_task, tell_data, variation_of
+from operators.training.console import Data, friendly, print_notes
+from operators.training.options import ImageTraining, takes
+from operators.training.running import input_size, report, tell_data
 
 if TYPE_CHECKING:
-    from operators.training.augmentation import Variation
     from operators.training.torchvision_tasks import TorchvisionDetectorTask, TorchvisionSegmenterTask
 
 
+@takes(ImageTraining, epochs=20)
 def train_torchvision(
     name: Annotated[str, typer.Argument(help="A detector or segmenter of torchvision.", show_default=False)],
     data: Data,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes through the training images.")] = 20,
+    options: ImageTraining,
     out: Annotated[Path | None, typer.Option(help="The file to write (.pth). Default: NAME.pth.")] = None,
-    resume: Resume = False,
-    overwrite: Overwrite = False,
     weights: Annotated[
         str | None,
         typer.Option(help="Begin with torchvision's weights of this name (default, COCO_V1, ...) from its cache."),
@@ -46,17 +31,6 @@ def train_torchvision(
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Size of training images. Default: theirs, longest side 384.")
     ] = None,
-    batch: Batch = 16,
-    learning_rate: Rate = 1e-3,
-    seed: Seed = 0,
-    flip: Flip = True,
-    variation: Strength = 1.0,
-    evaluate_every: Every = 1,
-    workers: Workers = 2,
-    threads: Threads = None,
-    device: Device = None,
-    bfloat16: Bfloat16 = False,
-    json: Json = False,
 ) -> None:
     """Fine-tune a torchvision detector or segmenter on your own classes.
 
@@ -72,49 +46,39 @@ def train_torchvision(
     """
     with friendly():
         out = Path(f"{name}.pth") if out is None else out
-        keep_earlier(out, resume, overwrite, ".pth")
+        options.keep_earlier(out, ".pth")
         if weights is not None and initial is not None:
             raise ValueError("give either --weights or --from: both are what to begin with")
         from operators.torch_models import cached_weights, family_of
-        from operators.training.loop import Settings
         from operators.training.torchvision_tasks import weights_in
 
-        changes = variation_of(flip, variation)
         detects = family_of(name) == "detection"
-        task = (_detector if detects else _segmenter)(name, data, size, seed, changes, json)
+        task = (_detector if detects else _segmenter)(name, data, size, options)
         if weights is not None or initial is not None:
             state = cached_weights(name, weights) if weights is not None else weights_in(initial or out)
             taken, known = task.begin_with(state)
-            print_notes([f"{taken} of {known} arrays begin as given, the others at random"], json)
-        settings = Settings(
-            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
-            device=device, bfloat16=bfloat16,
-        )  # fmt: skip
-        outcome = run_task(task, settings, out, resume, json)
+            print_notes([f"{taken} of {known} arrays begin as given, the others at random"], options.json)
+        outcome = options.run(task, out)
     params = f"model: {name}, checkpoint: {{file}}" + ("" if detects else f", side: {min(task.size)}")
     operator = "operators.detection:TorchvisionDetector" if detects else "operators.segmentation:TorchvisionSegmenter"
-    report(outcome, operator, json, params)
+    report(outcome, operator, options.json, params)
 
 
-def _detector(
-    name: str, data: Path, size: str | None, seed: int, variation: Variation, quiet: bool
-) -> TorchvisionDetectorTask:
+def _detector(name: str, data: Path, size: str | None, options: ImageTraining) -> TorchvisionDetectorTask:
     from operators.detection.custom.folder import read_detection_data
     from operators.training.torchvision_tasks import TorchvisionDetectorTask
 
-    read = read_detection_data(data, seed)
+    read = read_detection_data(data, options.seed)
     shown = input_size(size, [image.file for image in read.training[:20]])
-    tell_data(read.notes, len(read.training), len(read.validation), read.classes, shown, quiet)
-    return TorchvisionDetectorTask(read, name, shown, seed=seed, variation=variation)
+    tell_data(read, shown, options.json)
+    return TorchvisionDetectorTask(read, name, shown, seed=options.seed, variation=options.changes)
 
 
-def _segmenter(
-    name: str, data: Path, size: str | None, seed: int, variation: Variation, quiet: bool
-) -> TorchvisionSegmenterTask:
+def _segmenter(name: str, data: Path, size: str | None, options: ImageTraining) -> TorchvisionSegmenterTask:
     from operators.segmentation.dataset import read_segmentation_data
     from operators.training.torchvision_tasks import TorchvisionSegmenterTask
 
-    read = read_segmentation_data(data, seed)
+    read = read_segmentation_data(data, options.seed)
     shown = input_size(size, [image.image for image in read.training[:20]])
-    tell_data(read.notes, len(read.training), len(read.validation), read.classes, shown, quiet)
-    return TorchvisionSegmenterTask(read, name, shown, seed=seed, variation=variation)
+    tell_data(read, shown, options.json)
+    return TorchvisionSegmenterTask(read, name, shown, seed=options.seed, variation=options.changes)

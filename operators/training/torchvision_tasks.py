@@ -16,11 +16,11 @@ from operators.detection.custom.augmentation import DetectionSample, view
 from operators.detection.custom.dataset import DetectionData
 from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.decode import Candidates
+from operators.learning.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
+from operators.learning.files import TrainingFileError, load_safely, save_atomically
 from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
 from operators.segmentation.score import confusion, mean_iou
 from operators.torch_models import Family, new_model
-from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
-from operators.training.files import TrainingFileError, load_safely, save_atomically
 
 BACKGROUND = "__background__"
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the images that torchvision's weights know

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.training.files import TrainingFileError, whole
+from operators.learning.files import TrainingFileError, whole
 from operators.training.quantization import INT8
 from operators.weights.model_parts import ModelParts, digest_of
 from operators.weights.network_file import KEY, TRUNK, read_facts

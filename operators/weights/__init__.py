@@ -10,6 +10,7 @@ from operators.weights.network_file import (
     open_second,
     read_facts,
     shipped,
+    trained_in_simulation,
     training_seed,
 )
 
@@ -23,5 +24,6 @@ __all__ = [
     "open_second",
     "read_facts",
     "shipped",
+    "trained_in_simulation",
     "training_seed",
 ]

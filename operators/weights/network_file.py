@@ -11,7 +11,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.inference import ModelError, open_content, open_session
+from operators.protobuf import fields
 from operators.weights.shared_trunk import SharedTrunk, divided, tensor_of
 
 if TYPE_CHECKING:
     import onnxruntime
 
 KEY, SECOND, TRUNK = "dataflow.network", "dataflow.second", "trunk"
+TRAINED_ON, SIMULATOR = "trained_on", "simulator"
+_METADATA, _NAME, _VALUE = 14, 1, 2  # of a model; of an entry of its metadata
 _IMAGES = ("kind", "classes", "width", "height")
 _FOLDER = Path(__file__).parent
 
@@ -37,6 +40,24 @@ class NetworkFileError(ModelError):
 def shipped(name: str) -> Path:
     """Tells where the project's own network `name` lies."""
     return _FOLDER / name
+
+
+def trained_in_simulation(file: str | Path) -> bool:
+    """Returns whether a network knows simulated worlds alone: one that comes with the project, or whose file says so
+    by `trained_on` in its metadata. Opens no network; False for a file that is not there or is none of ours."""
+    file = Path(file).expanduser()
+    if file.resolve().parent == _FOLDER.resolve():
+        return True
+    try:
+        entries = (dict(_entry(f.content)) for f in fields(file.read_bytes()) if f.number == _METADATA)
+        facts = next((json.loads(e[_VALUE]) for e in entries if e.get(_NAME) == KEY.encode()), None)
+    except (OSError, ValueError):
+        return False
+    return isinstance(facts, dict) and facts.get(TRAINED_ON) == SIMULATOR
+
+
+def _entry(content: bytes) -> Iterator[tuple[int, bytes]]:
+    return ((each.number, each.content) for each in fields(content))
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,8 @@ def test_a_bag_is_drawn_as_a_recording_is(dataflow, bag: Path, tmp_path: Path) -
     told = dataflow("convert", bag, tmp_path / "b.rrd", "--json").stdout
 
     assert (tmp_path / "a.rrd").stat().st_size > 1000
-    assert json.loads(told) == {"files": [str(tmp_path / "b.rrd")], "messages": 40, "not_drawn": 0}
+    drawn = {"files": [str(tmp_path / "b.rrd")], "messages": 40, "not_drawn": 0}
+    assert json.loads(told).items() >= drawn.items()
 
 
 def test_a_ros_1_bag_is_drawn_too(dataflow, tmp_path: Path) -> None:

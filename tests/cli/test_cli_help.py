@@ -71,10 +71,12 @@ def test_our_own_tracebacks_are_shown_only_when_asked_for(dataflow, small: Path,
 
     from typer.testing import CliRunner
 
-    told = CliRunner().invoke(app, ["--traceback", "info", str(small)])
-    assert told.exit_code == 2
-    assert "Traceback (most recent call last)" in told.stderr
-    assert "not an MCAP file" in told.stderr
+    for words in (["--traceback", "info", str(small)], ["info", str(small), "--traceback"]):
+        monkeypatch.setenv("DATAFLOW_TRACEBACK", "0")
+        told = CliRunner().invoke(app, words)
+        assert told.exit_code == 2
+        assert "Traceback (most recent call last)" in told.stderr
+        assert "not an MCAP file" in told.stderr
 
 
 @pytest.mark.parametrize("asked", ["0", "1"])

@@ -13,9 +13,10 @@ import typer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from rich.text import Text
 
 from dataflow.cli.arguments import chosen_streams, existing, graph_file, output_file, window
-from dataflow.cli.output import about_a_file, friendly_errors, jsonable, plural, seconds, size
+from dataflow.cli.output import about_a_file, friendly_errors, jsonable, plural, seconds, size, table
 from dataflow.cli.progress import RunDisplay, shown
 from dataflow.cli.report import print_report, report_json
 from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
@@ -161,14 +162,15 @@ def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
     )
     file = io.StringIO()
 
-    print_report(Console(file=file, width=width), report)
+    print_report(Console(file=file, width=width), report, verbose=True)
 
     lines = file.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     assert any(line.split() == ["ate", "rmse", "0.0123", "m"] for line in lines)
     assert any(line.split()[:4] == ["camera", "dropped:", "past", "7"] for line in lines)
+    assert "dropped: unmatched" not in file.getvalue()
     assert "10.0 s of event time in 5.00 s, 2.00 × real time" in lines[0]
-    assert "wrote out/run.mcap (1 message, 5.0 MB)" in lines
+    assert "wrote   out/run.mcap (1 message, 5.0 MB)" in lines
 
 
 def test_progress_shows_no_duration_of_what_has_no_beginning() -> None:
@@ -226,17 +228,17 @@ def lossy_report() -> RunReport:
 def test_a_report_tells_drops_timeouts_and_late_messages_apart(width: int) -> None:
     console = Console(file=io.StringIO(), width=width)
 
-    print_report(console, lossy_report())
+    print_report(console, lossy_report(), verbose=True)
 
     lines = [text.rstrip() for text in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
     assert max(map(len, lines)) <= width
     told = [text.split() for text in lines]
     headings = "operator firings out Hz dropped timeouts late CPU s ms each wall s"
     assert headings.split() in told
-    assert ["fusion", "100", "100", "9.9", "14", "3", "5", "0.50", "5.00", "30.00"] in told
+    assert ["fusion", "100", "100", "9.9", "2", "3", "5", "0.50", "5.00", "30.00"] in told
     text = "\n".join(" ".join(words) for words in told)
     assert "fusion.image dropped: late 2 came after its firing" in text
-    assert "fusion.image dropped: unmatched 12 " in text
+    assert "fusion.image unmatched 12 no partner of its stamp" in text
     assert "fusion.image late 3 after its firing, for later ones" in text  # of 5, 2 were dropped
     assert "fusion.image timeout 3 wait given up, nothing dropped" in text
 
@@ -246,17 +248,55 @@ def test_a_report_without_losses_has_no_columns_for_them() -> None:
     report = lossy_report()
     counts = {name: replace(c, dropped=0) for name, c in report.operators.items()}
 
-    print_report(console, replace(report, operators=counts, drops={}, waits={}))
+    print_report(console, replace(report, operators=counts, drops={}, waits={}), verbose=True)
 
     told = console.file.getvalue()  # type: ignore[attr-defined]
     assert "dropped" not in told
     assert "timeout" not in told
 
 
+def printed(report: RunReport, width: int = 200) -> list[str]:
+    console = Console(file=io.StringIO(), width=width)
+    print_report(console, report, verbose=False)
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
+
+
+def test_what_matters_comes_first_and_the_rest_is_asked_for() -> None:
+    wrote = {"path": "out/a_000.mcap", "parts": ["out/a_000.mcap", "out/a_001.mcap"], "messages": 9, "bytes": 5_000_000}
+    report = replace(lossy_report(), files={"@recorder": wrote}, sources=("camera",))
+
+    lines = printed(report)
+
+    assert lines[1:] == [
+        "rates   camera 49.9 Hz, fusion 9.9 Hz",
+        "lost    2 messages dropped: 2 fusion.image (came after its firing)",
+        "wrote   out/a_000.mcap to a_001.mcap (2 files, 9 messages, 5.0 MB)",
+    ]
+    scores = {"metrics": {"matched": 120, "path_m": 2.4, "ate_rmse_m": 0.001, "ate_max_m": 0.5}}
+    assert "scores  metrics: ate rmse 0.001 m" in printed(replace(report, summaries=scores))
+
+
+def test_a_miss_is_no_loss() -> None:
+    assert "lost    nothing" in printed(replace(lossy_report(), drops={"fusion": (("image", "unmatched", 12),)}))
+
+
+def test_what_a_recording_lacks_is_among_the_losses() -> None:
+    lost = {"messages": 7, "firings": 3, "spans": [[2 * 10**9, None]], "reasons": ["a.mcap: no space"], "streams": {}}
+    facts = {"path": "a.mcap", "messages": 9, "bytes": 5_000_000, "lost": lost}
+
+    lines = printed(replace(lossy_report(), drops={}, files={"@recorder": facts}))
+
+    assert "lost    7 messages and 3 calls not recorded, from 2.000000000s to the end (a.mcap: no space)" in lines
+
+
+def test_a_note_is_printed_once() -> None:
+    assert printed(replace(lossy_report(), notes=("late", "late"))).count("note: late") == 1
+
+
 def test_the_json_report_has_cpu_and_wall_time() -> None:
     fusion = report_json(lossy_report())["operators"]["fusion"]
 
-    assert (fusion["cpu_ms"], fusion["wall_ms"], fusion["dropped"]) == (500.0, 30_000.0, 14)
+    assert (fusion["cpu_ms"], fusion["wall_ms"], fusion["dropped"]) == (500.0, 30_000.0, 2)
 
 
 def test_a_missing_file_of_an_operator_is_one_message_without_a_traceback(monkeypatch, capsys) -> None:
@@ -312,3 +352,15 @@ def test_a_start_says_which_processes_it_waits_for() -> None:
         "2",
         "more",
     ]
+
+
+def test_a_line_break_in_a_name_makes_no_row() -> None:
+    console = Console(file=io.StringIO(), width=120)
+    made = table("stream", "messages")
+    made.add_row(Text("imu\nforged/stream  1,000"), "3\n4")
+
+    console.print(made)
+
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert [line for line in lines if "forged" in line] == [line for line in lines if "imu" in line]
+    assert any("3\\n4" in line for line in lines)

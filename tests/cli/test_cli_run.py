@@ -24,7 +24,7 @@ ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def test_a_run_reports_operators_and_figures_on_stdout_and_progress_on_stderr(dataflow, small: Path) -> None:
-    told = dataflow("run", small, "--one-process", "--set", "count=10")
+    told = dataflow("run", small, "--one-process", "--set", "count=10", "-v")
 
     assert "small  complete" in told.stdout
     assert any(line.split()[:3] == ["left", "10", "13"] for line in told.stdout.splitlines())  # firings, out
@@ -228,7 +228,7 @@ def test_ctrl_c_ends_a_run_in_order_with_code_130(small: Path, tmp_path: Path) -
 
     assert running.returncode == 130
     assert "small  interrupted" in stdout
-    assert f"wrote {path}" in stdout
+    assert f"wrote   {path}" in stdout
 
 
 ABSENT = """\
@@ -309,7 +309,7 @@ def test_ctrl_c_while_the_graph_starts_is_a_stop_and_no_failure(tmp_path: Path) 
     assert running.returncode == 130
     assert "slow  interrupted while starting" in stdout
     assert "still starting, and killed: process 'last'" in stdout
-    assert "wrote run.mcap (0 messages" in stdout
+    assert "wrote   run.mcap (0 messages" in stdout
     assert "error" not in stderr
     assert "fail" not in stdout + stderr
     with Recording(tmp_path / "run.mcap") as recording:
@@ -336,7 +336,7 @@ def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
     told = dataflow(*words, "--overwrite")
 
     assert "opening" in told.stderr
-    assert f"wrote {saved}" in told.stdout
+    assert f"wrote   {saved}" in told.stdout
     for _ in range(100):
         if noted.exists():
             break

@@ -173,3 +173,18 @@ def test_a_name_of_a_million_characters_is_cut_and_the_rest_counted(dataflow, tm
         assert told.exit_code == 0
         assert "more characters)" in " ".join(told.stdout.split())
         assert len(told.stdout) < 100_000
+
+
+def test_diff_leaves_logs_out(dataflow, tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    for name, text in (("a.mcap", b'{"text": "1 ms"}'), ("b.mcap", b'{"text": "2 ms"}')):
+        with (tmp_path / name).open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            schema = writer.register_schema("s", "jsonschema", b"{}")
+            for topic, data in (("/result", b"{}"), ("/@/logs", text)):
+                writer.add_message(writer.register_channel(topic, "json", schema), 1, data, 1)
+            writer.finish()
+
+    assert dataflow("diff", tmp_path / "a.mcap", tmp_path / "b.mcap").exit_code == 0

@@ -244,8 +244,8 @@ def test_a_process_that_does_not_answer_is_shown_so_until_it_goes_on(dataflow, a
 
     assert (rows["tuned"]["state"], rows["tuned"]["note"]) == ("no answer", "its process does not answer")
     assert rows["left"]["state"] == "running"
-    assert "nobody answered for 'tuned' within 0.5 s" in told
-    assert "nobody answered for tuned within 0.5 s" in missing.stderr
+    assert "no answer for 'tuned' within 0.5 s" in told
+    assert "no answer for tuned within 0.5 s" in missing.stderr
     assert "slow.sleep" in missing.stdout
     assert dataflow("param", "set", "tuned.factor", "7", "--timeout", "30").stdout == "tuned.factor = 7.0\n"
 

@@ -9,10 +9,11 @@ import pytest
 from mcap.reader import make_reader
 
 from dataflow.client.attach import find_running, graph_of
-from dataflow.client.recorder import AttachedRecorder, Splitting, Subscription, record, subscribed
+from dataflow.client.recorder import AttachedRecorder, Subscription, record, subscribed
 from dataflow.graph import Graph, load_graph
 from dataflow.messages import FeatureVector
 from dataflow.recording import Recording
+from dataflow.recording.parts import Splitting
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.transport import Envelope, Kind

@@ -59,7 +59,7 @@ def checked(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[st
         ("```sh\ndataflow fly out/a.mcap\n```\n", "page.md:2: dataflow fly out/a.mcap: ValueError: no command 'fly'"),
         ("```sh\ndataflow replay run.mcap --rate fast\n```\n", "fast"),
         ("```sh\ndataflow verify elsewhere.mcap\n```\n", "where is elsewhere.mcap?"),
-        ("```sh\npip install -e '.[all]'\n```\n", "no extra all"),
+        ("```sh\npip install -e '.[every]'\n```\n", "no extra every"),
         ("```sh\ndataflow run graphs/synthetic_rgbd.yaml --set frame=3\n```\n", "did you mean 'frames'"),
         ("```sh\nfly away\n```\n", "'fly' is none of"),
         ("```json\n{a: 1}\n```\n", "JSONDecodeError"),

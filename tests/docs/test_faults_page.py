@@ -22,7 +22,7 @@ def test_every_test_that_is_named_exists(repository: Path) -> None:
     named = set(re.findall(r"`(test_\w+)`", page(repository)))
     there = {
         node.name
-        for folder in ("runtime", "process", "supervision", "transport")
+        for folder in ("runtime", "process", "supervision", "transport", "simulation")
         for file in (repository / "tests" / folder).glob("test_*.py")
         for node in ast.parse(file.read_text(encoding="utf-8")).body
         if isinstance(node, ast.FunctionDef)

@@ -131,8 +131,8 @@ def test_no_page_names_a_place_on_somebodys_machine(page: Path) -> None:
     assert found is None, f"{page.name}: {found and found[0]}"
 
 
-def test_the_readme_lists_every_command() -> None:
-    listed = set(re.findall(r"^\| `dataflow (\w+)", text_of(REPOSITORY / "README.md"), re.MULTILINE))
+def test_the_page_of_commands_lists_every_command() -> None:
+    listed = set(re.findall(r"^\| `dataflow (\w+)", text_of(REPOSITORY / "docs" / "commands.md"), re.MULTILINE))
     assert listed == set(COMMANDS)
 
 
@@ -145,8 +145,9 @@ def test_the_quick_start_is_two_marked_blocks() -> None:
     assert "pytest" in marked[1][1]
 
 
-def test_the_graph_in_the_readme_passes_the_check() -> None:
-    (graph,) = re.findall(r"^```yaml\n(.+?)^```", text_of(REPOSITORY / "README.md"), re.DOTALL | re.MULTILINE)
+def test_the_graph_in_the_first_steps_passes_the_check() -> None:
+    page = text_of(REPOSITORY / "docs" / "first-steps.md")
+    (graph,) = re.findall(r"^```yaml\n(.+?)^```", page, re.DOTALL | re.MULTILINE)
     assert load_text(graph).nodes
 
 

@@ -1,4 +1,4 @@
-"""The README's commands go on from each other: what is followed is what was started."""
+"""The commands of the first steps go on from each other: what is followed is what was started."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from dataflow.graph import load_graph
 
 @pytest.fixture(scope="module")
 def quoted() -> list[Quoted]:
-    """The `dataflow` commands of the README's blocks, from top to bottom."""
-    text = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
-    scripts = [block.text for block in blocks_of(text) if block.language == "sh"]
+    """The `dataflow` commands of the README's blocks and of the first steps, from top to bottom."""
+    root = Path(__file__).resolve().parents[2]
+    texts = [(root / page).read_text(encoding="utf-8") for page in ("README.md", "docs/first-steps.md")]
+    scripts = [block.text for text in texts for block in blocks_of(text) if block.language == "sh"]
     words = [words for script in scripts for _, words in lines_of(script)]
     return [parsed(command[1:]) for command in words if Path(command[0]).name == "dataflow"]
 
@@ -41,6 +42,10 @@ def test_streams_that_are_followed_belong_to_the_graph_that_was_started(quoted: 
 
 def test_every_extra_has_a_row_that_says_what_it_brings(repository: Path) -> None:
     project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    readme = (repository / "README.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `\[(\w+)\]` \|", readme, re.MULTILINE)
-    assert sorted(rows) == sorted(project["optional-dependencies"]), "README.md: What an install costs"
+    page = (repository / "docs" / "installing.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `\[(\w+)\]` \|", page, re.MULTILINE)
+    assert sorted(rows) == sorted(project["optional-dependencies"])
+
+
+def test_the_readme_is_short(repository: Path) -> None:
+    assert len((repository / "README.md").read_text(encoding="utf-8").split()) <= 900

@@ -54,6 +54,24 @@ class Collector:
         return [record.kind for record in self.records]
 
 
+class Returned(Collector):
+    """Also gives the runner what it emits, as its process does with what an operator takes from itself."""
+
+    runner: Runner
+
+    def message(self, stream: str, entry: Entry) -> None:
+        super().message(stream, entry)
+        self.runner.push(stream, entry)
+
+    def frontier(self, stream: str, frontier: int) -> None:
+        super().frontier(stream, frontier)
+        self.runner.advance(stream, frontier)
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        super().end(stream, final_stamp, reason)
+        self.runner.end(stream, final_stamp, reason)
+
+
 def node(cls: type[Operator], inputs: Mapping[str, Iterable[str]], live: Live | None = None, **fields: Any) -> Node:
     return Node(
         name="n",
@@ -127,6 +145,21 @@ class Gathers(Operator):
 
     def process(self, x: FeatureVector, rest: tuple[FeatureVector, ...]) -> None:
         return None
+
+
+class Loop(Operator):
+    """Adds its input to what it last gave."""
+
+    x: In[FeatureVector]
+    last: Sampled[FeatureVector] = Sampled(required=False, before=True)
+    rest: Batch[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(
+        self, x: FeatureVector, last: FeatureVector | None, rest: tuple[FeatureVector, ...]
+    ) -> FeatureVector | None:
+        before = 0.0 if last is None else float(last.vectors[0, 0])
+        return value(x.stamp, before + float(x.vectors[0, 0]))
 
 
 class Timer(Operator, every="13ms"):

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from firing_operators import Collector, Echo, Either, Gathers, Looks, Pair, entry, node, run_all
+from firing_operators import Collector, Echo, Either, Gathers, Looks, Loop, Pair, Returned, entry, node, run_all
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.firing.live import LiveRunner
+from dataflow.firing.ready import Ready
 from dataflow.graph.model import Live
 from dataflow.sync import FOREVER
 
@@ -161,6 +162,47 @@ def test_a_record_says_how_many_drops_it_does_not_list() -> None:
     (record,) = [r for r in collector.records if r.kind == "fire"]
     assert len(record.drops) == 4_096
     assert record.detail["unlisted_drops"] == [["x", "overflow", 4_999 - 4_096]]
+
+
+def looped(**live: Any) -> tuple[LiveRunner, Returned, Ready]:
+    made = node(Loop, {"x": ["t/s/x"], "last": ["t/n/y"], "rest": ["t/s/rest"]}, Live(**live))
+    collector = Returned()
+    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 0)
+    collector.runner, ready = runner, Ready()
+    ready.add(runner)
+    runner.setup()
+    return runner, collector, ready
+
+
+def fired(collector: Collector) -> list[int]:
+    return [r.stamp for r in collector.records if r.kind == "fire"]
+
+
+def test_an_operator_that_samples_itself_fires_at_once_when_its_own_promise_decides() -> None:
+    waits = {"x": None, "last": None, "rest": None}
+    runner, collector, ready = looped(queue="newest", size=16, wait=waits)
+    runner.advance("t/s/rest", 1_000)
+    for seq, stamp in enumerate((100, 200, 300)):
+        runner.push("t/s/x", entry("t/s/x", stamp, seq + 1))
+        while ready.step():
+            pass
+
+        assert fired(collector)[-1:] == [stamp]
+    assert collector.numbers == [1.0, 3.0, 6.0]
+
+
+def test_an_operator_that_samples_itself_makes_all_firings_that_follow_from_its_own_messages() -> None:
+    """Every call decides the next one by what it gives to itself; nothing else arrives."""
+    waits = {"x": None, "last": None, "rest": None}
+    runner, collector, ready = looped(queue="block", size=16, wait=waits)
+    runner.advance("t/s/rest", 1_000)
+    for seq, stamp in enumerate(range(100, 600, 100)):
+        runner.push("t/s/x", entry("t/s/x", stamp, seq + 1))
+    while ready.step():
+        pass
+
+    assert fired(collector) == [100, 200, 300, 400, 500]
+    assert runner.waiting() == (None, {})
 
 
 def test_done_rises_with_every_firing() -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 from firing_operators import Collector, Echo, entry, node, run_all
 
 from dataflow.chaos.faults import HANG, OperatorFaults
+from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.live import LiveRunner
 from dataflow.graph.model import Live, Restart
+from dataflow.messages import FeatureVector
 from dataflow.sync import Firing
 
 
@@ -24,6 +29,41 @@ def test_a_planned_error_fails_one_firing_in_place_of_the_operator() -> None:
     failed, _, fired = (r for r in collector.records[1:])
     assert (failed.outcome, failed.detail) == ("error", {"error": "InjectedFault: planned", "injected": True})
     assert (fired.incarnation, fired.outcome) == (1, "ok")
+
+
+class Crashing(Echo):
+    """Fails at its first message, in a library."""
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        np.linalg.inv(np.zeros((2, 2)))
+        return x
+
+
+def test_a_failure_that_is_outlived_says_the_operators_own_line() -> None:
+    made = node(Crashing, {"x": ["t/s/x"]}, Live("newest", 16, {"x": 0}, restart=Restart(max=1, backoff=0)))
+    told: list[OperatorFailure] = []
+    runner = LiveRunner(
+        made,
+        Collector(),
+        static=frozenset(),
+        operator=Crashing(),
+        event_clock=lambda: 0,
+        on_failure=lambda failure, pause: told.append(failure),
+    )
+    runner.setup()
+    runner.push("t/s/x", entry("t/s/x", 10, 0))
+    runner.step()
+
+    (failure,) = told
+    assert failure.file == __file__
+    assert failure.line == Crashing.process.__code__.co_firstlineno + 1
+    assert failure.where == f"{Path(__file__).name}:{failure.line}"
+
+
+def test_a_failure_outside_of_any_operator_has_no_line() -> None:
+    failure = OperatorFailure("n", "its timer", ValueError("no grid"))
+
+    assert (failure.file, failure.line, failure.where) == ("", 0, "")
 
 
 def test_slow_and_hanging_firings_end_with_their_time() -> None:

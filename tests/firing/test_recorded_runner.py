@@ -7,10 +7,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
+import pytest
 from firing_operators import Collector, Dice, Echo, entry, node, run_all
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dataflow.firing import runner as runner_module
 from dataflow.firing.calls import Calls
 from dataflow.firing.live import LiveRunner
 from dataflow.firing.recorded import RecordedRunner
@@ -195,3 +197,20 @@ def test_done_rises_with_every_firing_that_is_repeated() -> None:
         reached.append(runner.done)
 
     assert reached == [100, 101, 102]
+
+
+def test_a_snapshot_that_is_too_large_to_be_recorded_is_left_out_and_counted(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = dice()
+    with monkeypatch.context() as patched:
+        patched.setattr(runner_module, "MAX_STATE_BYTES", 10)
+        ran = live_run(made, MESSAGES[:2], version=2, gains=())
+
+    snapshots = [r.detail for r in ran.records if r.kind == "snapshot"]
+    assert snapshots
+    assert all(detail.keys() == {"left_out"} and detail["left_out"] > 10 for detail in snapshots)
+    assert f"at most 10 are recorded; {len(snapshots)} so far" in caplog.text
+    repeated = again(made, ran, MESSAGES[:2])
+    assert repeated.result.verdict == "identical"
+    assert again(made, ran, MESSAGES[:2], begin=150).result.began == "start"

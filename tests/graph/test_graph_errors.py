@@ -136,7 +136,7 @@ CASES = {
     ),
     "abstract": (
         operator('c: {use: "graph_operators:Abstract"}'),
-        "4:12: 'graph_operators:Abstract' is abstract: it declares no ports of its own",
+        "4:12: 'graph_operators:Abstract' is abstract: it declares no ports",
         "operators in 'graph_operators': Camera, CloudBuilder, Detector, Device, Echo, Fuse, Log, Mapper, Odometry, "
         "StaticUser, Ticker, Watchdog",
     ),
@@ -248,7 +248,7 @@ CASES = {
     ),
     "ticks_without_bounds": (
         HEAD + '  t: {use: "graph_operators:Ticker", inputs: {lens: camera/info}}\n',
-        "4:38: t: Ticker ticks every 1s, but every wired input is static or 'before': nothing says when ticks begin and end",
+        "4:38: t: Ticker ticks every 1s, but every wired input is static or 'before': the beginning and the end of ticks are unknown",
         "wire an input to a stream that is neither",
     ),
     "cycle": (

@@ -47,28 +47,33 @@ def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path:
 @pytest.mark.parametrize(("adapt", "source"), [(False, "image_watch/checked"), (True, "adapter/adapted")])
 def test_the_networks_see_adapted_images_where_that_is_asked_for(adapt: bool, source: str) -> None:
     graph = load_graph(REPOSITORY / "graphs" / "perception.yaml", settings=[f"perception.adapt={adapt}"])
-    for network in ("detector", "focus", "names", "segmenter"):
+    for network in ("detector", "segmenter"):
         assert graph.nodes[f"perception/{network}"].inputs["image"] == (f"robot1/perception/{source}",)
 
 
 def test_where_boxes_and_masks_are_given_no_network_runs() -> None:
     nodes = load_graph(REPOSITORY / "graphs" / "perception_given.yaml").nodes
-    assert not {f"perception/{each}" for each in ("detector", "focus", "names", "segmenter")} & nodes.keys()
+    assert not {f"perception/{each}" for each in ("detector", "segmenter")} & nodes.keys()
     lifter, tracker = nodes["perception/lifter"].inputs, nodes["perception/tracker"].inputs
     assert lifter["detections"] == tracker["detections"] == ("robot1/robot/objects",)
     assert lifter["segmentation"] == ("robot1/robot/masks",)
     assert nodes["perception/objects"].inputs["boxes"] == ("robot1/perception/lifter/boxes",)
 
 
-def test_small_things_are_looked_at_once_more_where_the_detector_is_ours() -> None:
-    nodes = load_graph(REPOSITORY / "graphs" / "perception.yaml").nodes
-    assert nodes["perception/focus"].inputs["detections"] == ("robot1/perception/detector/detections",)
-    assert nodes["perception/names"].inputs["detections"] == ("robot1/perception/focus/refined",)
-    for name in ("lifter", "tracker"):
-        assert nodes[f"perception/{name}"].inputs["detections"] == ("robot1/perception/names/renamed",)
-    for name in ("perception_rgbd", "perception_kitti"):
-        left_out = load_graph(REPOSITORY / "graphs" / f"{name}.yaml").left_out
-        assert {"perception/focus", "perception/names"} <= left_out.keys()
+@pytest.mark.parametrize("name", ["perception", "perception_rgbd", "perception_kitti", "movers"])
+def test_boxes_of_any_detector_reach_the_map_and_the_tracks_unchanged(name: str) -> None:
+    nodes = load_graph(REPOSITORY / "graphs" / f"{name}.yaml").nodes
+    (detector,) = (f"robot1/{each}/detections" for each in nodes if each == "perception/detector")
+    for consumer in ("lifter", "tracker"):
+        assert nodes[f"perception/{consumer}"].inputs["detections"] == (detector,)
+
+
+@pytest.mark.parametrize("name", ["perception", "perception_given", "perception_rgbd", "perception_kitti"])
+def test_one_setting_gives_every_operator_the_label_space(name: str) -> None:
+    nodes = load_graph(REPOSITORY / "graphs" / f"{name}.yaml", settings=["labels=own.yaml"]).nodes
+    spaces = {each: node.params["labels"] for each, node in nodes.items() if "labels" in node.params}
+    assert {"perception/lifter", "perception/objects", "perception/scene"} <= spaces.keys()
+    assert set(spaces.values()) == {"own.yaml"}
 
 
 def test_postures_reach_the_activities_wherever_there_is_depth() -> None:

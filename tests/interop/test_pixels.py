@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dataflow.recording import RecordingError
-from dataflow.recording.pixels import as_depth, as_image, stored_rows
+from dataflow.recording.pixels import as_depth, as_image, as_image16, stored_rows
 
 RGB = np.random.default_rng(0).integers(0, 256, (4, 6, 3), np.uint8)
 
@@ -25,19 +25,19 @@ def rows(encoding: str, pixels: np.ndarray, **options: bool) -> np.ndarray:
         ("8UC3", RGB[..., ::-1]),  # OpenCV's order
         ("rgba8", np.dstack([RGB, RGB[..., 0]])),
         ("bgra8", np.dstack([RGB[..., ::-1], RGB[..., 0]])),
-        ("rgb16", RGB.astype("<u2") << 8),
-        ("bgr16", RGB[..., ::-1].astype("<u2") << 8),
     ],
 )
 def test_colour_encodings_become_rgb(encoding: str, stored: np.ndarray) -> None:
     np.testing.assert_array_equal(as_image(encoding, rows(encoding, stored)), RGB)
 
 
-def test_greys_stay_greys_and_16_bits_keep_the_upper_8() -> None:
-    grey = RGB[..., 0]
+def test_greys_stay_greys_and_16_bits_stay_16_bits() -> None:
+    grey, deep = RGB[..., 0], RGB.astype("<u2") * 257 + 3
 
     np.testing.assert_array_equal(as_image("mono8", rows("mono8", grey)), grey)
-    np.testing.assert_array_equal(as_image("mono16", rows("mono16", grey.astype("<u2") << 8)), grey)
+    np.testing.assert_array_equal(as_image16("mono16", rows("mono16", deep[..., 0])), deep[..., 0])
+    np.testing.assert_array_equal(as_image16("rgb16", rows("rgb16", deep)), deep)
+    np.testing.assert_array_equal(as_image16("bgr16", rows("bgr16", deep[..., ::-1])), deep)
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])

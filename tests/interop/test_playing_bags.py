@@ -138,3 +138,58 @@ def test_topics_that_are_not_played_survive_in_the_recording_byte_for_byte(
 def _rows_of(bag: Path) -> list[Any]:
     with AnyReader([bag]) as reader:
         return [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+
+
+def test_all_of_the_recording_of_a_replay_is_on_the_clock_of_what_was_played(graph: Path, tmp_path: Path) -> None:
+    rows = []
+    for i in range(20):
+        simulated, wall = (900 + i) * SECOND, (1_700_000_000 + i) * SECOND
+        for topic in ("/estimate", "/truth"):
+            pose = ros("geometry_msgs/Pose", position=xyz(i, i * i, 0, "Point"), orientation=xyzw(0, 0, 0, 1))
+            at = header(simulated, "map")
+            rows.append((topic, wall, ros("geometry_msgs/PoseStamped", header=at, pose=pose)))
+        rows.append(("/kept", wall, ros("geometry_msgs/Polygon")))
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    dataflow.replay(bag, graph=str(graph), record=tmp_path / "o.mcap", maps=dict(word.split("=") for word in MAPS))
+
+    with Recording(tmp_path / "o.mcap") as made:
+        kept, played = made.streams["/kept"], made.streams["robot1/truth/pose"]
+        assert (kept.first, kept.last) == (played.first, played.last) == (900 * SECOND, 919 * SECOND)
+
+
+RGBD = """
+graph: rgbd
+operators:
+  camera: {use: "operators.sources:RecordedRgbdCamera"}
+  watch: {use: "operators.monitoring:ImageWatch", inputs: {image: camera/image}}
+"""
+
+
+def test_16_bit_grey_is_played_as_depth_where_it_is_mapped_to_depth(tmp_path: Path) -> None:
+    (tmp_path / "g.yaml").write_text(RGBD)
+    grey = {"width": 4, "height": 2, "encoding": "mono16", "step": 8, "data": np.full(16, 4, np.uint8)}
+    color = {"width": 4, "height": 2, "encoding": "rgb8", "step": 12, "data": np.zeros(24, np.uint8)}
+    at = 1_700_000_000 * SECOND
+    rows = [("/d", at, ros("sensor_msgs/Image", header=header(at), **grey)),
+            ("/c", at, ros("sensor_msgs/Image", header=header(at), **color))]  # fmt: skip
+    bag, built = write_ros2(tmp_path / "bag", rows), load_graph(tmp_path / "g.yaml")
+
+    told = match(bag, built, ["/d=camera/depth", "/c=camera/image"]).played()
+
+    assert {played.topic: played.type for played in told.values()} == {"/d": "DepthImage", "/c": "Image"}
+    with play(bag, built, ["/d=camera/depth", "/c=camera/image"]) as streams:
+        depth = next(m.message for m in streams.messages() if m.stream.endswith("depth"))
+    assert depth.data[0, 0] == np.float32(1.028)
+
+
+def test_16_bit_grey_is_never_proposed_as_depth(tmp_path: Path) -> None:
+    (tmp_path / "g.yaml").write_text(RGBD)
+    grey = {"width": 4, "height": 2, "encoding": "mono16", "step": 8, "data": np.full(16, 4, np.uint8)}
+    at = 1_700_000_000 * SECOND
+    bag = write_ros2(tmp_path / "bag", [("/d", at, ros("sensor_msgs/Image", header=header(at), **grey))])
+
+    found = match(bag, load_graph(tmp_path / "g.yaml"), [])
+
+    assert [reading.read_as.SCHEMA for reading in found.readings if reading.read_as] == ["Image16"]
+    assert found.options() == ["/d=camera/image"]

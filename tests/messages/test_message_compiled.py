@@ -51,8 +51,12 @@ def documented_digest(message: Message) -> bytes:
     """The digest by its documentation, field by field."""
     schema = message.SCHEMA.encode()
     data = struct.pack("<I", len(schema)) + schema + struct.pack("<q", message.stamp)
-    for spec in message.SCALARS:
+    for spec in sorted(message.SCALARS, key=lambda spec: spec.added):
         value: Any = message.__dict__[spec.name]
+        if spec.added:
+            if value is None:
+                continue
+            data += spec.name.encode()
         if value is None:
             data += b"n"
         elif spec.kind == "bool":
@@ -64,7 +68,11 @@ def documented_digest(message: Message) -> bytes:
         else:
             data += b"l" + struct.pack("<I", len(value))
             data += b"".join(struct.pack("<I", len(word.encode())) + word.encode() for word in value)
-    for held in message.arrays():
+    for array_spec, held in zip(message.ARRAYS, message.arrays(), strict=True):
+        if array_spec.added:
+            if held is None:
+                continue
+            data += array_spec.name.encode()
         if held is None:
             data += b"\x00"
         else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,8 +22,8 @@ from dataflow.messages.scene_summary import (
 Relation = tuple[int, str, int, float]
 
 
-def graph(classes: str, *relations: Relation) -> SceneGraph:
-    """Nodes of these classes with ids 1, 2, ...; relations by index."""
+def graph(classes: str, *relations: Relation, places: Mapping[int, int] | None = None) -> SceneGraph:
+    """Nodes of these classes with ids 1, 2, ..., but for `places`, whose ids are given by index; relations by index."""
     words = classes.split()
     names = tuple(dict.fromkeys(words))
     return SceneGraph(
@@ -29,7 +31,7 @@ def graph(classes: str, *relations: Relation) -> SceneGraph:
         frame="map",
         class_names=names,
         predicates=tuple(p for _, p, _, _ in relations),
-        ids=np.arange(1, len(words) + 1),
+        ids=np.array([(places or {}).get(k, k + 1) for k in range(len(words))]),
         class_ids=np.array([names.index(word) for word in words], np.int32),
         positions=np.zeros((len(words), 3)),
         sizes=np.ones((len(words), 3)),
@@ -46,11 +48,11 @@ def test_a_thing_is_carried_by_the_likeliest_alone() -> None:
 
 
 def test_a_thing_is_told_in_place_of_its_top() -> None:
-    made = graph("mug table tabletop", (0, "on", 1, 0.7), (0, "on", 2, 0.9), (2, "part_of", 1, 0.9))
+    made = graph("mug table tabletop", (0, "on", 1, 0.7), (0, "on", 2, 0.9), (2, "part_of", 1, 0.9), places={2: -11})
     told = summarize(made)
     assert {child: r.object for child, r in told.carriers.items()} == {0: 1, 2: 1}
     assert [(row.name, row.text) for row in carriers_in_words(made, told)] == [("table 2", "on it mug 1")]
-    alone = graph("mug tabletop", (0, "on", 1, 0.9))
+    alone = graph("mug tabletop", (0, "on", 1, 0.9), places={1: -11})
     assert [row.text for row in carriers_in_words(alone, summarize(alone))] == ["on it mug 1"]
 
 
@@ -105,7 +107,7 @@ def test_people_come_with_what_they_do_and_where_they_go() -> None:
         class_ids=np.array([0, 1], np.int32),
         scores=np.array([0.9, 0.5], np.float32),
     )
-    rows = agents_in_words(scene, summarize(scene), acts)
+    rows = agents_in_words(scene, summarize(scene, acts), acts)
     assert [(row.name, row.text) for row in rows] == [
         ("person 2", "walking 90 %, heads for chair 3 (76 %)"),
         ("ball 1", "resting 50 %, on chair 3"),
@@ -116,17 +118,28 @@ def test_what_is_carried_is_grouped_by_class_and_the_floor_has_what_stands_alone
     scene = graph(
         "floor table book book mug lamp",
         (1, "on", 0, 0.9), (2, "on", 1, 0.9), (3, "on", 1, 0.9), (4, "in", 1, 0.9), (5, "on", 0, 0.9),
+        places={0: 0},
     )  # fmt: skip
     rows = carriers_in_words(scene, summarize(scene))
     assert [(row.name, row.text) for row in rows] == [
         ("table 2", "on it 2 books; in it mug 5"),
-        ("floor 1", "lamp 6"),
+        ("floor 0", "lamp 6"),
     ]
 
 
+def test_agents_are_what_acts_whatever_its_class() -> None:
+    scene = graph("zorb mug table", (0, "holding", 1, 0.9), (1, "on", 2, 0.9))
+    assert summarize(scene).agents == {0}
+    acts = Activity(
+        stamp=0, class_names=("resting",), subjects=np.array([3]), class_ids=np.array([0], np.int32),
+        scores=np.array([0.9], np.float32),
+    )  # fmt: skip
+    assert summarize(scene, acts).agents == {0, 2}
+
+
 def test_groups_are_in_english() -> None:
-    assert [plural(word) for word in ("person", "shelf", "box", "bench", "mug")] == [
-        "people", "shelves", "boxes", "benches", "mugs",
+    assert [plural(word) for word in ("robot", "shelf", "box", "bench", "mug")] == [
+        "robots", "shelves", "boxes", "benches", "mugs",
     ]  # fmt: skip
     assert grouped(["mug 1", "box 2", "box 3"], ["mug", "box", "box"]) == "2 boxes, mug 1"
 

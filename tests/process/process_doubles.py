@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from typing import Any
 
 import numpy as np
+import pytest
 
 from dataflow.messages import FeatureVector
 from dataflow.transport import Envelope, Kind
@@ -37,3 +40,20 @@ class RecordedChannel:
 
     def of(self, kind: str) -> list[dict[str, Any]]:
         return [fields for sent, fields in self.sent if sent == kind]
+
+
+class Disk:
+    """A disk that can be full."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.full = False
+        write = os.write
+
+        def refusing(descriptor: int, data: Any) -> int:
+            if self.full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return write(descriptor, data)
+
+        monkeypatch.setattr("dataflow.recording.container.os.write", refusing)
+        monkeypatch.setattr("dataflow.process.outage.FIRST_PAUSE", 0.0)
+        monkeypatch.setattr("dataflow.process.outage.LONGEST_PAUSE", 0.0)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from process_doubles import Disk
 
 from dataflow.graph import Graph, load_graph
 from dataflow.graph.sections import Flight, Trigger
@@ -18,6 +19,7 @@ from dataflow.messages import Diagnostics, FeatureVector
 from dataflow.process.flight import FlightSink
 from dataflow.process.triggers import Triggers
 from dataflow.recording import Recording
+from dataflow.recording.parts import Storage
 from dataflow.records.firing import encode_batch
 from dataflow.records.reading import FiringLog
 from dataflow.supervision.run import replay, run
@@ -54,30 +56,42 @@ def recorded(graph: Graph, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def flown(
-    recorded: Path, graph: Graph, folder: Path, *, when: tuple[Trigger, ...] = (), asks: Any = (), **more: Any
+    recorded: Path,
+    graph: Graph,
+    folder: Path,
+    *,
+    when: tuple[Trigger, ...] = (),
+    asks: Any = (),
+    each: Any = lambda stamp: None,
+    **more: Any,
 ) -> Any:
     """Gives a flight recorder what a recorder was given; `asks`: stamps (s) at which somebody triggers it."""
     flight = replace(graph.record.flight, when=when, **more)  # type: ignore[type-var]
     made = replace(graph, record=replace(graph.record, flight=flight))
     history: list[tuple[int, int]] = []
-    asks = sorted(asks)
+    asks, clock = sorted(asks), 0
     with Recording(recorded) as recording:
         metadata = {n: dict(v) for n, v in recording.metadata.items() if n not in ("recording", "digests")}
         options = {"metadata": metadata, "compression": "zstd", "overwrite": True, "label": "ring", "settle": 0.0}
+        options["storage"] = Storage(on_failure="go_on")
         sink = FlightSink(folder, made, list(made.record.streams), options)
         records = _records(recording)
         at = next(records, None)
         for found in recording.messages():
             while at is not None and at.stamp < found.stamp:
-                sink.firings(at.operator, at.stamp, encode_batch([at]))
+                sink.firings(at.operator, [at], encode_batch([at]))
                 at = next(records, None)
+            each(found.stamp / SECOND)
             sink.message(found.stream, found.message, found.seq, found.incarnation)
+            if found.stamp // SECOND != clock:
+                clock = found.stamp // SECOND
+                sink.flush()
             history.append((sink.ring_bytes, len(list((folder / ".ring").iterdir()))))
             if asks and found.stamp >= asks[0] * SECOND and found.stamp < 10**14:
                 asks = asks[1:]
                 sink.event("trigger", found.stamp, {"text": "a test"})
         while at is not None:
-            sink.firings(at.operator, at.stamp, encode_batch([at]))
+            sink.firings(at.operator, [at], encode_batch([at]))
             at = next(records, None)
     return sink, history
 
@@ -256,3 +270,35 @@ def test_a_flight_recorder_that_cannot_be_is_refused_where_it_stands(tmp_path: P
     (tmp_path / "a.yaml").write_text(GRAPH.replace("{keep: 4s, after: 2s, snapshots: 1s}", said))
     with pytest.raises(GraphError, match=fault):
         load_graph(tmp_path / "a.yaml")
+
+
+def test_a_full_disk_is_outlived_and_what_comes_after_is_kept(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def at(stamp: float) -> None:
+        disk.full = 10 <= stamp < 14
+
+    sink, _ = flown(recorded, graph, tmp_path, asks=[25.0], each=at)
+    facts = sink.close("complete")
+
+    said = capsys.readouterr().out
+    assert "flight recorder: stops, the run goes on" in said
+    assert "flight recorder: goes on" in said
+    assert facts["lost"]["streams"]["test/left/fast"] == pytest.approx(4 * 20, abs=25)
+    path = Path(facts["kept"][0]["path"])
+    assert facts["messages"] == facts["kept"][0]["messages"] > 100
+    assert {v.operator: v.verdict for v in verify(path).operators} == dict.fromkeys(
+        ("first", "second", "slow"), "identical"
+    )
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_restart_is_kept_with_the_line_and_the_traceback_of_its_failure() -> None:
+    failed = {"text": "operator 'a' failed", "operators": ["a"], "where": "crashy.py:12", "traceback": "Traceback …"}
+    triggers = Triggers([Trigger("raise")])
+
+    assert list(triggers.event("restart", failed)) == [
+        {"what": "operator 'a' failed", "operators": ["a"], "where": "crashy.py:12", "traceback": "Traceback …"}
+    ]
+    killed = {"text": "process 'a' was killed", "operators": ["a"]}
+    assert list(triggers.event("restart", killed)) == [{"what": "process 'a' was killed", "operators": ["a"]}]

@@ -123,6 +123,8 @@ def test_a_source_that_raises_is_restarted_and_its_streams_begin_a_new_incarnati
         ("camera", "stream() after stamp 1103"),
     ]
     assert all(t["summary"] == "Unplugged: no such device" and t["pause"] > 0 for t in told)
+    assert all(t["where"].startswith("process_operators.py:") for t in told)
+    assert all("Unplugged: no such device" in t["traceback"].splitlines()[-1] for t in told)
     assert sources.emitted.messages == [(i, k, 1000 + 100 * i + k) for i in range(3) for k in range(4)]
     assert [i for i, kind in sources.emitted.records if kind == "setup"] == [0, 1, 2]
     assert len(process_operators.Count.closed) == 2

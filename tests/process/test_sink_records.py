@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -31,8 +32,9 @@ class Stored:
     def __init__(self) -> None:
         self.places: list[tuple[int, int]] = []
 
-    def firings(self, operator: str, stamp: int, payload: bytes) -> None:
-        self.places += [(r.incarnation, r.index) for r in decode_batch(payload).records]
+    def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
+        assert list(decode_batch(payload).records) == list(records)
+        self.places += [(r.incarnation, r.index) for r in records]
 
 
 class Arrived(queue.SimpleQueue[tuple[Any, ...]]):

@@ -8,11 +8,13 @@ import logging
 import os
 import threading
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.shared_generators import AT_WORK
-from dataflow.process.speech import LONGEST, MARK, SOURCE_THREAD, _Handler, _Lines, _say, heard, shown
+from dataflow.process.speech import LONGEST, MARK, SOURCE_THREAD, _Handler, _Lines, _say, heard, log_failure, shown
 from dataflow.recording.logs import LEVELS, LogLine
 
 
@@ -83,10 +85,29 @@ def test_prints_become_whole_lines_and_the_rest_at_a_flush() -> None:
 
 def test_a_logger_whose_arguments_do_not_fit_is_heard_all_the_same(monkeypatch) -> None:
     said: list[str] = []
-    monkeypatch.setattr("dataflow.process.speech._say", lambda *fields: said.append(fields[2]))
+    monkeypatch.setattr("dataflow.process.speech._say", lambda *fields, operator: said.append(fields[2]))
     _Handler().emit(logging.LogRecord("n", logging.WARNING, "f.py", 3, "%d apples", ("no",), None))
     assert "%d apples" in said[0]
     assert "cannot be formatted" in said[0]
+
+
+def test_a_failure_that_is_outlived_is_an_error_of_its_operator_with_file_and_line(monkeypatch) -> None:
+    def crash() -> None:
+        np.linalg.inv(np.zeros((2, 2)))
+
+    written: list[bytes] = []
+    monkeypatch.setattr("dataflow.process.speech.os.write", lambda _, data: written.append(bytes(data)) or len(data))
+    monkeypatch.setattr(logging.getLogger("dataflow.failure"), "handlers", [_Handler()])
+    try:
+        crash()
+    except np.linalg.LinAlgError as error:
+        log_failure(OperatorFailure("crashy", "fire at stamp 5", error))
+
+    said = heard(b"".join(written).decode().rstrip(), "p", ("other", "crashy"))
+    assert (said.level, said.operator, said.file) == ("error", "crashy", __file__)
+    assert said.line == crash.__code__.co_firstlineno + 1  # not that of NumPy, which raised
+    assert said.text.startswith("Traceback (most recent call last):")
+    assert said.text.endswith("LinAlgError: Singular matrix")
 
 
 def test_people_see_levels_of_what_was_logged_and_prints_as_they_are() -> None:

@@ -31,6 +31,18 @@ def test_a_recording_is_the_same_as_itself_and_as_a_differently_written_one(
     assert [(s.stream, s.outcome, s.count_a) for s in report.streams] == [("a", "same", 10), ("b", "same", 10)]
 
 
+def test_logs_are_no_results_and_are_compared_when_they_are_named(
+    record: Callable[..., Path], pose: Callable[..., Pose]
+) -> None:
+    logs = ("@/logs", "test/@/logs")
+    a = record([("s", pose(0)), *((name, pose(1)) for name in logs)], name="a.mcap")
+    b = record([("s", pose(0)), *((name, pose(2)) for name in logs)], name="b.mcap")
+
+    assert [s.stream for s in compare(a, b).streams] == ["s"]
+    assert compare(a, b).same
+    assert not compare(a, b, streams=["test/@/logs"]).same
+
+
 def test_the_first_difference_has_stamp_and_field(record: Callable[..., Path], pose: Callable[..., Pose]) -> None:
     a = record([("s", pose(i)) for i in range(5)], name="a.mcap")
     b = record([("s", pose(i, x=0.5 if i >= 3 else 0.0)) for i in range(5)], name="b.mcap")

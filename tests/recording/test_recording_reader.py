@@ -269,14 +269,16 @@ def test_a_foreign_raw_image_is_an_image_or_a_depth_image_by_its_encoding(tmp_pa
         writer = Writer(file)
         writer.start()
         schema = writer.register_schema("foxglove.RawImage", "protobuf", file_descriptor_set(RawImage))
-        for topic, encoding, width in (("/rgb", "rgb8", 5), ("/depth", "32FC1", 3), ("/bayer", "bayer_rggb8", 15)):
+        kinds = (("/rgb", "rgb8", 5), ("/depth", "32FC1", 3), ("/bayer", "bayer_rggb8", 15), ("/odd", "nv12", 15))
+        for topic, encoding, width in kinds:
             proto = RawImage(width=width, height=2, encoding=encoding, step=16, data=padded.tobytes())
             channel = writer.register_channel(topic, "protobuf", schema)
             writer.add_message(channel, log_time=7, publish_time=7, data=proto.SerializeToString())
         writer.finish()
     with Recording(path) as recording:
         found = {m.stream: m.message for m in recording.messages()}
-        assert recording.streams["/bayer"].message_type is None
+        assert recording.streams["/odd"].message_type is None
+    assert isinstance(found["/bayer"], Image)
     assert isinstance(found["/rgb"], Image)
     assert np.array_equal(found["/rgb"].data, padded[:, :15].reshape(2, 5, 3))
     assert isinstance(found["/depth"], DepthImage)

@@ -117,6 +117,36 @@ def test_a_process_that_dies_is_named_with_the_signal_and_how_far_it_was() -> No
     assert "process 'bad' was killed by SIGKILL while running" in str(failure)
 
 
+def test_a_run_whose_nursery_is_killed_says_so_and_leaves_no_process(tmp_path: Path) -> None:
+    graph = chain(
+        "bad: {use: runtime_operators:Broken, params: {how: children}, inputs: {x: left/fast}}",
+        "sum: {use: runtime_operators:Sum, inputs: {x: bad/y}}",
+    )
+    lines: list[str] = []
+    supervisor = Supervisor(
+        RunPlan(graph, placement="process_each", rate=0.05, record=tmp_path / "run.mcap"),
+        on_output=lambda label, line: lines.append(line),
+    )
+    pids: list[int] = []
+
+    def kill() -> None:
+        while not any("left behind" in line for line in lines):
+            time.sleep(0.02)
+        pids.extend(supervisor.pid_of(label) for label in ("left", "bad", "sum", "@recorder"))
+        os.kill(psutil.Process(pids[0]).ppid(), signal.SIGKILL)
+
+    threading.Thread(target=kill, daemon=True).start()
+    with pytest.raises(RunFailed, match="the process that starts the others was killed by SIGKILL"):
+        supervisor.run()
+
+    started = int(next(line for line in lines if "left behind" in line).rpartition(" ")[2])
+    assert len(pids) == 4
+    assert not [pid for pid in pids if psutil.pid_exists(pid)]
+    assert not psutil.pid_exists(started) or psutil.Process(started).status() == psutil.STATUS_ZOMBIE
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert recording.streams["test/left/fast"].count > 0
+
+
 def test_an_operator_that_hangs_ends_the_run_within_the_stall_timeout() -> None:
     failure = fails(broken("hang"), placement="process_each", stall_timeout=1.0)
 

@@ -161,7 +161,15 @@ def test_restarts_come_to_an_end_and_the_last_cause_is_named(path: Path) -> None
     with Recording(path) as recording:
         assert recording.metadata["dataflow:outcome"]["outcome"].startswith("failed: operator 'doomed'")
         outcomes = [r.outcome for r in recorded_firings(recording, "doomed") if r.kind == "fire"]
+        outlived = [event.data for event in recording.events() if event.name == "restart"]
+        logged = [line for _, line in recording.logs() if line.source == "dataflow.failure"]
     assert outcomes == ["error"] * 3
+    assert len(outlived) == 2
+    assert all(re.search(r"no calibration \(faulty_operators.py:\d+\); made anew", event["text"]) for event in outlived)
+    assert all('faulty_operators.py", line ' in event["traceback"] for event in outlived)
+    assert [(line.level, line.operator, Path(line.file).name) for line in logged] == [
+        ("error", "doomed", "faulty_operators.py")
+    ] * 2
 
 
 HANGS = "bad: {{use: runtime_operators:Broken, params: {{how: hang}}, inputs: {{x: left/fast}}, live: {{{}}}}}"
@@ -430,7 +438,9 @@ def test_a_source_that_raises_is_made_anew_in_the_same_process(path: Path) -> No
 
     assert ran.report.restarts == {"camera": 1}
     assert "operator 'camera' failed in stream() after stamp " in ran.events("restart")[0]
-    assert "OSError: no such device; made anew in 0.02 s" in ran.events("restart")[0]
+    assert re.search(
+        r"OSError: no such device \(faulty_operators.py:\d+\); made anew in 0.02 s", ran.events("restart")[0]
+    )
     assert [i for i, kind in ran.kinds("camera") if kind == "setup"] == [0, 1]
     assert len(ran.numbers("test/resets/y")) == 130
     assert {row[1] for row in ran.numbers("test/other/y")} == {42.0}

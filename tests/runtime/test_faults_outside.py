@@ -49,13 +49,13 @@ def graph_file(folder: Path, *, count: int, source: str = "runtime_operators:Cou
 
 # A disk that is full
 
-RUN = ("run", "outside.yaml", "--live", "--record", "small/run.mcap")
+RUN = ("run", "outside.yaml", "--live", "--record", "small/run.mcap", "--record-failure")
 
 
-def check_full_disk(command: list[str], folder: Path, words: str, **options: Any) -> None:
-    """A recording that the disk does not take ends the run, says so, and holds what came before."""
+def check_full_disk(command: list[str], folder: Path, words: str, then: str = "end", **options: Any) -> str:
+    """A recording that the disk does not take fails the run, which says so; returns what it prints."""
     done = subprocess.run(
-        [*command, sys.executable, "-m", "dataflow.cli.main", *RUN],
+        [*command, sys.executable, "-m", "dataflow.cli.main", *RUN, then],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent.parent)])},
         capture_output=True,
@@ -68,6 +68,7 @@ def check_full_disk(command: list[str], folder: Path, words: str, **options: Any
     assert words in done.stderr
     assert "run.mcap" in done.stderr
     assert "Traceback" not in done.stdout + done.stderr
+    return done.stdout
 
 
 def check_what_is_left(path: Path) -> None:
@@ -88,6 +89,24 @@ def test_a_recording_that_may_not_grow_ends_the_run_and_stays_readable(tmp_path:
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000)),
     )
 
+    check_what_is_left(tmp_path / "small" / "run.mcap")
+
+
+def test_a_run_goes_on_without_its_recording_and_says_what_is_lost(tmp_path: Path) -> None:
+    graph_file(tmp_path, count=600, source="faulty_operators:Noise")
+    (tmp_path / "small").mkdir()
+
+    told = check_full_disk(
+        [],
+        tmp_path,
+        "recording stops, the run goes on",
+        "go_on",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000)),
+    )
+
+    assert told.startswith("outside  complete")
+    assert "not recorded, from" in told
+    assert "File too large" in told
     check_what_is_left(tmp_path / "small" / "run.mcap")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dataflow.firing.source import SourceRunner
-from dataflow.graph import load_graph
+from dataflow.graph import load_graph, load_text
 from dataflow.recording import Recording
 from dataflow.recording.layout import RUN
 from dataflow.records.firing import FiringRecord
@@ -32,7 +32,7 @@ def test_a_live_run_with_drops_and_timeouts_is_verified_in_another_placement(pla
     assert ("mix", "timeout") in waited
     assert "timeout" not in {reason for _, reason in reasons}
     with Recording(path) as recording:
-        assert recording.metadata[RUN]["seeding"] == "2"
+        assert recording.metadata[RUN]["seeding"] == "3"
         overflowed = [d for r in recorded_firings(recording, "slow") for d in r.drops if d.reason == "overflow"]
         assert len(overflowed) == sum(n for _, why, n in report.drops["slow"] if why == "overflow")
     verified = verify(path, jobs=1 if placement == "process_each" else None)
@@ -75,3 +75,14 @@ class Outlets:
 
     def record(self, record: FiringRecord) -> None:
         pass
+
+
+def test_the_report_of_a_device_has_the_span_of_its_stamps() -> None:
+    graph = load_text("graph: one\noperators:\n  device: {use: 'faulty_operators:Device', params: {steps: 20}}\n")
+
+    report = run(graph, live=True)
+
+    assert report.sources == ("device",)
+    assert report.first is not None
+    assert report.last is not None
+    assert report.last - report.first >= 19 * 10_000_000

@@ -11,7 +11,7 @@ from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, machine_facts
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.run import run
-from dataflow.verification import verify as verification
+from dataflow.verification import facts as verification_facts
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 
@@ -137,7 +137,7 @@ def test_facts_that_differ_from_the_recording_are_named_with_both_values(
         facts["device"]["gpu 0"] = "Imaginary 9000"
         return facts
 
-    monkeypatch.setattr(verification, "machine_facts", elsewhere)
+    monkeypatch.setattr(verification_facts, "machine_facts", elsewhere)
 
     found = {fact: (then, here) for fact, then, here in verify(recorded, only=["sum"], jobs=1).facts}
 

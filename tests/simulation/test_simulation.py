@@ -17,7 +17,7 @@ from simulation import bindings
 from simulation.check import check
 from simulation.mutants import MUTANTS, Mutant
 from simulation.run import Happening, Machine, simulate
-from simulation.scenario import TICKING, Scenario, scenario_of
+from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
@@ -161,6 +161,37 @@ def test_a_frozen_process_is_not_waited_for_without_end(memory: Path) -> None:
     assert result.outcome.seconds < 60.0
 
 
+RESTARTED = "restart: {max: 5, backoff: 10ms}"
+
+
+@pytest.mark.parametrize("policy", ["", RESTARTED, f"deadline: 200ms, {RESTARTED}"])
+@pytest.mark.parametrize("target", ["*", "", "relay", "@recorder"])
+@pytest.mark.parametrize("span", [6.0, 40.0])
+def test_a_pause_of_the_supervisor_and_others_kills_and_blames_nobody(
+    target: str, span: float, policy: str, memory: Path
+) -> None:
+    pause = (Happening(0.05, "pause", target, {"span": span}),)
+
+    result = check(replace(PLAIN, live=True, policy=policy, count=12, happenings=pause, work=0.05), memory)
+
+    assert result.outcome.report is not None
+    (note,) = result.outcome.report.notes
+    assert note == f"the supervisor did not run for {span:.1f} s, which count against no process"
+
+
+def test_a_process_that_stands_still_longer_than_the_pause_is_started_again(memory: Path) -> None:
+    happenings = (
+        Happening(0.15, "pause", "", {"span": 6.0}),
+        Happening(0.15, "freeze", "relay", {"span": 12.0}),
+    )
+    plain = replace(PLAIN, live=True, policy=RESTARTED, count=12, period=20_000_000)
+
+    result = check(replace(plain, happenings=happenings), memory)
+
+    assert result.outcome.report is not None
+    assert result.outcome.report.restarts == {"relay": 1}
+
+
 @pytest.mark.parametrize("first", range(0, 200, 25))
 def test_seeds(first: int, memory: Path) -> None:
     """No hang, no loss without a count, recordings that verify, replays that are equal."""
@@ -181,7 +212,7 @@ FOUND_BY = {
         graph="join",
         live=True,
         count=12,
-        machine=Machine(2, socket_room=2),
+        machine=Machine(1, socket_room=2),
         happenings=(
             Happening(0.01, "freeze", "right", {"span": 1e6}),
             Happening(0.1, "freeze", "smooth", {"span": 0.05}),
@@ -196,6 +227,27 @@ FOUND_BY = {
         window=2,
         machine=Machine(1, ring_bytes=4096),
         happenings=(Happening(0.01, "freeze", "sum", {"span": 1.0}), Happening(0.02, "freeze", "left", {"span": 0.05})),
+    ),
+    "itself": replace(
+        PLAIN,
+        graph=DRAWN,
+        live=True,
+        count=6,
+        period=20_000_000,
+        machine=Machine(4),
+        happenings=(Happening(0.01, "freeze", "loop", {"span": 0.05}),),
+        parts=(
+            "left: {SOURCE}",
+            "loop: {use: simulation.operators:LoopedBatch, inputs: {x: left/fast, last: loop/y, rest: left/fast}}",
+        ),
+    ),
+    "pause": replace(
+        PLAIN,
+        live=True,
+        happenings=(
+            Happening(0.01, "pause", "*", {"span": 6.0}),
+            Happening(0.02, "set", "relay", {"gain": 2.0}),
+        ),
     ),
 }
 """Scenarios that find a planted fault; how many seeds each needs: benchmarks/simulation.md."""

@@ -138,6 +138,7 @@ class Play:
 
     def failed(self, label: str, when: str) -> Said:
         fields = {"operator": label, "when": when, "summary": "RuntimeError: no camera", "traceback": "…"}
+        fields["where"] = "driver.py:7"
         return Said(label, "failed", fields)
 
     def progress(self, label: str, done: Mapping[str, int] | None = None, **more: Any) -> Said:

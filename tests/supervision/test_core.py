@@ -8,7 +8,7 @@ import pytest
 from plays import Play, asked_where, killed, sent, spawned
 
 from dataflow.supervision.commands import Announce, Over, Withdraw
-from dataflow.supervision.events import Aborted, Begin, Died, HungUp, LeftBehind, Printed, Said, Tick
+from dataflow.supervision.events import Aborted, Begin, Died, HungUp, LeftBehind, Paused, Printed, Said, Tick
 from dataflow.sync import FOREVER
 
 
@@ -28,6 +28,16 @@ def test_sources_are_released_when_every_edge_is_proven_and_not_before() -> None
     assert Announce(("left", "sum")) in released
     assert [(label, fields["first"]) for label, fields in sent(released, "go")] == [("left", 7), ("sum", 7)]
     assert play.core.status.phase == "running"
+
+
+def test_a_time_in_which_the_supervisor_did_not_run_is_noted_and_recorded() -> None:
+    play = Play(record="run.mcap").starts()
+
+    (told,) = sent(play.tell(Paused(6.0)), "event")
+
+    assert play.core.status.notes == ["the supervisor did not run for 6.0 s, which count against no process"]
+    assert told[0] == "@recorder"
+    assert told[1]["name"] == "paused"
 
 
 def test_placements_go_by_their_former_names_for_one_version() -> None:

@@ -8,8 +8,9 @@ import pytest
 from plays import LEFT, STEP, Play, asked_where, killed, sent, spawned
 
 from dataflow.chaos.plan import Fault
+from dataflow.recording.parts import Storage
 from dataflow.records.firing import Emission, FiringRecord
-from dataflow.supervision.commands import Send, Signal
+from dataflow.supervision.commands import Send, Signal, Spawn
 from dataflow.supervision.events import Begin, Died, NotReading, Said, Tick
 from dataflow.sync import FOREVER
 
@@ -144,7 +145,7 @@ def test_a_set_up_that_fails_after_a_restart_is_tried_again_by_the_policy() -> N
 
 def test_a_process_that_fails_itself_is_restarted_and_an_operator_that_failed_for_good_is_not() -> None:
     play = robot().starts()
-    failed = {"operator": None, "when": "", "summary": "ProcessFailure: no statics", "traceback": "…"}
+    failed = {"operator": None, "when": "", "summary": "ProcessFailure: no statics", "where": "", "traceback": "…"}
     play.tell(Said("smooth", "failed", failed))
     play.wait(1.0)
     assert play.core.status.notes[-1] == "process 'smooth' is back"
@@ -154,10 +155,36 @@ def test_a_process_that_fails_itself_is_restarted_and_an_operator_that_failed_fo
     assert play.failure() == "operator 'smooth' failed in fire at stamp 5: RuntimeError: no camera"
 
 
+def test_a_failure_that_is_outlived_keeps_its_line_and_traceback() -> None:
+    play = robot(record="run.mcap").starts()
+    failed = {"operator": "smooth", "when": "fire at stamp 5", "summary": "ZeroDivisionError: crashed", "pause": 0.5}
+    play.tell(Said("smooth", "restarting", {**failed, "where": "crashy.py:12", "traceback": "Traceback …"}))
+
+    ((_, event),) = sent(play.commands, "event")
+    text = "operator 'smooth' failed in fire at stamp 5: ZeroDivisionError: crashed (crashy.py:12); made anew in 0.5 s"
+    assert play.core.status.notes == [text]
+    assert event["data"]["text"] == text
+    assert (event["data"]["where"], event["data"]["traceback"]) == ("crashy.py:12", "Traceback …")
+
+
+def test_a_process_whose_set_up_failed_keeps_its_line_and_traceback_when_it_is_started_again() -> None:
+    play = robot(record="run.mcap").starts()
+    play.broken.add("smooth")
+    play.dies("smooth", -9)
+    play.wait(0.15)
+    play.broken.clear()
+    play.wait(1.0)
+
+    text = "process 'smooth' has left: operator 'smooth' failed in setup(): RuntimeError: no camera (driver.py:7)"
+    events = [fields["data"] for _, fields in sent(play.commands, "event")]
+    (told,) = (data for data in events if data["text"].startswith(text))
+    assert (told["where"], told["traceback"]) == ("driver.py:7", "…")
+
+
 def test_one_that_failed_and_does_not_leave_is_killed() -> None:
     play = robot().starts()
     play.deaf.add("smooth")
-    play.tell(Said("smooth", "failed", {"operator": None, "when": "", "summary": "x", "traceback": ""}))
+    play.tell(Said("smooth", "failed", {"operator": None, "when": "", "summary": "x", "where": "", "traceback": ""}))
 
     assert killed(play.wait(11.0)) == ["smooth"]
     assert play.core.status.notes[-1] == "process 'smooth' is back"
@@ -181,12 +208,22 @@ def test_a_process_that_reads_nothing_is_killed_and_restarted_by_its_policy() ->
 
 
 def test_one_that_lost_what_it_needs_ends_the_run_without_a_policy() -> None:
-    play = robot(record="run.mcap").starts()
+    play = robot(record="run.mcap", storage=Storage(on_failure="end")).starts()
     play.deaf.add("@recorder")
     play.tell(NotReading("@recorder", 9.0, 500, overflowed=True))
     play.wait(20.0)
 
     assert play.failure() == "process '@recorder' has read nothing for 9 s"
+
+
+def test_a_recorder_that_lost_what_it_needs_is_followed_by_another() -> None:
+    play = robot(record="run.mcap").starts()
+    assert killed(play.tell(NotReading("@recorder", 9.0, 500))) == []  # it may wait for its disk
+    assert killed(play.tell(NotReading("@recorder", 9.0, 500, overflowed=True))) == ["@recorder"]
+    play.wait(3.0)
+
+    assert any("'@recorder' has read nothing for 9.0 s; started again" in note for note in play.core.status.notes)
+    assert sum(isinstance(c, Spawn) and c.label == "@recorder" for c in play.commands) == 2
 
 
 def covered(play: Play, stamp: int) -> tuple[int, int]:

@@ -18,7 +18,12 @@ from dataflow.supervision.nursery import Child
 
 PACKAGE = Path(dataflow.__file__).parent
 BY_NUMBER = {"kill", "killpg"}
-NOT_WAITED_FOR_YET = {"supervision/nursery_process.py": 3, "verification/started.py": 1, "verification/worker.py": 1}
+NOT_WAITED_FOR_YET = {
+    "supervision/nursery.py": 1,
+    "supervision/nursery_process.py": 3,
+    "verification/started.py": 1,
+    "verification/worker.py": 1,
+}
 """Where a number is used: by the parent, of a child that it waits for only afterwards, which keeps the number taken."""
 
 

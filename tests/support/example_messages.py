@@ -342,6 +342,11 @@ def _diagnostics(values: Values, rng: Rng) -> None:
     values["keys"], values["values"] = _words(pairs, rng), _words(pairs, rng)
 
 
+def _organised(values: Values, rng: Rng) -> None:
+    if values["columns"] is not None:
+        values["columns"] = max(1, len(values["points"]))
+
+
 _REPAIRS: dict[str, Callable[[Values, Rng], None]] = {
     "Activity": _activity,
     "Boxes3D": _classes,
@@ -360,6 +365,7 @@ _REPAIRS: dict[str, Callable[[Values, Rng], None]] = {
     "NavSatFix": _nav_sat_fix,
     "OccupancyGrid": _occupancy_grid,
     "ParticleSet": _particle_set,
+    "PointCloud": _organised,
     "Path": _path,
     "Planes": _planes,
     "SceneGraph": _scene_graph,

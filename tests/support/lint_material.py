@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.lint.finding import Finding
 from dataflow.lint.material import Stamps, StreamFacts
 from dataflow.messages import Message
 
@@ -31,6 +32,9 @@ class MadeMaterial:
         }
         facts |= {name: StreamFacts("Other", False, len(found), False) for name, found in self._stamps.items()}
         self.streams = facts
+
+    def file_findings(self, *, whole: bool) -> Iterator[Finding]:
+        return iter(())
 
     def stamps(self, stream: str) -> Stamps:
         found = self._stamps.get(stream)

@@ -9,6 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from dataflow.process.channel import ready
 from dataflow.supervision.report import RunFailed
 from dataflow.verification.processes import Call, call_workers
 from dataflow.verification.started import EarlyWorkers, Started, early_workers
@@ -62,6 +63,17 @@ def test_those_that_nobody_takes_are_ended() -> None:
             taken.end()
         workers.close()
         assert children() == before
+
+
+def test_a_single_one_that_waits_and_is_not_taken_is_ended() -> None:
+    before = children()
+    workers = EarlyWorkers(1)
+    [worker] = workers._waiting
+    assert ready([worker.channel], 60.0)
+
+    workers.close()
+
+    assert children() == before
 
 
 def test_a_graph_with_other_threads_gets_workers_of_its_own(early: EarlyWorkers) -> None:

@@ -32,7 +32,7 @@ def scene(stamp: int = 0, *, person_x: float = 3.0, mug: bool = True) -> SceneGr
         frame="map",
         class_names=CLASSES,
         predicates=tuple(p for _, p, _, _ in relations),
-        ids=np.arange(len(classes)),
+        ids=np.array([-2, 0, 2, 3, 4, 5][: len(classes)]),
         class_ids=np.array([CLASSES.index(c) for c in classes], np.int32),
         positions=np.array(positions[: len(classes)], float),
         sizes=np.array(sizes[: len(classes)], float),
@@ -91,11 +91,11 @@ def test_things_that_are_carried_are_drawn_without_labels(tmp_path: Path) -> Non
 
 def test_a_person_is_a_capsule_as_tall_as_it_is_with_what_it_does(tmp_path: Path) -> None:
     found = draw(tmp_path, ("s/activities", walking()), ("s/graph", scene()))
-    (label,) = at(found, "/s/graph/space/people", "Capsules3D:labels")
+    (label,) = at(found, "/s/graph/space/agents", "Capsules3D:labels")
     assert label.values == ["person 4: walking"]
-    (length,) = at(found, "/s/graph/space/people", "Capsules3D:lengths")
-    (radius,) = at(found, "/s/graph/space/people", "Capsules3D:radii")
-    (foot,) = at(found, "/s/graph/space/people", "Capsules3D:translations")
+    (length,) = at(found, "/s/graph/space/agents", "Capsules3D:lengths")
+    (radius,) = at(found, "/s/graph/space/agents", "Capsules3D:radii")
+    (foot,) = at(found, "/s/graph/space/agents", "Capsules3D:translations")
     assert length.values[0] + 2 * radius.values[0] == np.float32(1.8)
     assert np.isclose(foot.values[0][2] - radius.values[0], 0.0)
 
@@ -110,7 +110,7 @@ def test_an_intention_is_an_arrow_with_its_probability(tmp_path: Path) -> None:
 
 def test_what_has_not_changed_is_not_sent_again(tmp_path: Path) -> None:
     found = draw(tmp_path, *(("s/graph", scene(t, person_x=3.0 + 0.1 * t)) for t in range(5)))
-    assert len(at(found, "/s/graph/space/people", "Capsules3D:translations")) == 5
+    assert len(at(found, "/s/graph/space/agents", "Capsules3D:translations")) == 5
     for entity, component in (
         ("/s/graph/space/things", "Boxes3D:centers"),
         ("/s/graph/graph", "GraphNode:id"),

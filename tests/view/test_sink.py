@@ -183,6 +183,14 @@ def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
     assert ("3D", "World") not in views(blueprint({"r/imu/data": Imu}))
 
 
+def test_there_is_no_world_where_nothing_has_depth_or_a_place() -> None:
+    flat = {"r/camera/image": Image, "r/camera/info": CameraInfo, "r/detector/boxes": Detections2D}
+
+    assert ("3D", "World") not in views(blueprint(flat))
+    assert ("3D", "World") in views(blueprint({**flat, "r/camera/depth": DepthImage}))
+    assert ("3D", "World") in views(blueprint({**flat, "r/odometry/pose": Pose}))
+
+
 def test_a_camera_view_shows_its_overlays_and_the_world_does_not() -> None:
     def contents(name: str, part: rrb.Container | rrb.View) -> list[str]:
         if isinstance(part, rrb.View):

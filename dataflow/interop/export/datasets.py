@@ -15,6 +15,7 @@ from dataflow.interop.export.frames import (
     messages_as,
     nearest,
     optional,
+    write_depth,
     write_png,
     write_rows,
     write_text,
@@ -28,6 +29,7 @@ from dataflow.messages import (
     Image,
     Imu,
     Pose,
+    Transforms,
 )
 from dataflow.messages.geometry import transform_matrix
 from dataflow.recording.errors import RecordingError
@@ -49,7 +51,10 @@ def export_tum(material: Material, folder: Path, done: Exported) -> None:
         stream = lists[name]
         for message in messages_as(material, stream, kind, done):
             place = f"{name[:-4]}/{_seconds(message.stamp)}.png"
-            write_png(folder / place, message, units)
+            if units is None:
+                write_png(folder / place, message)
+            else:
+                write_depth(folder / place, message, units, material.names[stream or ""], done)
             rows[name].append(f"{_seconds(message.stamp)} {place}")
     for message in messages_as(material, poses, Pose, done):
         assert isinstance(message, Pose)
@@ -67,13 +72,15 @@ def export_7scenes(material: Material, folder: Path, done: Exported) -> None:
     images = {m.stamp: m for m in messages_as(material, material.only("7-Scenes", *IMAGES), Image, done)}
     poses = {m.stamp: m for m in messages_as(material, optional(material, *POSES), Pose, done)}
     count = 0
-    for depth in messages_as(material, material.only("7-Scenes", *DEPTHS), DepthImage, done):
+    depths = material.only("7-Scenes", *DEPTHS)
+    for depth in messages_as(material, depths, DepthImage, done):
         image = nearest(images, depth.stamp)
         if image is None:
+            done.lose(material.names[depths], "depth without an image within 20 ms, left out")
             continue
         stem = f"frame-{count:06d}"
-        write_png(folder / f"{stem}.color.png", image, None)
-        write_png(folder / f"{stem}.depth.png", depth, SCENES_UNITS)
+        write_png(folder / f"{stem}.color.png", image)
+        write_depth(folder / f"{stem}.depth.png", depth, SCENES_UNITS, material.names[depths], done)
         pose = nearest(poses, depth.stamp)
         if pose is not None:
             assert isinstance(pose, Pose)
@@ -82,7 +89,7 @@ def export_7scenes(material: Material, folder: Path, done: Exported) -> None:
         count += 1
     if not count:
         raise RecordingError(f"{material.path}: no image lies within 20 ms of a depth image")
-    done.files.append(f"{folder} ({count} frames)")
+    done.files.append(str(folder))
     _intrinsics(material, folder, done)
 
 
@@ -100,7 +107,7 @@ def export_euroc(material: Material, folder: Path, done: Exported) -> None:
     for k, stream in enumerate(material.of_type(*IMAGES)):
         names = []
         for message in messages_as(material, stream, Image, done):
-            write_png(root / f"cam{k}" / "data" / f"{message.stamp}.png", message, None)
+            write_png(root / f"cam{k}" / "data" / f"{message.stamp}.png", message)
             names.append([str(message.stamp), f"{message.stamp}.png"])
         write_rows(root / f"cam{k}" / "data.csv", "#timestamp [ns],filename", iter(names), done)
     truth = optional(material, *POSES)
@@ -128,7 +135,7 @@ def export_kitti(material: Material, folder: Path, done: Exported) -> None:
     for k, stream in enumerate(cameras):
         stamps.append([])
         for message in messages_as(material, stream, Image, done):
-            write_png(folder / f"image_{k}" / f"{len(stamps[k]):06d}.png", message, None)
+            write_png(folder / f"image_{k}" / f"{len(stamps[k]):06d}.png", message)
             stamps[k].append(message.stamp)
     if len(cameras) == 2 and stamps[0] != stamps[1]:
         raise RecordingError(f"{material.path}: the two cameras' images do not have the same stamps")
@@ -151,6 +158,19 @@ def export_kitti(material: Material, folder: Path, done: Exported) -> None:
         else:
             rows = [transform_matrix(p.position, p.orientation)[:3].ravel() for p in poses if isinstance(p, Pose)]
             write_text(folder / "poses.txt", "".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows), done)
+
+
+def tell_untaken(material: Material, what: str, done: Exported) -> None:
+    """Says which streams and topics a dataset has no place for."""
+    used = {name for name in material.of_type(CameraInfo, Transforms) if what not in ("euroc",)}
+    for name, outside in material.names.items():
+        if name not in used and outside not in done.written and outside not in done.left_out:
+            kind = material.streams[name].message_type
+            done.left_out[outside] = f"{what} has no place for {kind.SCHEMA if kind else 'it'}"
+    for topic in material.untouched:
+        done.left_out.setdefault(
+            topic.name, f"{what} has no place for {topic.schema.name or 'messages without schema'}"
+        )
 
 
 DATASETS: dict[str, Callable[[Material, Path, Exported], None]] = {

@@ -11,6 +11,7 @@ from mcap.writer import Writer
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.interop.mcap_bag import McapBag
+from dataflow.interop.unpacking import Unpacked
 from dataflow.recording.attachments import Attachment, names_once, tells_of_run
 from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RESERVED_METADATA
@@ -28,7 +29,7 @@ class Extras:
     """
 
     def __init__(self, material: Material) -> None:
-        files = material.bag.files if isinstance(material.bag, McapBag) else ()
+        files = material.bag.files if isinstance(material.bag, McapBag | Unpacked) else ()
         self._files = list(files)
         listed = [[(n, v) for n, v in f.metadata if material.foreign or not tells_of_run(n)] for f in files]
         names_of_all = {name for f in files for name, _ in f.metadata}

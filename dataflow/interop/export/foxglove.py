@@ -6,17 +6,18 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from dataflow.foxglove.drawing import data_of, schema_of
+from dataflow.foxglove.drawing import data_of, drawing_of, schema_of
 from dataflow.interop.export.extras import carry
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Message
+from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS
 
 
 def export_foxglove(material: Material, file: Path, done: Exported) -> None:
     """Writes an MCAP for Foxglove: topics named `/node/port`, log time and the messages' own time the stamp.
 
-    Fields that a Foxglove schema has no place for are left out (our own recordings keep them in companions).
+    Fields that a Foxglove schema has no place for are counted and left out (our recordings keep them in companions).
     """
     with file.open("wb") as opened:
         writer = Writer(opened, compression=CompressionType.ZSTD)
@@ -31,6 +32,13 @@ def export_foxglove(material: Material, file: Path, done: Exported) -> None:
             place = (recorded.stream, schema_of(message)[0].name)
             if place not in channels:
                 channels[place] = _open(writer, f"/{material.names[recorded.stream].lstrip('/')}", message)
+            known = FOXGLOVE_SCHEMAS.get(type(message))
+            for field in () if known is None else known.encode(message)[1]:
+                if getattr(message, field) not in (None, ""):
+                    done.lose(material.names[recorded.stream], field)
+            if (drawn := drawing_of(message)) is not None:
+                what = drawn.proto.DESCRIPTOR.full_name
+                done.lose(material.names[recorded.stream], f"what a {what}, as which it is drawn, does not show")
             writer.add_message(channels[place], stamp, data_of(message), stamp, recorded.seq % 2**32)
             done.count(material.names[recorded.stream])
         for stored in material.stored(list(kept)):

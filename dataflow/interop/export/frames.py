@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.interop.conversions import convert
+from dataflow.interop.conversions import NARROWING, convert
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import (
@@ -16,6 +16,7 @@ from dataflow.messages import (
     CompressedImage,
     DepthImage,
     Image,
+    Image16,
     Message,
     Odometry,
     Pose,
@@ -24,7 +25,7 @@ from dataflow.recording.errors import RecordingError
 
 PAIR_WITHIN = 20_000_000
 """Image, depth and pose of one frame lie at most this far apart (ns)."""
-IMAGES = (Image, CompressedImage)
+IMAGES = (Image, CompressedImage, Image16)
 DEPTHS = (DepthImage, CompressedDepth)
 POSES = (Pose, Odometry)
 
@@ -35,10 +36,14 @@ def optional(material: Material, *types: type[Message]) -> str | None:
 
 
 def messages_as(material: Material, stream: str | None, kind: type[Message], done: Exported) -> Iterator[Any]:
-    """The messages of a stream as one type."""
+    """The messages of a stream as one type; images of 16 bits stay such, since PNG holds them."""
     for recorded in material.messages([stream]) if stream is not None else ():
-        done.count(material.names[recorded.stream])
-        yield convert(recorded.message, kind)
+        name = material.names[recorded.stream]
+        done.count(name)
+        message = recorded.message
+        if (lost := NARROWING.get((type(message), kind))) is not None and not isinstance(message, Image16):
+            done.lose(name, lost)
+        yield message if kind is Image and isinstance(message, Image16) else convert(message, kind)
 
 
 def nearest(messages: dict[int, Any], stamp: int) -> Any | None:
@@ -48,17 +53,32 @@ def nearest(messages: dict[int, Any], stamp: int) -> Any | None:
     return messages[near] if near is not None and abs(near - stamp) <= PAIR_WITHIN else None
 
 
-def write_png(path: Path, message: Image | DepthImage, units: float | None) -> None:
-    """Writes an image as it is, or depth as 16-bit `units` a metre (0: no return, or too far to be written)."""
+def write_png(path: Path, message: Image | Image16) -> None:
+    """Writes an image as it is, of 8 or 16 bits."""
+    _write(path, message.data[..., ::-1] if message.data.ndim == 3 else message.data)
+
+
+def write_depth(path: Path, message: DepthImage, units: float, name: str, done: Exported) -> None:
+    """Writes depth as 16-bit `units` a metre, 0 for no return. What the format cannot hold is counted in pixels."""
+    metres = message.data.astype(np.float64)
+    seen = np.isfinite(metres) & (metres > 0)
+    scaled = np.rint(np.where(seen, metres, 0) * units)
+    far = scaled > 65535
+    if negative := int((metres < 0).sum()):
+        done.lose(name, "negative depth (pixels), written as no return", negative)
+    if beyond := int(far.sum()):
+        done.lose(name, f"depth beyond {65535 / units:.1f} m (pixels), written as no return", beyond)
+    if near := int((seen & (scaled == 0)).sum()):
+        done.lose(name, "depth below one unit (pixels), written as no return", near)
+    if np.abs(scaled / units - np.where(seen, metres, 0))[~far].max(initial=0) > 1e-6:
+        done.lose(name, f"digits of depth: it is written in units of {1000 / units:g} mm")
+    _write(path, np.where(far, 0, scaled).astype(np.uint16))
+
+
+def _write(path: Path, pixels: Any) -> None:
     import cv2
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    if units is None:
-        pixels: Any = message.data[..., ::-1] if message.data.ndim == 3 else message.data
-    else:
-        metres = np.nan_to_num(message.data.astype(np.float64), nan=0.0, posinf=0.0)
-        scaled = np.rint(metres * units)
-        pixels = np.where(scaled <= 65535, scaled, 0).astype(np.uint16)
     if not cv2.imwrite(str(path), pixels):
         raise RecordingError(f"{path} cannot be written")
 

@@ -39,9 +39,17 @@ def export_kitti_raw(material: Material, folder: Path, done: Exported) -> None:
     for message in messages_as(material, scans, PointCloud, done):
         near = min(stamps, key=lambda s: abs(s - message.stamp), default=None)
         if camera is not None and (near is None or abs(near - message.stamp) > PAIR_WITHIN):
+            done.lose(material.names[scans], "scans without an image within 20 ms, left out")
             continue
+        for field in ("colors", "rings", "time_offsets", "normals", "columns"):
+            if getattr(message, field) is not None:
+                done.lose(material.names[scans], field)
+        if message.precise is not None:
+            done.narrow(material.names[scans], "points of 64 bits, and KITTI has 32")
         intensities = np.zeros(message.count, np.float32) if message.intensities is None else message.intensities
         seen = np.isfinite(message.points).all(axis=1)
+        if not seen.all():
+            done.lose(material.names[scans], "points without a return, left out")
         rows = np.column_stack([message.points, intensities]).astype("<f4")[seen]
         path = drive / "velodyne_points" / "data" / f"{len(kept):010d}.bin"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +76,7 @@ def _images(material: Material, camera: str, wanted: list[int], folder: Path, do
     frame = ""
     for message in messages_as(material, camera, Image, done):
         for number in places.get(message.stamp, ()):
-            write_png(folder / "data" / f"{number:010d}.png", message, None)
+            write_png(folder / "data" / f"{number:010d}.png", message)
         frame = message.frame
     write_text(folder / "timestamps.txt", _times(wanted), done)
     return frame

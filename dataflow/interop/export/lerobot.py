@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.extras import missing_extra
 from dataflow.interop.conversions import convert
 from dataflow.interop.export.frames import IMAGES
 from dataflow.interop.export.lerobot_layouts import Dataset, Layout, Layout21
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
-from dataflow.messages import Image, Message
+from dataflow.messages import CameraInfo, Image, Image16, Message, Transforms
 from dataflow.messages.base import ArrayField
 from dataflow.recording.errors import RecordingError
 
@@ -86,8 +87,8 @@ def export_lerobot(
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ImportError:
-        raise RecordingError("a dataset of LeRobot needs pyarrow: pip install pyarrow") from None
+    except ImportError as error:
+        raise RecordingError(f"a dataset of LeRobot needs pyarrow; {missing_extra(error)}") from None
     layout = layout or Layout21()
     plan = _planned(material, action, done)
     stamps: list[int] = []
@@ -119,10 +120,13 @@ def _planned(material: Material, action: str | None, done: Exported) -> _Plan:
     acting = None if action is None else names.get(action, action)
     if acting is not None and acting not in material.streams:
         raise RecordingError(f"{material.path}: no stream {action!r} for the action; there are {', '.join(names)}")
-    images = {f"observation.images.{material.names[name].replace('/', '.')}": name for name in cameras}
+    images = {f"observation.images.{material.names[name].strip('/').replace('/', '.')}": name for name in cameras}
     states = []
     for name, info in material.streams.items():
-        if name in cameras or name == acting or info.static:
+        if name in cameras or name == acting:
+            continue
+        if info.static or info.message_type in (CameraInfo, Transforms):
+            done.left_out[material.names[name]] = "LeRobot has no place for calibrations and transforms"
             continue
         first = next(material.messages([name]), None)
         if first is None or not len(_numbers(first.message)[0]):
@@ -164,6 +168,8 @@ def _frames(material: Material, plan: _Plan, done: Exported) -> Iterator[tuple[i
             yield now, dict(newest)
         now = recorded.stamp
         newest[recorded.stream] = recorded.message
+        if isinstance(recorded.message, Image16):
+            done.narrow(material.names[recorded.stream], "16 bits, and LeRobot's images have 8")
         done.count(material.names[recorded.stream])
     if now is not None and is_frame():
         yield now, dict(newest)

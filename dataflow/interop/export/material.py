@@ -1,19 +1,21 @@
-"""Material of an export: the streams of a recording or the topics of a bag, and those that nobody here can read."""
+"""Material of an export: the streams of a recording or the topics of a bag, and those that nothing here can read."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Self
 
+from dataflow.interop.account import Account
 from dataflow.interop.bag import Bag, Stored, Topic
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign, open_bag
-from dataflow.interop.playing import readable
+from dataflow.interop.playing import PLAIN, Wishes, readable
 from dataflow.interop.streams import BagStreams
 from dataflow.messages import Message
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
-from dataflow.recording.layout import RECORDING
+from dataflow.recording.layout import BAG, RECORDING
 
 
 class Material:
@@ -31,6 +33,7 @@ class Material:
         clock: Choice = "auto",
         start: int | None = None,
         end: int | None = None,
+        wishes: Wishes = PLAIN,
     ) -> None:
         self.path, self.foreign = Path(path), is_foreign(Path(path))
         self._source: Recording | BagStreams | None = None
@@ -38,17 +41,20 @@ class Material:
         self.start, self.end = start, end
         try:
             if self.foreign:
-                self._source = readable(self.bag, self.path, clock, topics)
+                self._source = readable(self.bag, self.path, clock, topics, wishes, accounting=True)
                 namespace = ""
+                self.account = self._source.account
             else:
                 self._source = Recording(self.path)
                 namespace = self._source.metadata.get(RECORDING, {}).get("namespace", "")
+                self.account = Account(list(self.bag.notes))
             self.streams: dict[str, StreamInfo] = {
                 name: info
                 for name, info in self._source.streams.items()
                 if info.message_type is not None and info.count and (topics is None or name in topics)
             }
             self.names = {name: name.removeprefix(f"{namespace}/") if namespace else name for name in self.streams}
+            self.topics = self._topics_of(self._source)
             self.untouched: tuple[Topic, ...] = tuple(
                 topic
                 for name, topic in self.bag.topics.items()
@@ -58,6 +64,28 @@ class Material:
         except BaseException:
             self.close()
             raise
+
+    def _topics_of(self, source: Recording | BagStreams) -> dict[str, str]:
+        """The topic of the bag that each stream comes from, of a bag and of a recording that was made of one."""
+        known = {name: info.metadata["topic"] for name, info in self.streams.items() if "topic" in info.metadata}
+        try:
+            played = json.loads(source.metadata.get(BAG, {}).get("topics", "{}"))
+        except ValueError:
+            return known
+        return {name: topic for name, topic in played.items() if name in self.streams} | known
+
+    @property
+    def shift(self) -> int:
+        """Nanoseconds that are added to the log times of a bag so that they are of the clock of its streams."""
+        return self._source.clock.shift if isinstance(self._source, BagStreams) else 0
+
+    def facts(self) -> dict[str, str]:
+        """Metadata of a recording that was made of a bag; complete when all messages have been read."""
+        assert isinstance(self._source, BagStreams)
+        told = {name: text for name, text in self._source.facts().items() if name != "topics"}
+        account = self.account.as_json()
+        kept = {name: json.dumps(account[name], ensure_ascii=False) for name in ("unread", "lost") if account[name]}
+        return told | kept
 
     @property
     def clock(self) -> str:
@@ -80,11 +108,12 @@ class Material:
         return max(min(firsts), self.start or 0) if firsts else None
 
     def stored(self, topics: Sequence[str]) -> Iterator[Stored]:
-        """Serialised messages of topics by log time, those of the span."""
+        """Serialised messages of topics by log time, on the clock of the streams, those of the span."""
         low, high = self.start or 0, self.end
         for stored in self.bag.messages(topics):
-            if stored.log_time >= low and (high is None or stored.log_time <= high):
-                yield stored
+            time = max(stored.log_time + self.shift, 0)
+            if time >= low and (high is None or time <= high):
+                yield stored._replace(log_time=time)
 
     def only(self, what: str, *types: type[Message]) -> str:
         """The one stream of some types; raises `RecordingError` that names the choice."""

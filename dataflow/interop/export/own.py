@@ -17,12 +17,13 @@ def export_own(material: Material, file: Path, done: Exported, *, overwrite: boo
 
     Static messages of a bag, which may be stamped by another clock, get the stamp of the first other message.
     """
-    metadata = {BAG: {"file": material.path.name, "clock": material.clock}}
-    with RecordingWriter(file, metadata=metadata, overwrite=overwrite) as writer:
+    with RecordingWriter(file, metadata={}, overwrite=overwrite) as writer:
         names = {name: name.strip("/") or name for name in material.streams}
         for name, info in material.streams.items():
             assert info.message_type is not None
-            writer.add_stream(names[name], info.message_type, static=info.static, extra={"topic": name})
+            writer.add_stream(
+                names[name], info.message_type, static=info.static, extra={"topic": name, "type": info.schema}
+            )
         for topic in material.untouched:
             writer.add_untouched(topic.name, topic.encoding, topic.schema, topic.channel)
         numbers: dict[str, int] = {}
@@ -37,6 +38,8 @@ def export_own(material: Material, file: Path, done: Exported, *, overwrite: boo
         for stored in material.stored([t.name for t in material.untouched]):
             writer.write_untouched(stored.topic, stored.log_time, bytes(stored.data))
             done.count(stored.topic)
+        if material.foreign:
+            writer.add_metadata(BAG, material.facts())
         _carry(material, writer, done)
     done.files.append(str(file))
 

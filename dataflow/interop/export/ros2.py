@@ -6,16 +6,30 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from dataflow.interop.bag import Topic
 from dataflow.interop.export.extras import ROSBAG2, carry
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
-from dataflow.interop.ros.made import typestore
+from dataflow.interop.ros.made import Made, typestore
 from dataflow.interop.ros.outward import OUTWARD
-from dataflow.interop.typestores import RosType
-from dataflow.messages import Transforms
+from dataflow.interop.topics import UNIT
+from dataflow.interop.typestores import RosType, ros_type
+from dataflow.messages import (
+    Boxes3D,
+    Detections2D,
+    Imu,
+    LaserScan,
+    Message,
+    NavSatFix,
+    Number,
+    ParticleSet,
+    Pose,
+    RangeReading,
+    Transforms,
+)
 from dataflow.recording.codecs import SchemaText
 from dataflow.recording.errors import RecordingError
 
@@ -60,11 +74,14 @@ class Ros2Writer:
         self._first: int | None = None
         self._last = 0
 
-    def write(self, topic: str, schema: SchemaText, data: bytes, stamp: int, *, latched: bool = False) -> None:
-        """Adds a message; raises `RecordingError` for another type than the topic has."""
+    def write(
+        self, topic: str, schema: SchemaText, data: bytes, stamp: int, *, latched: bool = False, unit: str = ""
+    ) -> None:
+        """Adds a message; raises `RecordingError` for another type than the topic has. `unit`: of its numbers, for the
+        channel's metadata, since ROS has no place for it."""
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._channels[topic] = self._open(topic, schema, latched)
+            channel = self._channels[topic] = self._open(topic, schema, latched, unit)
         if channel.type != schema.name:
             raise RecordingError(f"topic {topic} is {channel.type} already, and cannot hold {schema.name}")
         self.mcap.add_message(channel.id, log_time=stamp, publish_time=stamp, data=data, sequence=channel.count)
@@ -72,11 +89,12 @@ class Ros2Writer:
         self._first = stamp if self._first is None else min(self._first, stamp)
         self._last = max(self._last, stamp)
 
-    def _open(self, topic: str, schema: SchemaText, latched: bool) -> _Channel:
+    def _open(self, topic: str, schema: SchemaText, latched: bool, unit: str) -> _Channel:
         if schema not in self._schemas:
             self._schemas[schema] = self.mcap.register_schema(schema.name, schema.encoding, schema.data)
         qos = _QOS.format(depth=1 if latched else 10, durability=LATCHED if latched else VOLATILE)
-        number = self.mcap.register_channel(topic, "cdr", self._schemas[schema], metadata={"offered_qos_profiles": qos})
+        about = {"offered_qos_profiles": qos} | ({UNIT: unit} if unit else {})
+        number = self.mcap.register_channel(topic, "cdr", self._schemas[schema], metadata=about)
         return _Channel(number, schema.name, qos)
 
     def close(self) -> None:
@@ -129,8 +147,8 @@ class Ros2Writer:
 def export_ros2(material: Material, folder: Path, done: Exported) -> None:
     """Writes a ROS 2 bag. Topics of ROS stay as they are, byte for byte (of ROS 1: field by field).
 
-    Streams of messages become ROS messages: transforms /tf and /tf_static, others a topic of their name. Raises
-    `RecordingError`.
+    Streams of messages become ROS messages. Those that come from a bag have the names of its topics again; of others,
+    transforms are /tf and /tf_static, and each one else is a topic of its name. Raises `RecordingError`.
     """
     ros = [t for t in material.bag.topics.values() if t.encoding in ("cdr", "ros1")]
     chosen = {*material.streams, *(t.name for t in material.untouched)}
@@ -165,11 +183,13 @@ def _copy(material: Material, topics: list[Topic], writer: Ros2Writer, done: Exp
             continue
         if topic.encoding == "ros1":
             kinds[topic.name] = kind
+    shift = material.shift
     for stored in material.stored(list(schemas)):
         kind_of = kinds.get(stored.topic)
         data = bytes(stored.data) if kind_of is None else kind_of.to_cdr(stored.data)
         name = _ros_name(stored.topic)
-        writer.write(name, schemas[stored.topic], data, stored.log_time, latched=latched[stored.topic])
+        log_time = stored.log_time - shift  # as it was: it all is of the recorder's clock
+        writer.write(name, schemas[stored.topic], data, log_time, latched=latched[stored.topic])
         done.count(name)
 
 
@@ -188,19 +208,66 @@ def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exp
     for recorded in material.messages(mapped) if mapped else ():
         name = recorded.stream
         static = material.streams[name].static
-        kind_of, message = OUTWARD[type(recorded.message)](recorded.message)
+        topic = _topic_of(material, name)
+        try:
+            kind_of, message = _made(material.streams[name].metadata.get("type", ""), recorded.message)
+        except RecordingError as error:
+            done.lose(topic, str(error))
+            continue
         if kind_of not in schemas:
             schemas[kind_of] = SchemaText(kind_of, "ros2msg", store.generate_msgdef(kind_of, ros_version=2)[0].encode())
-        topic = _ros_name(material.names[name])
-        if isinstance(recorded.message, Transforms):
-            topic = "/tf_static" if static else "/tf"
         stamp = begin if static else recorded.stamp
         try:
             data = bytes(store.serialize_cdr(message, kind_of))
         except (struct.error, OverflowError, ValueError) as error:
             raise RecordingError(f"{name} at {recorded.stamp} does not fit into {kind_of}: {error}") from error
-        writer.write(topic, schemas[kind_of], data, stamp, latched=static)
+        unit = recorded.message.unit if isinstance(recorded.message, Number) else ""
+        writer.write(topic, schemas[kind_of], data, stamp - material.shift, latched=static, unit=unit)
+        for lost in _lost(recorded.message):
+            done.lose(topic, lost)
         done.count(topic)
+
+
+def _topic_of(material: Material, name: str) -> str:
+    if name in material.topics:
+        return _ros_name(material.topics[name].partition(" (")[0])
+    if material.streams[name].message_type is Transforms:
+        return "/tf_static" if material.streams[name].static else "/tf"
+    return _ros_name(material.names[name])
+
+
+def _made(recorded_as: str, message: Message) -> Made:
+    """The ROS message; a single transform as one where the topic held such."""
+    if isinstance(message, Transforms) and ros_type(recorded_as) == "geometry_msgs/msg/TransformStamped":
+        rows = OUTWARD[Transforms](message)[1].transforms
+        if len(rows) == 1:
+            return "geometry_msgs/msg/TransformStamped", rows[0]
+    return OUTWARD[type(message)](message)
+
+
+_NO_PLACE: dict[type[Message], tuple[str, ...]] = {
+    Imu: ("temperature",),
+    NavSatFix: ("satellites",),
+    RangeReading: ("variance",),
+    ParticleSet: ("weights",),
+    Detections2D: ("visible", "pixel_counts"),
+    Boxes3D: ("velocities", "covariances", "visible", "point_counts"),
+}
+"""Fields that the ROS type of a message has no place for."""
+
+
+def _lost(message: Message) -> list[str]:
+    """What of a message its ROS type does not hold."""
+    found = [name for name in _NO_PLACE.get(type(message), ()) if getattr(message, name, None) is not None]
+    if isinstance(message, ParticleSet) and len(set(message.weights.tolist())) <= 1:
+        found.remove("weights")
+    if isinstance(message, Pose) and message.child_frame:
+        found.append("child_frame")
+    if isinstance(message, LaserScan) and message.time_offsets is not None and len(message.time_offsets) > 1:
+        steps = np.diff(message.time_offsets.astype(np.float64))
+        if abs(float(message.time_offsets[0])) > 1e-6 or float(np.ptp(steps)) > 1e-6:
+            found.append("time_offsets that are no constant step")
+    return found
 
 
 def _ros_name(name: str) -> str:

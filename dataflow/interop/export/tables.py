@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
+import xxhash
 
+from dataflow.extras import missing_extra
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Message
@@ -20,6 +24,8 @@ from dataflow.recording.errors import RecordingError
 MAX_COLUMNS = 36
 """Elements of an array that become columns; larger arrays, and those of no fixed shape, are left out."""
 ROWS = 4096
+MAX_NAME = 200
+"""Bytes of one part of a file's path, its suffix aside: file systems take 255."""
 
 
 def columns_of(kind: type[Message]) -> tuple[dict[str, list[str]], list[str]]:
@@ -58,7 +64,7 @@ def export_csv(material: Material, folder: Path, done: Exported) -> None:
     with ExitStack() as files:
         writers: dict[str, tuple[Any, dict[str, list[str]]]] = {}
         for name, columns in _tables(material, done):
-            path = _file(folder, material.names[name], ".csv")
+            path = file_of(folder, material.names[name], ".csv", done.files)
             file = files.enter_context(path.open("w", newline="", encoding="utf-8"))
             names = ["stamp", *(column for group in columns.values() for column in group)]
             writer = csv.DictWriter(file, names)
@@ -76,10 +82,10 @@ def export_parquet(material: Material, folder: Path, done: Exported) -> None:
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ImportError:
-        raise RecordingError("--to parquet needs pyarrow: pip install pyarrow") from None
+    except ImportError as error:
+        raise RecordingError(f"--to parquet needs pyarrow; {missing_extra(error)}") from None
     for name, columns in _tables(material, done):
-        path = _file(folder, material.names[name], ".parquet")
+        path = file_of(folder, material.names[name], ".parquet", done.files)
         kind = material.streams[name].message_type
         assert kind is not None
         schema = pa.schema([("stamp", pa.int64()), *_types(pa, kind, columns)])
@@ -120,8 +126,23 @@ def _tables(material: Material, done: Exported) -> Iterator[tuple[str, dict[str,
             yield name, columns
 
 
-def _file(folder: Path, name: str, suffix: str) -> Path:
-    parts = [part for part in name.split("/") if part not in ("", ".", "..")]
+def file_of(folder: Path, name: str, suffix: str, taken: Collection[str]) -> Path:
+    """Returns the file of a stream, slashes of its name as folders, other than those `taken`.
+
+    What no file system or terminal takes is spelled as in URLs (`%00`); a part that is too long ends in a digest.
+    """
+    parts = [_part(part) for part in name.split("/") if part] or ["%2F"]
     path = folder.joinpath(*parts[:-1], f"{parts[-1]}{suffix}")
+    numbered = (path.with_name(f"{parts[-1]}-{number}{suffix}") for number in count(2))
+    while str(path) in taken:
+        path = next(numbered)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def _part(part: str) -> str:
+    spelled = part.replace(".", "%2E") if part in (".", "..") else part
+    spelled = "".join(c if c.isprintable() else quote(c, errors="surrogatepass") for c in spelled)
+    if len(spelled.encode()) <= MAX_NAME:
+        return spelled
+    return f"{spelled.encode()[:MAX_NAME].decode(errors='ignore')}-{xxhash.xxh3_64_hexdigest(part.encode())}"

@@ -18,6 +18,7 @@ from dataflow.messages import (
     JointState,
     LaserScan,
     MagneticField,
+    Measurement,
     Message,
     NavSatFix,
     Number,
@@ -27,6 +28,7 @@ from dataflow.messages import (
     Path,
     PointCloud,
     Pose,
+    RangeReading,
     Switch,
     Text,
     Transforms,
@@ -39,7 +41,7 @@ Convert = Callable[[Any, int], Message]
 TRANSFORM_SETS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 """Types that hold transforms of several stamps: one message here for each stamp."""
 _NUMBERS = ("Float32", "Float64", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
-_READINGS = ("Temperature", "FluidPressure", "Illuminance", "RelativeHumidity", "Range")
+_READINGS = ("Temperature", "FluidPressure", "Illuminance", "RelativeHumidity")
 
 CONVERSIONS: dict[str, tuple[type[Message], Convert]] = {
     "sensor_msgs/msg/Image": (Image, images.image),
@@ -75,6 +77,7 @@ CONVERSIONS: dict[str, tuple[type[Message], Convert]] = {
     "std_msgs/msg/String": (Text, sensors.text),
     "std_msgs/msg/Bool": (Switch, sensors.switch),
     **{f"std_msgs/msg/{name}": (Number, sensors.number) for name in _NUMBERS},
-    **{f"sensor_msgs/msg/{name}": (Number, sensors.number) for name in _READINGS},
+    **{f"sensor_msgs/msg/{name}": (Measurement, sensors.measurement) for name in _READINGS},
+    "sensor_msgs/msg/Range": (RangeReading, sensors.range_reading),
 }
 """By ROS type: the message type that it usually becomes, and how."""

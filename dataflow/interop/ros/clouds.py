@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.interop.seen import lose
 from dataflow.messages import PointCloud
 from dataflow.recording.errors import RecordingError
 
@@ -17,31 +18,47 @@ _INTENSITY = ("intensity", "intensities", "reflectivity", "i")
 _RING = ("ring", "channel", "line", "laser_id")
 _TIMES = ("time", "t", "timestamp", "time_offset", "offset_time", "time_stamp")
 _COLOR = ("rgb", "rgba")
-_ABSOLUTE = 1e8
-"""Times of points beyond this many seconds are since the epoch, not since the stamp."""
+TYPICAL_PERIOD = 0.1
+"""Seconds from cloud to cloud where the recording does not tell."""
 
 
-def point_cloud(message: Any, stamp: int) -> PointCloud:
-    """sensor_msgs/PointCloud2, organised ones row by row.
+def point_cloud(message: Any, stamp: int, period: float = TYPICAL_PERIOD) -> PointCloud:
+    """sensor_msgs/PointCloud2, organised ones row by row. `period`: seconds from cloud to cloud.
 
-    Of the fields x, y, z; intensity or reflectivity; ring, channel or line; rgb or rgba; normal_x, normal_y, normal_z;
-    and the time of each point as drivers give it (float seconds, or integer nanoseconds, since the stamp or the epoch)
-    are carried. `carried` tells which of a cloud's fields are not.
+    Carried are x, y, z, with all their bits; intensity or reflectivity; ring, channel or line; rgb; normal_x, normal_y,
+    normal_z; and the time of each point, whatever unit its driver gives it in (`point_times`). Other fields are lost.
     """
     points = _points(message)
+    for name in left_out(message):
+        lose(message, f"the field {name} of the points")
+    names_ = points.dtype.names or ()
+    if (rgb := _found(names_, _COLOR)) is not None and points[rgb].dtype.itemsize != 4:
+        lose(message, f"the field {rgb} of the points, which is no packed colour")
     if points.dtype.names is None or not {"x", "y", "z"} <= set(points.dtype.names):
         raise RecordingError(
             f"a cloud without x, y and z; its fields are {', '.join(points.dtype.names or ()) or 'none'}"
         )
     names = points.dtype.names
+    times = _found(names, _TIMES)
+    offsets, odd = None, ""
+    if times is not None and points[times].ndim == 1:
+        measured = int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+        offsets, odd = point_times(points[times], measured, period)
+    if odd:
+        lose(message, f"the field {times} of the points: {odd}")
+    exact = np.column_stack([points[axis].astype(np.float64) for axis in "xyz"]).reshape(-1, 3)
+    with np.errstate(over="ignore"):
+        rounded = exact.astype(np.float32)
     return PointCloud(
         stamp=stamp,
         frame=message.header.frame_id,
-        points=np.column_stack([points[axis].astype(np.float32) for axis in "xyz"]).reshape(-1, 3),
+        points=rounded,
+        precise=None if np.array_equal(rounded, exact, equal_nan=True) else exact,
+        columns=int(message.width) if message.height > 1 and message.width else None,
         colors=_colors(points),
-        intensities=_one(points, _INTENSITY, "<f4"),
-        rings=_one(points, _RING, "<u2"),
-        time_offsets=_time_offsets(points, int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)),
+        intensities=_kept(message, points, _INTENSITY, "<f4"),
+        rings=_kept(message, points, _RING, "<u2"),
+        time_offsets=offsets,
         normals=np.column_stack([points[f"normal_{axis}"].astype(np.float32) for axis in "xyz"])
         if {"normal_x", "normal_y", "normal_z"} <= set(names)
         else None,
@@ -93,9 +110,21 @@ def _found(names: Any, wanted: tuple[str, ...]) -> str | None:
     return next((name for name in wanted if name in names), None)
 
 
-def _one(points: npt.NDArray[Any], names: tuple[str, ...], dtype: str) -> npt.NDArray[Any] | None:
+def _kept(message: Any, points: npt.NDArray[Any], names: tuple[str, ...], dtype: str) -> npt.NDArray[Any] | None:
+    """A field as the type that it has here; None for one that has several values a point."""
     name = _found(points.dtype.names, names)
-    return None if name is None or points[name].ndim > 1 else points[name].astype(dtype)
+    if name is None:
+        return None
+    values = points[name]
+    if values.ndim > 1:
+        lose(message, f"the field {name} of the points, which has {values.shape[1]} values")
+        return None
+    with np.errstate(invalid="ignore", over="ignore"):
+        kept = values.astype(dtype)
+        same = np.array_equal(kept.astype(values.dtype), values, equal_nan=values.dtype.kind == "f")
+    if not same:
+        lose(message, f"digits of the field {name} beyond {dtype[1:]}")
+    return kept
 
 
 def _colors(points: npt.NDArray[Any]) -> npt.NDArray[np.uint8] | None:
@@ -106,16 +135,55 @@ def _colors(points: npt.NDArray[Any]) -> npt.NDArray[np.uint8] | None:
     return np.column_stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)]).astype(np.uint8)
 
 
-def _time_offsets(points: npt.NDArray[Any], stamp: int) -> npt.NDArray[np.float32] | None:
-    name = _found(points.dtype.names, _TIMES)
-    if name is None or points[name].ndim > 1:
-        return None
-    values = points[name]
-    if values.dtype.kind in "iu":  # nanoseconds, as Ouster and Livox give them
-        ns = values.astype(np.int64)
-        return ((ns - stamp if ns.size and ns.max() > _ABSOLUTE * 1e9 else ns) * 1e-9).astype(np.float32)
-    seconds = values.astype(np.float64)
-    if not seconds.size or np.nanmax(np.abs(seconds)) < _ABSOLUTE:
-        return seconds.astype(np.float32)
-    whole = stamp // 10**9
-    return ((seconds - whole) - (stamp - whole * 10**9) * 1e-9).astype(np.float32)
+_UNITS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "ns": 1e-9}
+_EPOCH = {"ns": 1e17, "µs": 1e14, "ms": 1e11, "s": 1e8}
+"""Values beyond are since the epoch, in that unit: 1973 and later."""
+LONGEST = 60.0
+"""Seconds that the points of one cloud may lie from its stamp."""
+
+
+def point_times(
+    values: npt.NDArray[Any], stamp: int, period: float = TYPICAL_PERIOD
+) -> tuple[npt.NDArray[np.float32] | None, str]:
+    """Returns when points were measured, seconds since the stamp (ns) of their cloud, and what is odd about it.
+
+    Drivers give seconds, or whole nanoseconds, since the stamp or the epoch; some microseconds or milliseconds. The
+    unit is the usual one of the type of number unless the points of a cloud then take longer than it is until the next
+    (`period`, s), or hardly any time of it. None where no unit makes sense.
+    """
+    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    if not finite.size:
+        return np.zeros(0, np.float32) if not values.size else None, "" if not values.size else "no number"
+    whole = values.dtype.kind in "iu"
+    low, high = float(finite.min()), float(finite.max())
+    since = next((unit for unit, least in _EPOCH.items() if low > least and not (whole and unit == "s")), None)
+    if since is not None:
+        offsets = _since_epoch(values, since, stamp)
+        if np.nanmax(np.abs(offsets)) <= LONGEST:
+            return offsets.astype(np.float32), ""
+        odd = "it is of another clock than the stamps; counted from the first point"
+        return (offsets - np.nanmin(offsets)).astype(np.float32), odd
+    unit = _likeliest(high - low, max(abs(low), abs(high)), whole, period)
+    if unit is None:
+        return None, f"values from {low:g} to {high:g} make no sense in any unit"
+    return (values.astype(np.float64) * _UNITS[unit]).astype(np.float32), ""
+
+
+def _since_epoch(values: npt.NDArray[Any], unit: str, stamp: int) -> npt.NDArray[np.float64]:
+    """Seconds since the stamp. Seconds, milliseconds and microseconds are split so that no digit is lost."""
+    if values.dtype.kind in "iu" and unit == "ns":
+        return (values.astype(np.int64) - stamp) * 1e-9
+    each = round(1e9 * _UNITS[unit])
+    base = stamp // each
+    return np.asarray(((values.astype(np.float64) - base) - (stamp - base * each) / each) * _UNITS[unit])
+
+
+def _likeliest(span: float, farthest: float, whole: bool, period: float) -> str | None:
+    """The unit of times since the stamp."""
+    possible = [u for u, s in _UNITS.items() if span * s <= 1.5 * max(period, 1e-3) and farthest * s <= LONGEST]
+    usual = "ns" if whole else "s"
+    if whole:
+        possible = [u for u in possible if u != "s"]
+        if usual in possible and span * _UNITS[usual] < 0.01 * period and span:
+            return possible[0]
+    return usual if usual in possible else possible[0] if possible else None

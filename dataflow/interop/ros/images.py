@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.interop.ros.values import first, optional
-from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image
+from dataflow.interop.ros.values import first, known, optional
+from dataflow.interop.seen import lose
+from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, Image16
 from dataflow.messages.images import PNG_SIGNATURE
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.pixels import as_depth, as_image, is_depth, stored_rows
+from dataflow.recording.pixels import as_depth, as_image, as_image16, is_16_bit, is_depth, stored_rows
 
 _DEPTH_HEADER = struct.Struct("<iff")
 """The header that compressed_depth_image_transport puts before the PNG: format, quantisation parameters A and B."""
@@ -19,8 +20,17 @@ _DEPTH_UNIT = 0.001
 _JPEG = b"\xff\xd8\xff"
 
 
-def image(message: Any, stamp: int) -> Image | DepthImage:
-    """sensor_msgs/Image: depth where its encoding says so."""
+_CONVERTED = {
+    "rgba8": "the alpha channel",
+    "bgra8": "the alpha channel",
+    **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), "YUV 4:2:2 (it is RGB here, each value rounded)"),
+    **dict.fromkeys(("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"), "the Bayer mosaic (interpolated)"),
+}
+"""By encoding, what an `Image` does not hold of it."""
+
+
+def image(message: Any, stamp: int) -> Image | Image16 | DepthImage:
+    """sensor_msgs/Image: depth where its encoding says so, and all 16 bits of greys and colours that have them."""
     rows = stored_rows(
         message.encoding,
         message.width,
@@ -31,7 +41,13 @@ def image(message: Any, stamp: int) -> Image | DepthImage:
     )
     frame = message.header.frame_id
     if is_depth(message.encoding):
+        if message.encoding == "64FC1" and (rows.astype(np.float32) != rows)[np.isfinite(rows)].any():
+            lose(message, "depth beyond 32 bits")
         return DepthImage(stamp=stamp, frame=frame, data=as_depth(message.encoding, rows))
+    if is_16_bit(message.encoding):
+        return Image16(stamp=stamp, frame=frame, data=as_image16(message.encoding, rows))
+    if message.encoding in _CONVERTED:
+        lose(message, _CONVERTED[message.encoding])
     return Image(stamp=stamp, frame=frame, data=as_image(message.encoding, rows))
 
 
@@ -42,11 +58,18 @@ def compressed_image(message: Any, stamp: int) -> CompressedImage | CompressedDe
 
 
 def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedImage | CompressedDepth:
-    """An encoded image or depth image, told apart by the text of its format (`16UC1; compressedDepth png`)."""
+    """An encoded image or depth image, told apart by the text of its format (`16UC1; compressedDepth png`).
+
+    A 16-bit grey PNG whose format does not name its pixels (`png`) is depth in millimetres, as devices send it.
+    """
     if "compressedDepth" in format_:
         return _compressed_depth(format_, data, frame, stamp)
+    if not len(data):
+        raise RecordingError(f"an image of format {format_!r} without a byte")
     head = data[:26].tobytes()
-    if head.startswith(PNG_SIGNATURE) and head[24:26] == b"\x10\x00":
+    pixels = format_.partition(";")[0].strip()
+    named = pixels if is_16_bit(pixels) or is_depth(pixels) or pixels in ("mono8", "rgb8", "bgr8") else ""
+    if head.startswith(PNG_SIGNATURE) and head[24:26] == b"\x10\x00" and (not named or is_depth(named)):
         return CompressedDepth(stamp=stamp, frame=frame, scale=_DEPTH_UNIT, data=data)
     kind = "jpeg" if head.startswith(_JPEG) else "png" if head.startswith(PNG_SIGNATURE) else "webp"
     return CompressedImage(stamp=stamp, frame=frame, format=kind, data=data)
@@ -67,23 +90,61 @@ def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> Compre
 
 
 def camera_info(message: Any, stamp: int) -> CameraInfo:
-    """sensor_msgs/CameraInfo; raises `RecordingError` for a camera that is not calibrated (K of zeros)."""
+    """sensor_msgs/CameraInfo, as it is for the image that comes: of the sensor's size where it is binned or a part is
+    read out (REP 104), with K and P of those pixels. Raises `RecordingError` for a camera that is not calibrated (K
+    of zeros)."""
     K, D = first(message, "k", "K"), first(message, "d", "D")
     R, P = first(message, "r", "R"), first(message, "p", "P")
-    return calibration(
+    made = calibration(
         stamp, message.header.frame_id, message.width, message.height, message.distortion_model, K, D, R, P
     )
+    roi, binning = message.roi, (int(message.binning_x) or 1, int(message.binning_y) or 1)
+    if max(binning) > 1 and made.cx > 0.8 * made.width:
+        # some drivers give the size of the image beside the K of the sensor
+        made = made.replace(width=made.width * binning[0], height=made.height * binning[1])
+    offset = (int(roi.x_offset), int(roi.y_offset))
+    part = (int(roi.width) or made.width - offset[0], int(roi.height) or made.height - offset[1])
+    if roi.do_rectify:
+        lose(message, "roi.do_rectify")
+    return as_read_out(made, offset, part, binning)
+
+
+def as_read_out(
+    info: CameraInfo, offset: tuple[int, int], part: tuple[int, int], binning: tuple[int, int]
+) -> CameraInfo:
+    """A calibration of a whole sensor as one of the image that is read out: `part` (columns, rows) from `offset`,
+    `binning` pixels of each as one (REP 104). Raises `RecordingError` for a part outside the sensor."""
+    if offset == (0, 0) and part == (info.width, info.height) and binning == (1, 1):
+        return info
+    width, height = part[0] // binning[0], part[1] // binning[1]
+    fits = part[0] > 0 and part[1] > 0 and offset[0] + part[0] <= info.width and offset[1] + part[1] <= info.height
+    if not fits or not width or not height:
+        raise RecordingError(
+            f"its region of {part[0]}x{part[1]} at {offset}, binned {binning[0]}x{binning[1]}, does not lie in the "
+            f"sensor of {info.width}x{info.height} pixels"
+        )
+    scale = np.array([1 / binning[0], 1 / binning[1], 1.0])[:, None]
+    shift = np.array([[offset[0]], [offset[1]]], np.float64)
+
+    def moved(matrix: Any) -> Any:
+        changed = np.array(matrix)
+        changed[:2, 2:3] -= shift
+        return changed * scale
+
+    return info.replace(width=width, height=height, K=moved(info.K), P=None if info.P is None else moved(info.P))
 
 
 def calibration(
     stamp: int, frame: str, width: int, height: int, model: str, K: Any, D: Any, R: Any, P: Any
 ) -> CameraInfo:
-    """A calibration; matrices of zeros are not known."""
+    """A calibration; matrices of zeros or with NaN are not known."""
     intrinsics = np.asarray(K, np.float64)
     if not intrinsics.any():
         raise RecordingError(f"the camera {frame!r} is not calibrated: its K is all zeros")
-    rectification, projection = np.asarray(R, np.float64), np.asarray(P, np.float64)
+    rectification, projection = known(R), known(P)
     distortion = optional(D, "<f8")
+    if distortion is not None and not np.isfinite(distortion).all():
+        distortion, model = None, "none"
     if distortion is None or (not model and not distortion.any()):
         model, distortion = (model or "none") if distortion is None else "none", None
     return CameraInfo(
@@ -94,6 +155,6 @@ def calibration(
         distortion_model=model or "plumb_bob",
         K=intrinsics.reshape(3, 3),
         distortion=distortion,
-        R=rectification.reshape(3, 3) if rectification.any() else None,
-        P=projection.reshape(3, 4) if projection.any() else None,
+        R=None if rectification is None else rectification.reshape(3, 3),
+        P=None if projection is None else projection.reshape(3, 4),
     )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.interop.ros.values import orientation, time_ns, vector
+from dataflow.interop.seen import lose
 from dataflow.messages import Boxes3D, Detections2D, Path
 from dataflow.recording.errors import RecordingError
 
@@ -25,6 +26,8 @@ def detections_2d(message: Any, stamp: int) -> Detections2D:
     boxes, best = [], []
     for detection in message.detections:
         x, y, angle = _center_2d(detection.bbox.center)
+        if angle:
+            lose(message, "how boxes are turned (the upright ones around them are kept)")
         half_w, half_h = 0.5 * detection.bbox.size_x, 0.5 * detection.bbox.size_y
         cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
         w, h = half_w * cos + half_h * sin, half_w * sin + half_h * cos
@@ -76,6 +79,8 @@ def marker(message: Any, stamp: int) -> Boxes3D | Path:
 
 def marker_array(message: Any, stamp: int) -> Boxes3D:
     """visualization_msgs/MarkerArray: its cubes as boxes whose class is their namespace; other shapes are left out."""
+    if others := sorted({m.type for m in message.markers if m.type not in (CUBE, CUBE_LIST)}):
+        lose(message, f"markers of the types {', '.join(map(str, others))}")
     return _boxes([m for m in message.markers if m.type in (CUBE, CUBE_LIST) and m.action not in DELETE], stamp)
 
 

@@ -14,23 +14,27 @@ from dataflow.messages import (
     CompressedImage,
     DepthImage,
     Image,
+    Image16,
     Imu,
     JointState,
     LaserScan,
     MagneticField,
+    Measurement,
     NavSatFix,
     PointCloud,
+    RangeReading,
 )
 from dataflow.messages.poses import COVARIANCE_TYPES
 from dataflow.recording.errors import RecordingError
 
 _FIX = {"no_fix": -1, "fix": 0, "sbas": 1, "gbas": 2, "rtk_float": 2, "rtk_fixed": 2}
 _ABSENT = np.array([-1.0, 0, 0, 0, 0, 0, 0, 0, 0])
-_FLOAT32, _UINT16, _UINT32 = 7, 4, 6
+_FLOAT32, _FLOAT64, _UINT16, _UINT32 = 7, 8, 4, 6
 
 
-def image(m: Image | DepthImage) -> Made:
-    encoding = "32FC1" if isinstance(m, DepthImage) else "rgb8" if m.data.ndim == 3 else "mono8"
+def image(m: Image | Image16 | DepthImage) -> Made:
+    color, bits = m.data.ndim == 3, 8 * m.data.itemsize
+    encoding = "32FC1" if isinstance(m, DepthImage) else f"{'rgb' if color else 'mono'}{bits}"
     height, width = m.data.shape[:2]
     return "sensor_msgs/msg/Image", make(
         "sensor_msgs/Image",
@@ -80,7 +84,9 @@ def camera_info(m: CameraInfo) -> Made:
 
 
 def point_cloud(m: PointCloud) -> Made:
-    columns: list[tuple[str, str, int, Any]] = [(n, "<f4", _FLOAT32, m.points[:, i]) for i, n in enumerate("xyz")]
+    dtype, kind = ("<f4", _FLOAT32) if m.precise is None else ("<f8", _FLOAT64)
+    points = m.points if m.precise is None else m.precise
+    columns: list[tuple[str, str, int, Any]] = [(n, dtype, kind, points[:, i]) for i, n in enumerate("xyz")]
     if m.intensities is not None:
         columns.append(("intensity", "<f4", _FLOAT32, m.intensities))
     if m.colors is not None:
@@ -102,12 +108,12 @@ def point_cloud(m: PointCloud) -> Made:
     return "sensor_msgs/msg/PointCloud2", make(
         "sensor_msgs/PointCloud2",
         header=header_of(m.stamp, m.frame),
-        height=1,
-        width=len(rows),
+        height=1 if m.columns is None else len(rows) // m.columns,
+        width=len(rows) if m.columns is None else m.columns,
         fields=fields,
         is_bigendian=False,
         point_step=rows.itemsize,
-        row_step=rows.nbytes,
+        row_step=rows.itemsize * (m.columns or len(rows)),
         data=np.frombuffer(rows.tobytes(), np.uint8),
         is_dense=bool(np.isfinite(m.points).all()),
     )
@@ -151,6 +157,35 @@ def laser_scan(m: LaserScan) -> Made:
         range_max=m.range_max,
         ranges=np.array(m.ranges),
         intensities=np.zeros(0, np.float32) if m.intensities is None else np.array(m.intensities),
+    )
+
+
+MEASURED = {
+    "°C": ("Temperature", "temperature"),
+    "Pa": ("FluidPressure", "fluid_pressure"),
+    "lx": ("Illuminance", "illuminance"),
+    "": ("RelativeHumidity", "relative_humidity"),
+}
+"""Type and field of sensor_msgs by unit."""
+
+
+def measurement(m: Measurement) -> Made:
+    if m.unit not in MEASURED:
+        raise RecordingError(f"a Measurement in {m.unit!r} has no counterpart in ROS; known are {', '.join(MEASURED)}")
+    kind, field = MEASURED[m.unit]
+    values = {field: m.value, "variance": m.variance or 0.0}
+    return f"sensor_msgs/msg/{kind}", make(f"sensor_msgs/{kind}", header=header_of(m.stamp, m.frame), **values)
+
+
+def range_reading(m: RangeReading) -> Made:
+    return "sensor_msgs/msg/Range", make(
+        "sensor_msgs/Range",
+        header=header_of(m.stamp, m.frame),
+        radiation_type=int(m.radiation == "infrared"),
+        field_of_view=m.field_of_view,
+        min_range=m.range_min,
+        max_range=m.range_max,
+        range=m.range,
     )
 
 

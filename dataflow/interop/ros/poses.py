@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.interop.ros.values import covariance, orientation, time_ns, vector
+from dataflow.interop.seen import lose
 from dataflow.messages import Odometry, ParticleSet, Path, Pose, Transforms, Twist
 
 
@@ -89,9 +90,17 @@ def transform(message: Any, stamp: int) -> Transforms:
 def transforms(rows: Sequence[Any], stamp: int) -> Transforms:
     """Some geometry_msgs/TransformStamped as one set; of those that place one frame the last counts.
 
-    Frames that begin with a slash, as in early ROS, are named without it. A transform of a frame to itself is left out.
+    Frames that begin with a slash, as in early ROS, are named without it. A transform of a frame to itself is left out,
+    and so is one whose rotation is NaN.
     """
-    placed = [row for row in rows if _bare(row.child_frame_id) != _bare(row.header.frame_id)]
+    placed = []
+    for row in rows:
+        if _bare(row.child_frame_id) == _bare(row.header.frame_id):
+            continue
+        if np.isfinite(orientation(row.transform.rotation)).all():
+            placed.append(row)
+        else:
+            lose(row, f"a transform to {_bare(row.child_frame_id)} whose rotation is NaN")
     kept = list({_bare(row.child_frame_id): row for row in placed}.items())
     return Transforms(
         stamp=stamp,

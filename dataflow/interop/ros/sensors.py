@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.interop.ros.values import covariance, first, optional, orientation, vector
+from dataflow.interop.ros.values import covariance, optional, orientation, vector
+from dataflow.interop.seen import lose
 from dataflow.messages import (
     Alarm,
     Diagnostics,
@@ -14,9 +15,11 @@ from dataflow.messages import (
     JointState,
     LaserScan,
     MagneticField,
+    Measurement,
     NavSatFix,
     Number,
     OccupancyGrid,
+    RangeReading,
     Switch,
     Text,
 )
@@ -29,9 +32,13 @@ _ABSENT = -1.0
 
 
 def imu(message: Any, stamp: int) -> Imu:
-    """sensor_msgs/Imu; without an orientation where its covariance begins with -1 (REP 145) or it is all zeros."""
+    """sensor_msgs/Imu; without an orientation where its covariance begins with -1 (REP 145), or it is all zeros or
+    no number."""
     turned = message.orientation
-    known = message.orientation_covariance[0] != _ABSENT and any((turned.x, turned.y, turned.z, turned.w))
+    values = np.array([turned.x, turned.y, turned.z, turned.w])
+    known = message.orientation_covariance[0] != _ABSENT and bool(values.any() and np.isfinite(values).all())
+    if not known and message.orientation_covariance[0] != _ABSENT and values.any():
+        lose(message, "an orientation of NaN")
     return Imu(
         stamp=stamp,
         frame=message.header.frame_id,
@@ -59,7 +66,8 @@ def magnetic_field(message: Any, stamp: int) -> MagneticField:
 
 
 def laser_scan(message: Any, stamp: int) -> LaserScan:
-    """sensor_msgs/LaserScan; the last beam's angle follows from the increment."""
+    """sensor_msgs/LaserScan; the last beam's angle follows from the increment, as does the duration of a scan where
+    beams have times."""
     count = len(message.ranges)
     intensities = optional(message.intensities, "<f4")
     step = float(message.time_increment)
@@ -77,28 +85,41 @@ def laser_scan(message: Any, stamp: int) -> LaserScan:
 
 
 def nav_sat_fix(message: Any, stamp: int) -> NavSatFix:
-    """sensor_msgs/NavSatFix."""
+    """sensor_msgs/NavSatFix; no fix where it has no position."""
     kind = int(message.position_covariance_type)
+    placed = bool(np.isfinite([message.latitude, message.longitude]).all())
+    if not placed and int(message.status.status) >= 0:
+        lose(message, "a status of a fix without a position")
+    errors = covariance(message.position_covariance, 3) if kind else None
     return NavSatFix(
         stamp=stamp,
         frame=message.header.frame_id,
-        status=_FIX.get(int(message.status.status), "no_fix"),
+        status=_FIX.get(int(message.status.status), "no_fix") if placed else "no_fix",
         latitude=float(message.latitude),
         longitude=float(message.longitude),
         altitude=float(message.altitude),
-        covariance_type=COVARIANCE_TYPES[kind] if 0 <= kind < len(COVARIANCE_TYPES) else "unknown",
-        covariance=np.asarray(message.position_covariance, np.float64).reshape(3, 3) if kind else None,
+        covariance_type=COVARIANCE_TYPES[kind] if errors is not None and kind < len(COVARIANCE_TYPES) else "unknown",
+        covariance=errors,
     )
 
 
 def joint_state(message: Any, stamp: int) -> JointState:
-    """sensor_msgs/JointState."""
+    """sensor_msgs/JointState. Joints without names are numbered; values of another number than the joints are not
+    known."""
+    values = {name: optional(getattr(message, name), "<f8") for name in ("position", "velocity", "effort")}
+    names = tuple(message.name)
+    if not names:
+        names = tuple(map(str, range(max((len(v) for v in values.values() if v is not None), default=0))))
+    for name, found in values.items():
+        if found is not None and len(found) != len(names):
+            lose(message, f"{name}, of {len(found)} joints where {len(names)} are named")
+            values[name] = None
     return JointState(
         stamp=stamp,
-        names=tuple(message.name),
-        positions=optional(message.position, "<f8"),
-        velocities=optional(message.velocity, "<f8"),
-        efforts=optional(message.effort, "<f8"),
+        names=names,
+        positions=values["position"],
+        velocities=values["velocity"],
+        efforts=values["effort"],
     )
 
 
@@ -142,12 +163,44 @@ def log(message: Any, stamp: int) -> Alarm:
     )
 
 
-def number(message: Any, stamp: int) -> Number:
-    """std_msgs numbers, sensor_msgs/Temperature, FluidPressure, Illuminance, RelativeHumidity and Range."""
-    value = first(message, "data", "temperature", "fluid_pressure", "illuminance", "relative_humidity", "range")
-    units = {"temperature": "°C", "fluid_pressure": "Pa", "illuminance": "lx", "range": "m"}
-    unit = next((unit for name, unit in units.items() if hasattr(message, name)), "")
-    return Number(stamp=stamp, value=float(value), unit=unit)
+def number(message: Any, stamp: int, unit: str = "") -> Number:
+    """std_msgs numbers."""
+    value = float(message.data)
+    if isinstance(message.data, int) and int(value) != message.data:
+        lose(message, "digits beyond 53 bits")
+    return Number(stamp=stamp, value=value, unit=unit)
+
+
+UNITS = {"temperature": "°C", "fluid_pressure": "Pa", "illuminance": "lx", "relative_humidity": ""}
+"""By the field that holds the value."""
+
+
+def measurement(message: Any, stamp: int) -> Measurement:
+    """sensor_msgs/Temperature, FluidPressure, Illuminance and RelativeHumidity."""
+    name = next(name for name in UNITS if hasattr(message, name))
+    variance = float(message.variance)
+    return Measurement(
+        stamp=stamp,
+        frame=message.header.frame_id,
+        value=float(getattr(message, name)),
+        unit=UNITS[name],
+        variance=variance or None,
+    )
+
+
+def range_reading(message: Any, stamp: int) -> RangeReading:
+    """sensor_msgs/Range, with the variance that it has since Jazzy."""
+    variance = float(getattr(message, "variance", 0.0))
+    return RangeReading(
+        stamp=stamp,
+        frame=message.header.frame_id,
+        range=float(message.range),
+        range_min=float(message.min_range),
+        range_max=float(message.max_range),
+        field_of_view=float(message.field_of_view),
+        radiation="infrared" if int(message.radiation_type) == 1 else "ultrasound",
+        variance=variance or None,
+    )
 
 
 def text(message: Any, stamp: int) -> Text:

@@ -41,6 +41,12 @@ def covariance(values: Any, size: int) -> F64 | None:
     return data.reshape(size, size) if data.any() else None
 
 
+def known(values: Any) -> F64 | None:
+    """The numbers; None where all are zero, which in ROS says that they are not known, or one is NaN or infinite."""
+    data = np.asarray(values, np.float64)
+    return data if data.any() and np.isfinite(data).all() else None
+
+
 def optional(values: Any, dtype: str) -> npt.NDArray[Any] | None:
     """An array; None for one without elements."""
     data = np.asarray(values, dtype)

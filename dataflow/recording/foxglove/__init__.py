@@ -24,6 +24,7 @@ from dataflow.messages import (
     CompressedImage,
     DepthImage,
     Image,
+    Image16,
     LaserScan,
     Message,
     NavSatFix,
@@ -43,6 +44,7 @@ FOXGLOVE_SCHEMAS: dict[type[Message], FoxgloveSchema] = {
     schema.message: schema
     for schema in (
         FoxgloveSchema(Image, RawImage, images.encode_image, images.decode_image),
+        FoxgloveSchema(Image16, RawImage, images.encode_image16, images.decode_image16),
         FoxgloveSchema(DepthImage, RawImage, images.encode_depth, images.decode_depth),
         FoxgloveSchema(CompressedImage, CompressedImageProto, images.encode_compressed, images.decode_compressed),
         FoxgloveSchema(
@@ -52,7 +54,7 @@ FOXGLOVE_SCHEMAS: dict[type[Message], FoxgloveSchema] = {
             images.decode_camera,
             ("width", "height", "distortion_model", "distortion", "R", "P"),
         ),
-        FoxgloveSchema(PointCloud, PointCloudProto, clouds.encode_cloud, clouds.decode_cloud),
+        FoxgloveSchema(PointCloud, PointCloudProto, clouds.encode_cloud, clouds.decode_cloud, clouds.CLOUD_EXTRAS),
         FoxgloveSchema(Pose, PoseInFrame, poses.encode_pose, poses.decode_pose, ("child_frame", "covariance")),
         FoxgloveSchema(
             Odometry, PoseInFrame, poses.encode_odometry, poses.decode_pose, ("child_frame", *poses.ODOMETRY_EXTRAS)

@@ -11,7 +11,7 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudPro
 
 from dataflow.messages import PointCloud
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.foxglove.values import Fields, Parts, frozen, pose_of, timestamp_of, with_field
+from dataflow.recording.foxglove.values import Fields, Parts, frozen, placed_by, pose_of, timestamp_of, with_field
 
 NUMERIC = PackedElementField
 _NUMERIC_DTYPES: dict[int, np.dtype[Any]] = {
@@ -36,6 +36,7 @@ _CLOUD_COLUMNS: tuple[tuple[str, tuple[str, ...], str, int], ...] = (
 )
 """Field of `PointCloud`, its packed columns in the order written, their dtype."""
 OPAQUE = 255
+CLOUD_EXTRAS = ("precise", "columns")
 
 
 def encode_cloud(message: PointCloud) -> tuple[Parts, tuple[str, ...]]:
@@ -61,12 +62,13 @@ def encode_cloud(message: PointCloud) -> tuple[Parts, tuple[str, ...]]:
             proto.fields.add(name="alpha", offset=offset, type=NUMERIC.UINT8)
             offset += 1
     proto.point_stride = offset
+    lacks = tuple(name for name in CLOUD_EXTRAS if getattr(message, name) is not None)
     if names == ["points"]:
-        return with_field(proto, "data", message.points), ()
+        return with_field(proto, "data", message.points), lacks
     packed = np.empty(len(message.points), np.dtype({"names": names, "formats": formats}))
     for name in names:
         packed[name] = OPAQUE if name == "alpha" else getattr(message, name)
-    return with_field(proto, "data", packed.view(np.uint8)), ()
+    return with_field(proto, "data", packed.view(np.uint8)), lacks
 
 
 def decode_cloud(proto: PointCloudProto) -> Fields:
@@ -82,6 +84,21 @@ def decode_cloud(proto: PointCloudProto) -> Fields:
             found[field] = _columns(proto.data, count, stride, present, dtype)
     if "points" not in found:
         raise RecordingError(f"PointCloud needs the fields x, y and z, got {', '.join(offsets) or 'none'}")
+    wide = [offsets[axis] for axis in "xyz"]
+    if any(kind == NUMERIC.FLOAT64 for _, kind in wide):
+        exact = _columns(proto.data, count, stride, wide, "<f8")
+        if not np.array_equal(exact, found["points"], equal_nan=True):
+            found["precise"] = exact
+    place = placed_by(proto.pose)
+    if place is not None:
+        for field, shift, dtype in (
+            ("points", place[:3, 3], "<f4"),
+            ("precise", place[:3, 3], "<f8"),
+            ("normals", np.zeros(3), "<f4"),
+        ):
+            if field in found:
+                moved = found[field].astype(np.float64) @ place[:3, :3].T + shift
+                found[field] = frozen(moved, dtype, moved.shape)
     return found
 
 

@@ -10,15 +10,17 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage as CompressedImageProto
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from dataflow.messages import CameraInfo, CompressedImage, DepthImage, Image
+from dataflow.messages import CameraInfo, CompressedImage, DepthImage, Image, Image16
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foxglove.values import Fields, Parts, frozen, matrix, timestamp_of, with_field
-from dataflow.recording.pixels import as_depth, as_millimetres
+from dataflow.recording.pixels import as_depth, as_image, as_image16, as_millimetres, stored_rows
 
 UINT32_MAX = 2**32 - 1
 
 
-def _raw_image(message: Image | DepthImage, encoding: str, data: npt.NDArray[Any]) -> tuple[Parts, tuple[str, ...]]:
+def _raw_image(
+    message: Image | Image16 | DepthImage, encoding: str, data: npt.NDArray[Any]
+) -> tuple[Parts, tuple[str, ...]]:
     height, width = data.shape[:2]
     proto = RawImage(
         timestamp=timestamp_of(message.stamp),
@@ -33,6 +35,19 @@ def _raw_image(message: Image | DepthImage, encoding: str, data: npt.NDArray[Any
 
 def encode_image(message: Image) -> tuple[Parts, tuple[str, ...]]:
     return _raw_image(message, "rgb8" if message.data.ndim == 3 else "mono8", message.data)
+
+
+def encode_image16(message: Image16) -> tuple[Parts, tuple[str, ...]]:
+    return _raw_image(message, "rgb16" if message.data.ndim == 3 else "mono16", message.data)
+
+
+def decode_image16(proto: RawImage) -> Fields:
+    channels = {"mono16": 1, "rgb16": 3, "bgr16": 3}.get(proto.encoding)
+    if channels is None:
+        raise RecordingError(f"RawImage encoding {proto.encoding!r} is no Image16; those known are rgb16 and mono16")
+    data = as_image16(proto.encoding, rows_of(proto, "<u2", channels))
+    data.flags.writeable = False
+    return {"frame": proto.frame_id, "data": data}
 
 
 def encode_depth(message: DepthImage) -> tuple[Parts, tuple[str, ...]]:
@@ -61,9 +76,12 @@ def rows_of(proto: RawImage, dtype: str, channels: int) -> npt.NDArray[Any]:
 
 def decode_image(proto: RawImage) -> Fields:
     channels = {"rgb8": 3, "mono8": 1, "8UC1": 1}.get(proto.encoding)
-    if channels is None:
-        raise RecordingError(f"RawImage encoding {proto.encoding!r} is no Image; those known are rgb8 and mono8")
-    return {"frame": proto.frame_id, "data": rows_of(proto, "u1", channels)}
+    if channels is not None:
+        return {"frame": proto.frame_id, "data": rows_of(proto, "u1", channels)}
+    flat = np.frombuffer(proto.data, np.uint8)
+    pixels = as_image(proto.encoding, stored_rows(proto.encoding, proto.width, proto.height, proto.step, flat))
+    pixels.flags.writeable = False
+    return {"frame": proto.frame_id, "data": pixels}
 
 
 def decode_depth(proto: RawImage) -> Fields:
@@ -83,7 +101,8 @@ def encode_compressed(message: CompressedImage) -> tuple[Parts, tuple[str, ...]]
 
 def decode_compressed(proto: CompressedImageProto) -> Fields:
     data = np.frombuffer(proto.data, np.uint8)
-    return {"frame": proto.frame_id, "format": proto.format, "data": data}
+    named = proto.format.lower().removeprefix("image/")
+    return {"frame": proto.frame_id, "format": "jpeg" if named == "jpg" else named, "data": data}
 
 
 def encode_camera(message: CameraInfo) -> tuple[Parts, tuple[str, ...]]:

@@ -16,6 +16,7 @@ from dataflow.recording.foxglove.values import (
     bits_survive,
     frozen,
     matrix,
+    placed_by,
     pose_of,
     timestamp_of,
     with_field,
@@ -56,10 +57,19 @@ def encode_scan(message: LaserScan) -> tuple[Parts, tuple[str, ...]]:
 
 
 def decode_scan(proto: LaserScanProto) -> Fields:
+    turn = 0.0
+    place = placed_by(proto.pose)
+    if place is not None:
+        turn = float(np.arctan2(place[1, 0], place[0, 0]))
+        if place[:3, 3].any() or abs(place[2, 2] - 1) > 1e-9:
+            raise RecordingError(
+                f"its pose in {proto.frame_id!r} is more than a turn about z, and a LaserScan has no place for it: "
+                "give the scanner a frame, and say by a transform where it is"
+            )
     return {
         "frame": proto.frame_id,
-        "angle_min": proto.start_angle,
-        "angle_max": proto.end_angle,
+        "angle_min": proto.start_angle + turn,
+        "angle_max": proto.end_angle + turn,
         "range_min": 0.0,
         "range_max": float("inf"),
         "ranges": frozen(np.fromiter(proto.ranges, "<f8", len(proto.ranges)), "<f4", (-1,)),

@@ -12,6 +12,7 @@ from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion as QuaternionPro
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from dataflow.messages.geometry import transform_matrix
 from dataflow.recording.errors import RecordingError
 
 Parts = list[bytes | memoryview]
@@ -71,6 +72,21 @@ def pose_of(position: Sequence[float], orientation: Sequence[float]) -> PoseProt
     x, y, z = position
     qx, qy, qz, qw = orientation
     return PoseProto(position=Vector3(x=x, y=y, z=z), orientation=QuaternionProto(x=qx, y=qy, z=qz, w=qw))
+
+
+def placed_by(pose: PoseProto) -> npt.NDArray[np.float64] | None:
+    """The pose as a matrix (4, 4); None for the identity, and for a rotation that is not set (all zeros).
+
+    Raises `RecordingError` for one that is no pose.
+    """
+    position, orientation = position_of(pose.position), orientation_of(pose.orientation)
+    turned = any(orientation[:3])
+    if not (turned or any(position)):
+        return None
+    norm = float(np.linalg.norm(orientation))
+    if not np.isfinite([*position, norm]).all():
+        raise RecordingError(f"its pose is no pose: position {position}, orientation {orientation}")
+    return transform_matrix(position, np.array(orientation) / norm if turned else (0.0, 0.0, 0.0, 1.0))
 
 
 def position_of(proto: Any) -> list[float]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, RelativeDepth
+from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, Image16, RelativeDepth
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 
@@ -51,6 +51,14 @@ def image(canvas: Canvas, message: Image) -> None:
     )
     quality = canvas.scene.options.jpeg_quality
     canvas.draw("", canvas.plane, picture if quality is None else picture.compress(jpeg_quality=quality))
+
+
+@visualizer(Image16, "image")
+def image16(canvas: Canvas, message: Image16) -> None:
+    """The image in 8 bits, its own first to last percent from dark to bright."""
+    low, high = np.percentile(message.data, (1, 99))
+    share = np.clip((message.data.astype(np.float32) - low) / max(float(high - low), 1.0), 0, 1)
+    image(canvas, Image(stamp=message.stamp, frame=message.frame, data=np.rint(share * 255).astype(np.uint8)))
 
 
 @visualizer(CompressedImage, "image")

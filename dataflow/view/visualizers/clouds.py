@@ -106,7 +106,7 @@ def finite_rows(*arrays: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
 
 
 def thin(canvas: Canvas, indices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Every n-th index, so that at most `max_points` remain; says so once."""
+    """Every n-th index, so that at most `max_points` remain; notes it once."""
     most = canvas.scene.options.max_points
     if len(indices) <= most:
         return indices

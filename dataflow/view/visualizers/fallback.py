@@ -1,4 +1,4 @@
-"""Message types that nobody wrote a visualiser for: numbers as curves, the rest as text."""
+"""Message types without a visualiser: numbers as curves, the rest as text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataflow.messages.base import ArrayField
 from dataflow.view.canvas import Canvas, visualizer
 
 MAX_CURVES = 16
-"""Elements of an array up to which each has a curve of its own."""
+"""Elements of an array up to which each has a curve."""
 
 
 @visualizer(Message, "plot", "log")

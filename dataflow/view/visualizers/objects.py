@@ -244,7 +244,7 @@ def _id(ids: Sequence[int] | npt.NDArray[np.int64] | None, index: int) -> int | 
 
 
 def _label(name: str, identity: int | None, score: float | None) -> str:
-    """Such as "chair #3 0.87"; a score of 1 (truth, or what does not score) says nothing and is left out."""
+    """Such as "chair #3 0.87"; a score of 1 (truth, or an unscored box) is left out."""
     words = [name] + ([f"#{identity}"] if identity is not None else [])
     if score is not None and np.isfinite(score) and score != 1:
         words.append(f"{score:.2f}")

@@ -1,4 +1,4 @@
-"""Scene graphs: objects as labelled boxes, people as capsules, intentions as arrows; a tree and a list in words."""
+"""Scene graphs: objects as labelled boxes, agents as capsules, intentions as arrows; a tree and a list in words."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ import rerun as rr
 from dataflow.messages import Activity, SceneGraph
 from dataflow.messages.geometry import quaternion_to_matrix
 from dataflow.messages.scene_summary import (
-    AGENTS,
-    PEOPLE,
-    PLACES,
     Row,
     SceneSummary,
     Told,
@@ -44,20 +41,19 @@ _THIN = 0.05  # metres: least radius of a capsule
 @visualizer(SceneGraph, "graph", "space", "text")
 def scene_graph(canvas: Canvas, message: SceneGraph) -> None:
     """Objects in space, a tree and a list of those relations that are worth telling."""
-    told = summarize(message)
     activities = canvas.scene.remembered.get((_operator(canvas.stream), "activities"))
+    told = summarize(message, activities)
     tree(canvas, message, told, activities)
     _words(canvas, message, told, activities)
     shown = finite_rows(message.positions, message.sizes)
-    classes = class_names(message)
-    _places(canvas, message, [i for i in shown if classes[i] in PLACES])
-    solid = [i for i in shown if classes[i] not in PLACES | PEOPLE and message.sizes[i].any()]
-    acting = [r for r in (*told.intentions, *told.telling) if classes[r.subject] in AGENTS]
+    _places(canvas, message, [i for i in shown if i in told.places and message.sizes[i].any()])
+    solid = [i for i in shown if i not in told.places | told.agents and message.sizes[i].any()]
+    acting = [r for r in (*told.intentions, *told.telling) if r.subject in told.agents]
     named = {r.object for r in acting} | {r.subject for r in acting}
-    carried = {i for i, r in told.carriers.items() if classes[r.object] not in PLACES}
+    carried = {i for i, r in told.carriers.items() if r.object not in told.places}
     _boxes(canvas, "space/things", message, [i for i in solid if i not in carried or i in named], True)
     _boxes(canvas, "space/parts", message, [i for i in solid if i in carried and i not in named], False)
-    _people(canvas, message, [i for i in shown if classes[i] in PEOPLE], activities)
+    _agents(canvas, message, [i for i in shown if i in told.agents], activities)
     drawable = set(shown.tolist())
     _lines(canvas, message, told, drawable)
     _intentions(canvas, message, [r for r in told.intentions if {r.subject, r.object} <= drawable])
@@ -141,10 +137,10 @@ def _boxes(canvas: Canvas, path: str, message: SceneGraph, nodes: Sequence[int],
     )
 
 
-def _people(canvas: Canvas, message: SceneGraph, people: Sequence[int], activities: Activity | None) -> None:
-    """Capsules as tall as the people, with what they do."""
+def _agents(canvas: Canvas, message: SceneGraph, agents: Sequence[int], activities: Activity | None) -> None:
+    """Capsules as tall as the agents, with what they do."""
     names, acts = message.names(), doing(activities)
-    chosen = np.asarray(people, np.int64)
+    chosen = np.asarray(agents, np.int64)
     sizes = np.maximum(message.sizes[chosen], 2 * _THIN)
     radii = np.minimum(sizes[:, :2].mean(axis=1), sizes[:, 2]) / 2
     bottoms = message.positions[chosen] - np.column_stack([np.zeros((len(chosen), 2)), sizes[:, 2] / 2 - radii])
@@ -153,13 +149,13 @@ def _people(canvas: Canvas, message: SceneGraph, people: Sequence[int], activiti
         act = acts.get(int(message.ids[i]))
         labels.append(names[i] if act is None else f"{names[i]}: {spaced(act[0])}")
     canvas.draw(
-        "space/people",
+        "space/agents",
         message.frame,
         rr.Capsules3D(
             lengths=sizes[:, 2] - 2 * radii,
             radii=radii,
             translations=bottoms,
-            colors=colors.PERSON,
+            colors=colors.AGENT,
             fill_mode=rr.components.FillMode.Solid,
             labels=labels,
             show_labels=True,
@@ -169,15 +165,12 @@ def _people(canvas: Canvas, message: SceneGraph, people: Sequence[int], activiti
 
 def _lines(canvas: Canvas, message: SceneGraph, told: SceneSummary, drawable: set[int]) -> None:
     """Thin lines from each thing to what carries it, thicker ones with words for what else is told."""
-    classes = class_names(message)
-    carried = [
-        r for r in told.carriers.values() if classes[r.object] not in PLACES and {r.subject, r.object} <= drawable
-    ]
+    carried = [r for r in told.carriers.values() if r.object not in told.places and {r.subject, r.object} <= drawable]
     ends = [message.positions[[r.subject, r.object]] for r in carried]
     if _moved(canvas, "carried", ends):
         lines = rr.LineStrips3D(ends, colors=_LINE, radii=rr.Radius.ui_points(0.7))
         canvas.draw("space/carried", message.frame, lines)
-    others = [r for r in told.telling if {r.subject, r.object} <= drawable and classes[r.subject] in AGENTS]
+    others = [r for r in told.telling if {r.subject, r.object} <= drawable and r.subject in told.agents]
     ends = [message.positions[[r.subject, r.object]] for r in others]
     words = [spaced(r.predicate) for r in others]
     if _moved(canvas, "relations", ends) | canvas.scene.changed(canvas.entity, "words of relations", words):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +9,6 @@ import rerun as rr
 
 from dataflow.messages import Activity, SceneGraph
 from dataflow.messages.scene_summary import (
-    AGENTS,
-    PEOPLE,
-    PLACES,
     SceneSummary,
     Told,
     class_names,
@@ -91,8 +87,8 @@ def _blocks(message: SceneGraph, told: SceneSummary) -> list[Block]:
     names, classes = message.names(), class_names(message)
     blocks = []
     for node in range(message.count):
-        children = [c for c in told.carried(node) if classes[c] not in AGENTS]
-        if classes[node] in AGENTS | PLACES or not children:
+        children = [c for c in told.carried(node) if c not in told.agents]
+        if node in told.agents | told.places or not children:
             continue
         key, kinds = _key(message, node), dict[str, list[int]]()
         for child in children:
@@ -144,14 +140,14 @@ def _agents(
     names, classes, acts = message.names(), class_names(message), doing(activities)
     nodes: list[Node] = []
     edges: list[tuple[str, str]] = []
-    agents = sorted((i for i in range(message.count) if classes[i] in AGENTS), key=lambda i: classes[i] not in PEOPLE)
+    agents = sorted(told.agents)
     row = 0.5
-    ways = {agent: _ways(agent, told, classes) for agent in agents}
+    ways = {agent: _ways(agent, told) for agent in agents}
     rows = max(_ROWS, sum(max(1, len(way)) for way in ways.values()))
     for agent in agents:
         key, act = _key(message, agent), acts.get(int(message.ids[agent]))
         label = names[agent] if act is None else f"{names[agent]}: {words_of(act[0])}"
-        color = colors.PERSON if classes[agent] in PEOPLE else colors.of_class(classes[agent])
+        color = colors.AGENT
         nodes.append(Node(key, label, color, 0.0, row / rows))
         for relation in ways[agent]:
             word = words_of(relation.predicate)
@@ -167,10 +163,10 @@ def _agents(
     return nodes, edges
 
 
-def _ways(agent: int, told: SceneSummary, classes: Sequence[str]) -> list[Told]:
+def _ways(agent: int, told: SceneSummary) -> list[Told]:
     """The relations of an agent that are shown."""
     carrier = told.carriers.get(agent)
-    related = [] if carrier is None or classes[carrier.object] in PLACES else [carrier]
+    related = [] if carrier is None or carrier.object in told.places else [carrier]
     return [*related, *(r for r in (*told.telling, *told.intentions) if r.subject == agent)][:_WAYS]
 
 

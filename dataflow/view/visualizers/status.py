@@ -60,7 +60,7 @@ def joint_state(canvas: Canvas, message: JointState) -> None:
 def diagnostics(canvas: Canvas, message: Diagnostics) -> None:
     """A lane from green to red for each status, a line of text when it changes by more than its numbers, and curves.
 
-    Latencies and rates among the numeric values have plots of their own.
+    Latencies and rates among the numeric values have separate plots.
     """
     for i, name in enumerate(message.names):
         level = Level(int(message.levels[i]))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.custom.dataset import LabelledImage
-from operators.training.augmentation import Pixels, Variation, fitted, recolored, varied, warp
+from operators.learning.augmentation import Pixels, Variation, fitted, recolored, varied, warp
 
 _LEAST_SHARE = 0.35
 """An object of which the view cuts away more becomes an ignored one."""

@@ -40,11 +40,15 @@ def read_coco(folder: Path) -> DetectionData:
         raise DataError(f"{folder} has only annotations for a test: {', '.join(f.name for f in files)}")
     names = _merged_names(contents)
     images: dict[str, list[LabelledImage]] = {"train": [], "val": []}
+    notes = []
     for file, content in contents.items():
         images[files[file]] += _images(folder, file, content, names)
+        if flat := [annotation.get("id") for annotation in content["annotations"] if _is_flat(annotation)]:
+            some = ", ".join(map(str, flat[:10]))
+            notes.append(f"{file.name}: {len(flat)} boxes without width or height left out (id {some})")
     if not images["train"]:
         images = {"train": images["val"], "val": []}
-    return DetectionData(names, tuple(images["train"]), tuple(images["val"]))
+    return DetectionData(names, tuple(images["train"]), tuple(images["val"]), tuple(notes))
 
 
 def _split(file: Path, folder: Path) -> str:
@@ -104,6 +108,8 @@ def _images(folder: Path, file: Path, content: Mapping[str, Any], names: Sequenc
         label = annotation.get("category_id")
         if not isinstance(label, int) or label not in number:
             raise DataError(f"{where}: category_id {label!r} is not among the categories {sorted(number)}")
+        if _is_flat(annotation):
+            continue
         ignored = bool(annotation.get("iscrowd") or annotation.get("ignore"))
         rows[key].append((_box(where, annotation.get("bbox"), sizes[key]), number[label], ignored))
     return [
@@ -134,6 +140,14 @@ def _box(where: str, box: Any, size: tuple[int, int]) -> list[float]:
     if min(x, y) < -_OUTSIDE or x + w > size[0] + _OUTSIDE or y + h > size[1] + _OUTSIDE:
         raise DataError(f"{where}: bbox {box!r} reaches over the image of {size[0]}x{size[1]} pixels; {right}")
     return [x / size[0], y / size[1], (x + w) / size[0], (y + h) / size[1]]
+
+
+def _is_flat(annotation: Mapping[str, Any]) -> bool:
+    """Tells whether a box has no width or no height, as two of COCO's own have: nothing can be learnt from it."""
+    box = annotation.get("bbox")
+    if not isinstance(box, list) or len(box) != 4 or not all(map(_is_number, box)):
+        return False
+    return bool(min(box[2:]) == 0)
 
 
 def _is_number(value: Any) -> bool:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+ORIGIN = "origin.txt"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 _VALIDATION_SHARE = 0.15
 
@@ -48,12 +49,14 @@ class LabelledImage:
 
 @dataclass(frozen=True, eq=False)
 class DetectionData:
-    """Class names, images to train on and images to score on; `notes` says what was assumed in reading them."""
+    """Class names, images to train on and images to score on; `notes` says what was assumed in reading them, `origin`
+    what made them (see `origin_of`)."""
 
     classes: tuple[str, ...]
     training: tuple[LabelledImage, ...]
     validation: tuple[LabelledImage, ...]
     notes: tuple[str, ...] = ()
+    origin: str = ""
 
     def only(self, names: Sequence[str]) -> DetectionData:
         """The data with these classes alone, numbered in this order; objects of other classes become background.
@@ -81,6 +84,12 @@ class DetectionData:
             training=tuple(map(chosen, self.training)),
             validation=tuple(map(chosen, self.validation)),
         )
+
+
+def origin_of(folder: Path) -> str:
+    """Returns what made the images of a data folder, as its file origin.txt says (`simulator`); '' without one."""
+    file = folder / ORIGIN
+    return read_utf8(file).strip() if file.is_file() else ""
 
 
 def split(data: DetectionData, seed: int) -> DetectionData:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from operators.detection.custom.decode import find_boxes
 from operators.detection.decode import Candidates
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.weights import NetworkFileError, open_network
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from operators.detection.custom.coco_folder import find_annotations, read_coco
-from operators.detection.custom.dataset import DataError, DetectionData, split
+from operators.detection.custom.dataset import DataError, DetectionData, origin_of, split
 from operators.detection.custom.yolo_folder import find_names, read_yolo
 
 
@@ -32,4 +33,5 @@ def read_detection_data(folder: Path, seed: int = 0) -> DetectionData:
         )
     if not any(len(image.boxes) for image in data.training):
         raise DataError(f"{folder}: none of the {len(data.training)} training images has a label")
+    data = replace(data, origin=origin_of(folder))
     return data if data.validation else split(data, seed)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from operators.training.backbone import Backbone, MobileNetV2, SeparableConv
+from operators.learning.backbone import Backbone, MobileNetV2, SeparableConv
 
 STRIDES = (8, 16, 32)
 FINE_STRIDES = (4, *STRIDES)

@@ -23,9 +23,9 @@ from operators.detection.custom.refiner import DEQUANTIZED, KIND, Look, inner_na
 from operators.detection.custom.refiner_network import RefinerNetwork
 from operators.detection.custom.surroundings import surroundings
 from operators.detection.nms import intersection_over_union
-from operators.training.augmentation import Variation, recolored
-from operators.training.files import TrainingFileError
-from operators.training.second import Columns, SecondTask, answered
+from operators.learning.augmentation import Variation, recolored
+from operators.learning.files import TrainingFileError
+from operators.learning.second_stage import Columns, SecondTask, answered
 from operators.weights import open_network
 
 SIDE = 48

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 
 F32 = NDArray[np.float32]
 GRID = 6

@@ -18,10 +18,11 @@ from operators.detection.custom.decode import find_boxes
 from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.custom.loss import Truth, detection_loss
 from operators.detection.custom.network import ANCHORS_PER_CELL, STRIDES, GridDetector
-from operators.training.augmentation import Variation, fitted, tensor_of, warp
-from operators.training.backbone import BACKBONES, Backbone, load_backbone
-from operators.training.export import export_network
-from operators.training.network_weights import begin_with, fitting_facts, sample_images
+from operators.learning.augmentation import Variation, fitted, tensor_of, warp
+from operators.learning.backbone import BACKBONES, Backbone, load_backbone
+from operators.learning.export import export_network
+from operators.learning.network_weights import begin_with, fitting_facts, sample_images
+from operators.weights.network_file import TRAINED_ON
 
 KIND = "detector"
 STEP = 16
@@ -147,6 +148,7 @@ class DetectorTask:
             "strides": list(self.strides),
             "anchors": np.round(self.anchors.astype(float), 4).tolist(),
             "training_images": self.samples,
+            **({TRAINED_ON: self.data.origin} if self.data.origin else {}),
             **facts,
         }
         export_network(network, self.size, [f"stride{s}" for s in self.strides], described, file)

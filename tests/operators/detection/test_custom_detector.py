@@ -24,7 +24,7 @@ from operators.detection.custom.folder import read_detection_data
 from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
-from operators.training.augmentation import NONE, Variation, fitted, tensor_of, warp
+from operators.learning.augmentation import NONE, Variation, fitted, tensor_of, warp
 from operators.weights import NetworkFileError, open_network, open_second, shipped
 
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
@@ -243,7 +243,7 @@ def test_a_bad_yolo_row_is_named_with_file_and_line(tmp_path: Path, row: str, fa
     ("change", "fault"),
     [
         (lambda c: c["annotations"][1].update(bbox=[1, 2, 3]), r"annotations\[1\] \(id 1\): bbox is \[1, 2, 3\]"),
-        (lambda c: c["annotations"][1].update(bbox=[1, 2, 0, 3]), r"annotations\[1\] .*has no area"),
+        (lambda c: c["annotations"][1].update(bbox=[1, 2, -1, 3]), r"annotations\[1\] .*has no area"),
         (lambda c: c["annotations"][1].update(bbox=[150, 2, 50, 3]), r"reaches over the image of 160x128"),
         (lambda c: c["annotations"][1].update(image_id=1), r"image_id 1 is not among the images"),
         (lambda c: c["annotations"][1].update(category_id=9), r"category_id 9 is not among the categories \[3, 7\]"),
@@ -268,6 +268,19 @@ def test_a_bad_coco_entry_is_named(tmp_path: Path, change, fault: str) -> None: 
     file.write_text(json.dumps(content))
     with pytest.raises(DataError, match=fault):
         read_detection_data(tmp_path)
+
+
+def test_boxes_without_width_or_height_are_left_out_and_counted(tmp_path: Path) -> None:
+    file = write_coco(tmp_path, 3) / "annotations.json"
+    before = read_detection_data(tmp_path)
+    content = json.loads(file.read_text())
+    flat = content["annotations"][0] | {"id": 918, "bbox": [29.5, 88.0, 1.0, 0.0]}
+    file.write_text(json.dumps(content | {"annotations": [*content["annotations"], flat]}))
+
+    data = read_detection_data(tmp_path)
+
+    assert [len(image.boxes) for image in data.training] == [len(image.boxes) for image in before.training]
+    assert data.notes[0] == "annotations.json: 1 boxes without width or height left out (id 918)"
 
 
 @pytest.mark.parametrize(
@@ -547,7 +560,7 @@ def test_boxes_follow_the_pixels_through_every_variation(tmp_path: Path, seed: i
 
 
 def test_without_variation_training_sees_what_the_operator_sees(tmp_path: Path) -> None:
-    from operators.detection.fit import Fit
+    from operators.image.letterbox import Fit
 
     for size, target in (((640, 480), (320, 240)), ((200, 120), (160, 128)), ((100, 160), (160, 128))):
         pixels = cv2.resize(np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8), size)
@@ -614,7 +627,7 @@ def test_an_ignored_object_is_neither_missed_nor_wrong_to_find() -> None:
 
 
 def exported(tmp_path: Path, classes: int = 3, more: dict[str, object] | None = None) -> tuple[Path, GridDetector]:
-    from operators.training.export import export_network
+    from operators.learning.export import export_network
 
     torch.manual_seed(0)
     network = GridDetector(classes, width=0.25, channels=32).eval()

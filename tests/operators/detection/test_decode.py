@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from operators.detection.decode import (
+    decode_end2end,
     decode_fastestdet,
     decode_ssd,
     decode_torchvision,
@@ -47,6 +48,29 @@ def test_yolov5_and_yolov8_agree_on_the_same_boxes() -> None:
 def test_yolov5_multiplies_by_objectness() -> None:
     found = decode_yolov5([np.array([[[5, 5, 2, 2, 0.5, 0.8]]], np.float32)], (64, 64), 0.1)
     np.testing.assert_allclose(found.scores, [0.4])
+
+
+def test_an_end_to_end_output_is_read_as_it_is() -> None:
+    rows = np.array([[[1, 2, 30, 40, 0.9, 16], [0, 0, 5, 5, 0.1, 3]]], np.float32)
+
+    found = decode_end2end([rows], (64, 64), 0.25)
+
+    assert found.boxes.tolist() == [[1, 2, 30, 40]]
+    assert (found.scores.tolist(), found.classes.tolist()) == ([np.float32(0.9)], [16])
+
+
+@pytest.mark.parametrize(
+    ("outputs", "reason"),
+    [
+        ([np.zeros((1, 300, 6), np.float32)], "decoder end2end"),
+        ([np.zeros((1, 116, 8400), np.float32), np.zeros((1, 32, 160, 160), np.float32)], "a segmentation model"),
+    ],
+)
+def test_outputs_of_other_exports_than_yolov8_decodes_are_refused_with_the_reason(
+    outputs: list[np.ndarray], reason: str
+) -> None:
+    with pytest.raises(ValueError, match=reason):
+        decode_yolov8(outputs, (640, 640), 0.25)
 
 
 @pytest.mark.parametrize("decode", [decode_fastestdet, decode_yolov5, decode_yolov8])

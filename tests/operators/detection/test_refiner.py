@@ -21,8 +21,8 @@ from operators.detection.custom.first_look import FirstLook, Looked
 from operators.detection.custom.refiner import Look, Refiner, look_again
 from operators.detection.custom.surroundings import GRID, surroundings
 from operators.detection.decode import Candidates
-from operators.detection.fit import Fit
 from operators.detection.nms import intersection_over_union
+from operators.image.letterbox import Fit
 from operators.weights import NetworkFileError, open_network
 
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
@@ -30,10 +30,11 @@ torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 from operators.detection.custom.dataset import DetectionData, LabelledImage, labelled  # noqa: E402
 from operators.detection.custom.network import STRIDES, GridDetector  # noqa: E402
 from operators.detection.custom.refiner_training import RefinerTask, astray, matched  # noqa: E402
-from operators.training.augmentation import Variation  # noqa: E402
-from operators.training.export import attach_second, export_network, without_second  # noqa: E402
-from operators.training.files import TrainingFileError, load_safely  # noqa: E402
-from operators.training.loop import Settings, train  # noqa: E402
+from operators.learning.augmentation import Variation  # noqa: E402
+from operators.learning.export import attach_second, export_network, without_second  # noqa: E402
+from operators.learning.files import TrainingFileError, load_safely  # noqa: E402
+from operators.learning.loop import Settings, train  # noqa: E402
+from operators.training.options import ImageTraining  # noqa: E402
 from operators.training.quantization import quantize_network  # noqa: E402
 from operators.training.refining import add_second  # noqa: E402
 
@@ -86,8 +87,8 @@ def refined(tmp_path_factory: pytest.TempPathFactory) -> Refined:
     """A detector's file, the same with a refiner that has learned crates and balls, and what it learned from."""
     folder = tmp_path_factory.mktemp("refined")
     data, plain, out = data_of(folder / "data", 48, 4), untrained(folder), folder / "refined.onnx"
-    task_settings = Settings(epochs=30, batch=8, learning_rate=4e-3, evaluate_every=30, threads=1)
-    add_second(RefinerTask(data, plain, variation=GENTLE), plain, out, task_settings, resume=False, quiet=True)
+    own = ImageTraining(epochs=30, batch=8, learning_rate=4e-3, evaluate_every=30, threads=1, json=True)
+    add_second(RefinerTask(data, plain, variation=GENTLE), plain, out, own)
     return plain, out, data
 
 

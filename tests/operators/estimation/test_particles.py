@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+from filterpy.monte_carlo import systematic_resample
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -32,6 +34,13 @@ def test_systematic_resampling_draws_every_particle_as_often_as_its_share_says(
     drawn = np.bincount(systematic(weights, count, offset), minlength=len(weights))
     assert drawn.sum() == count
     assert (np.abs(drawn - weights * count) < 1 + 1e-6).all()
+
+
+@given(WEIGHTS, st.floats(0, 0.999))
+def test_systematic_resampling_equals_filterpy(weights: np.ndarray, offset: float) -> None:
+    with patch("filterpy.monte_carlo.resampling.random", lambda: offset):
+        theirs = systematic_resample(weights)
+    np.testing.assert_array_equal(systematic(weights, len(weights), offset), theirs)
 
 
 @given(WEIGHTS)

@@ -219,3 +219,20 @@ def test_equal_paths_give_equal_figures_bit_for_bit() -> None:
     found = path.copy()
     found[:, :3, 3] += np.random.default_rng(0).normal(0, 0.05, (len(path), 3))
     assert score(found, path) == score(found, path) != score(path, path)
+
+
+@pytest.mark.parametrize(("apart", "named"), [(0, False), (5 * 10**17, True)])
+def test_a_truth_of_another_clock_is_named_with_both_spans(apart: int, named: bool) -> None:
+    metrics = TrajectoryMetrics()
+    metrics.setup()
+    place = {"frame": "world", "orientation": [0.0, 0.0, 0.0, 1.0]}
+    for k in range(20):
+        at = 10**18 + k * 10**8
+        pose = Pose(stamp=at, position=[k, k * k, 0.0], **place)
+        metrics.process(estimate=pose, ground_truth=(pose.replace(stamp=at + apart),))
+
+    metrics.finish()
+
+    told = str(metrics.summary().get("matching", ""))
+    assert ("only 0 of 20 poses" in told) == named
+    assert ("1500000000.000 to" in told) == named

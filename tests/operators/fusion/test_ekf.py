@@ -229,6 +229,15 @@ def test_what_is_ignored_is_counted_with_its_reason() -> None:
     assert "robot/fix" in status.names  # type: ignore[attr-defined]
 
 
+def test_odometry_begins_without_an_altitude_and_the_status_says_what_is_missing() -> None:
+    robot = Robot(10.0)
+    operator, played = fused({"robot/imu": robot.imu, "robot/fix": robot.fixes(altitude=False)}, **HEADING)
+
+    assert len(played["odometry"]) > 400
+    assert "height" in played["status"][-1].names  # type: ignore[attr-defined]
+    assert any("altitude" in name for name in operator.summary())
+
+
 def test_a_fix_without_altitude_counts_horizontally() -> None:
     robot = Robot()
     _, played = fused({"robot/imu": robot.imu, "robot/fix": robot.fixes(altitude=False)}, sure=2000.0, **HEADING)

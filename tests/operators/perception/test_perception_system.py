@@ -78,7 +78,7 @@ def test_the_results_are_those_of_the_graph_and_the_recording_verifies(room: Roo
 
     streams = dataflow.open(graph)
     ports = {
-        "detections": "names/renamed", "segmentation": "segmenter/segmentation", "tracks": "tracker/tracks",
+        "detections": "detector/detections", "segmentation": "segmenter/segmentation", "tracks": "tracker/tracks",
         "boxes": "lifter/boxes", "pose": "fusion/odometry", "objects": "objects/objects", "graph": "scene/graph",
         "activities": "scene/activities", "changes": "scene/changes",
     }  # fmt: skip

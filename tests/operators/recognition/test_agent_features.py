@@ -12,17 +12,18 @@ from operators.scene.bodies import Body
 
 
 def person(x: float) -> Body:
-    return Body(1, "person", np.array([x, 0.0, 0.85]), np.array([0.5, 0.4, 1.7]), 0.0, np.zeros(3), agent=True)
+    roles = frozenset(("agent", "person"))
+    return Body(1, "person", np.array([x, 0.0, 0.85]), np.array([0.5, 0.4, 1.7]), 0.0, np.zeros(3), roles)
 
 
-@pytest.mark.parametrize(("label", "speed"), [("robot", 0.0), ("robot", 0.9), ("person", 0.9)])
-def test_a_robot_that_is_new_is_as_fast_as_its_velocity_tells(label: str, speed: float) -> None:
+@pytest.mark.parametrize(("roles", "speed"), [({"agent"}, 0.0), ({"agent"}, 0.9), ({"agent", "person"}, 0.9)])
+def test_a_robot_that_is_new_is_as_fast_as_its_velocity_tells(roles: set[str], speed: float) -> None:
     window, around = AgentWindow(), Surroundings()
-    body = replace(person(2.0), label=label, velocity=np.array([0.0, speed, 0.3]))
+    body = replace(person(2.0), roles=frozenset(roles), velocity=np.array([0.0, speed, 0.3]))
     window.add(4.0, body)
     around.update(4.0, [body])
     values = window.vector(body, 0.0, around, None)
-    expected = speed if label == "robot" else 0.0
+    expected = 0.0 if "person" in roles else speed
     assert values[NAMES.index("speed, short")] == pytest.approx(expected)
     assert values[NAMES.index("speed, long")] == pytest.approx(expected)
     assert values[NAMES.index("rise, short")] == 0  # a middle that rises is a foot that comes out of hiding, too

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from made_scene import FOCAL, camera
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from operators.labels import LabelSpace, labels_file
 from operators.scene.box_images import image_boxes, images
 from operators.scene.box_overlap import shared_volume, upright_iou
 from operators.scene.cells import standing_box
-from operators.scene.class_sizes import CLASS_SIZES
 from operators.scene.cuboid import Box, ImageView, _surface, fit_cuboid
 
 K = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
 ALL = np.ones(4, np.bool_)
 BOOK: Box = (np.array([2.5, 0.1, 1.0]), np.array([0.16, 0.04, 0.23]), 0.1)
 SIDEWAYS = [0.0, 0.25, -0.3, 0.5, -0.5]
+SIMULATOR = LabelSpace.read(Path(labels_file("simulator")))
 
 
 def view_of(box: Box, y: float, noise: float = 0.0) -> ImageView:
@@ -43,7 +46,7 @@ def test_a_book_of_which_the_spine_is_seen_gets_its_depth_and_stays_apart_from_i
     for box in (BOOK, beside):
         points = spine(box)
         views = [view_of(box, y, noise) for y in SIDEWAYS]
-        found.append(fit_cuboid(standing_box(points), views, points, CLASS_SIZES["book"])[1])
+        found.append(fit_cuboid(standing_box(points), views, points, SIMULATOR.sizes("book"))[1])
         assert upright_iou(found[-1], box) > (0.7 if noise == 0 else 0.45)
     assert shared_volume(found[0], found[1]) < 0.35 * float(np.prod(BOOK[1]))
 
@@ -64,7 +67,7 @@ def test_edges_that_the_image_cuts_off_do_not_count() -> None:
         for v in whole
     ]
     points = spine(table)
-    first, second = (fit_cuboid(standing_box(points), v, points, CLASS_SIZES["table"])[1] for v in (whole, cut))
+    first, second = (fit_cuboid(standing_box(points), v, points, SIMULATOR.sizes("table"))[1] for v in (whole, cut))
     assert upright_iou(first, second) > 0.7
 
 
@@ -77,7 +80,7 @@ def test_leaves_inside_their_box_do_not_push_it_away_from_the_viewer() -> None:
     plant: Box = (np.array([2.5, 0.0, 0.9]), np.array([0.12, 0.12, 0.23]), 0.0)
     leaves = spine(plant) + np.array([0.03, 0.0, 0.0])
     center, _, _ = fit_cuboid(
-        standing_box(leaves), [view_of(plant, y) for y in SIDEWAYS], leaves, CLASS_SIZES["plant"], noise=0.0012
+        standing_box(leaves), [view_of(plant, y) for y in SIDEWAYS], leaves, SIMULATOR.sizes("plant"), noise=0.0012
     )[1]
     assert abs(center[0] - 2.5) < 0.02
 
@@ -87,7 +90,7 @@ def test_points_that_stray_by_the_noise_of_their_ranges_do_not_draw_a_box_toward
     points = np.concatenate([spine(far)] * 3)
     points[:, 0] += np.random.default_rng(7).normal(0, 0.0012 * 4.4**2, len(points))
     views = [view_of(far, y) for y in SIDEWAYS]
-    start, usual = standing_box(points), CLASS_SIZES["book"]
+    start, usual = standing_box(points), SIMULATOR.sizes("book")
     single, accumulated = (
         fit_cuboid(start, views, points, usual, noise=0.0012, raw=raw)[1][0] for raw in (True, False)
     )
@@ -102,7 +105,7 @@ def test_a_few_points_of_something_before_a_thing_do_not_draw_its_box_towards_th
     points = np.column_stack([4.5 + 0.035 * np.cos(around), 0.035 * np.sin(around), z])
     points[::15, 0] -= 0.15
     views = [view_of(bottle, y) for y in SIDEWAYS]
-    usual = CLASS_SIZES["bottle"]
+    usual = SIMULATOR.sizes("bottle")
     raw, all_but_outermost = (
         fit_cuboid(standing_box(points), views, points, usual, raw=raw)[1][0] for raw in (True, False)
     )
@@ -114,7 +117,7 @@ def test_a_fit_tells_which_view_is_of_another_thing() -> None:
     beside: Box = (BOOK[0] + [0, 0.06, 0], BOOK[1], BOOK[2])
     views = [view_of(beside if k == 2 else BOOK, y, 0.5) for k, y in enumerate(SIDEWAYS)]
     points = spine(BOOK)
-    strays = fit_cuboid(standing_box(points), views, points, CLASS_SIZES["book"])[2]
+    strays = fit_cuboid(standing_box(points), views, points, SIMULATOR.sizes("book"))[2]
     assert np.argmax(strays) == 2
     assert strays[2] > 2.5 > np.delete(strays, 2).max()
 
@@ -127,7 +130,7 @@ def test_a_shelf_lies_along_the_room_where_views_of_what_is_beside_it_would_turn
     views = [view_of(askew, y) for y in SIDEWAYS]
     points = spine(askew)
     settled = None if before is None else (before, askew)
-    start, usual = standing_box(points), CLASS_SIZES["shelf"]
+    start, usual = standing_box(points), SIMULATOR.sizes("shelf")
     free, along = (fit_cuboid(start, views, points, usual, settled, h)[1][2] for h in (None, 0.0))
     off = [abs(np.remainder(yaw + np.pi / 4, np.pi / 2) - np.pi / 4) for yaw in (free, along)]
     assert off[0] > 0.2

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from operators.labels import LabelSpace, labels_file
 from operators.scene.bodies import Body
 from operators.scene.goals import GoalInference
 from operators.scene.layered_graph import GraphSettings, LayeredGraph
 
 STEP = 250_000_000
+roles = LabelSpace.read(Path(labels_file("simulator"))).roles
 
 
 def thing(id: int, label: str, x: float, y: float, *, size: float = 0.1, z: float = 0.8, yaw: float = 0.0) -> Body:
-    return Body(id, label, np.array([x, y, z]), np.full(3, size), yaw, np.zeros(3))
+    return Body(id, label, np.array([x, y, z]), np.full(3, size), yaw, np.zeros(3), roles(label))
 
 
 def person(x: float, y: float) -> Body:
-    return Body(9, "person", np.array([x, y, 0.85]), np.array([0.6, 0.4, 1.7]), 0.0, np.zeros(3), agent=True)
+    return Body(9, "person", np.array([x, y, 0.85]), np.array([0.6, 0.4, 1.7]), 0.0, np.zeros(3), roles("person"))
 
 
-def after(
-    places: list[tuple[float, float]], goals: list[Body], supports: dict[int, Body] | None = None
-) -> dict[int, float]:
+def after(places: list[tuple[float, float]], goals: list[Body]) -> dict[int, float]:
     inference, found = inferring(), {-1: 1.0}
     for k, (x, y) in enumerate(places):
-        found = inference.update(0.25 * k, person(x, y), goals, supports or {})
+        found = inference.update(0.25 * k, person(x, y), goals)
     return found
 
 
@@ -43,22 +45,12 @@ def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
     assert found[1] > 0.8
 
 
-def test_of_two_mugs_equally_near_the_one_before_the_right_hand_is_the_goal() -> None:
-    table = thing(1, "table", 0.5, 0.0, yaw=np.pi)  # its heading is that of either side
-    mugs = [thing(2, "mug", 0.5, -0.19), thing(3, "mug", 0.5, 0.19)]  # right and left, looking along x
-    found = after([(min(-1 + 0.15 * k, 0.0), 0.0) for k in range(10)], mugs, {2: table, 3: table})
-    assert found[2] > 2 * found[3]
-
-
-def test_who_stands_before_a_seat_is_going_to_sit_on_it_though_a_table_is_as_near() -> None:
-    chair, table = thing(1, "chair", 0.44, 0.0, size=0.5, z=0.4), thing(2, "table", 0.0, -0.44, size=0.7, z=0.4)
-    found = after([(0.0, 1.0 - 0.15 * min(k, 6) - 0.1) for k in range(9)], [chair, table])
-    assert found[1] > 2 * found[2]
-
-
-def test_a_thing_of_which_no_support_is_known_is_in_reach_all_around() -> None:
-    found = after([(0.0, 0.0)], [thing(1, "mug", 0.38, 0.38), thing(2, "mug", 0.95, 0.0), thing(3, "mug", 0.1, 0.0)])
-    assert max(found, key=lambda i: found[i]) == 1
+@pytest.mark.parametrize("side", [1, -1], ids=["left", "right"])
+def test_a_path_to_a_thing_says_the_same_for_either_hand(side: int) -> None:
+    """Somebody walks straight past one mug to another, which lies on this side of a table or on that."""
+    mugs = [thing(2, "mug", 0.6, 0.3 * side), thing(3, "mug", 0.6, -0.3 * side)]
+    found = after([(0.08 * k, 0.03 * side * k) for k in range(9)], mugs)
+    assert max(found, key=lambda i: found[i]) == 2
 
 
 def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
@@ -66,7 +58,7 @@ def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
     left, right = thing(1, "door", -1, 0, size=1), thing(2, "door", 3, 0, size=1)
     inference, walk = inferring(), [0.2 * k for k in range(6)]
     for k, x in enumerate(walk):
-        late = inference.update(0.25 * k, person(x, 0.0), [right] if k < 5 else [left, right], {})
+        late = inference.update(0.25 * k, person(x, 0.0), [right] if k < 5 else [left, right])
     early = after([(x, 0.0) for x in walk], [left, right])
     assert late == early
     assert late[1] < 0.5 * late[2]
@@ -80,34 +72,20 @@ def test_the_jitter_of_a_box_that_stands_still_says_nothing_against_any_goal() -
     assert shaken[1] == pytest.approx(still[1], abs=0.02)
 
 
-def test_what_stands_on_the_floor_is_not_reached_for() -> None:
-    """Half a metre before a table and 0.19 m beside its middle is no place for the table, but one for a mug there."""
-    table = Body(1, "table", np.array([1.0, 0.0, 0.4]), np.array([0.6, 1.6, 0.8]), 0.0, np.zeros(3))
-    mug = thing(2, "mug", 0.8, -0.19, z=0.85)
-    chair = Body(3, "chair", np.array([0.3, -0.75, 0.4]), np.array([0.45, 0.45, 0.8]), 0.0, np.zeros(3))
+def test_a_person_in_a_graph_heads_for_what_it_walks_to() -> None:
+    table = Body(1, "table", np.array([1.0, 0.0, 0.4]), np.array([0.6, 1.6, 0.8]), 0.0, np.zeros(3), roles("table"))
+    door = thing(2, "door", -3.0, 0.0, size=1)
     graph = LayeredGraph(GraphSettings())
     for k in range(10):
-        now = graph.update(k * STEP, [table, mug, chair, person(min(-1 + 0.15 * k, 0.3), 0.0)], None)
+        now = graph.update(k * STEP, [table, door, person(min(-1 + 0.15 * k, 0.3), 0.0)], None)
     (act,) = now.acts
-    assert act.goal == 2
-    assert act.goals[2] > 2 * act.goals[1]
-    assert act.goals[2] > 2 * act.goals[3]
-
-
-def test_what_lies_on_the_floor_is_in_reach_all_around() -> None:
-    bottles = [thing(1, "bottle", 0.5, -0.19, z=0.05), thing(2, "bottle", 0.378, 0.378, z=0.05)]
-    graph = LayeredGraph(GraphSettings())
-    for k in range(4):
-        now = graph.update(k * STEP, [*bottles, person(0.0, 0.0)], None)
-    assert (1, "on", 0) in now.relations
-    (act,) = now.acts
-    assert act.goals[1] == pytest.approx(act.goals[2], rel=0.02)
+    assert act.goal == 1
 
 
 def test_a_restored_inference_goes_on_the_same() -> None:
     goals = [thing(1, "door", 4, 0, size=1), thing(2, "chair", 0, 4, size=0.5)]
     first, second = inferring(), inferring()
     for k in range(8):
-        first.update(0.25 * k, person(0.2 * k, 0.1 * k), goals, {})
+        first.update(0.25 * k, person(0.2 * k, 0.1 * k), goals)
     second.restore(first.snapshot())
-    assert first.update(2.0, person(1.7, 0.8), goals, {}) == second.update(2.0, person(1.7, 0.8), goals, {})
+    assert first.update(2.0, person(1.7, 0.8), goals) == second.update(2.0, person(1.7, 0.8), goals)

@@ -39,7 +39,7 @@ def shown() -> list[View]:
 
 def mapped(given: Sequence[View], **params: Any) -> Played:
     streams = {name: [view[k] for view in given] for k, name in enumerate(("boxes", "clusters", "cloud", "pose"))}
-    return play(SemanticMap(**{"movers": [], **params}), streams)
+    return play(SemanticMap(**{"labels": "simulator", **params}), streams)
 
 
 def last(played: Played) -> Boxes3D:
@@ -79,8 +79,9 @@ def test_equal_maps_are_equal_files_and_are_read_as_they_were_written(
 
 
 def test_what_moves_by_itself_is_not_taken_over(shown: list[View], saved: Path) -> None:
-    mover = last(mapped(shown)).labels()[0]
-    assert last(mapped(shown[:1], map_file=str(saved), movers=[mover])).count == 0
+    assert set(last(mapped(shown)).labels()) == {"box"}
+    boxes_move = Path(__file__).parent / "label_spaces" / "boxes_move.yaml"
+    assert last(mapped(shown[:1], map_file=str(saved), labels=str(boxes_move))).count == 0
 
 
 def test_classes_are_taken_over_by_name_also_where_more_were_learned_since(shown: list[View], saved: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from operators.labels import LabelSpace, labels_file
 from operators.scene.box_images import CORNERS
 from operators.scene.cells import Cells
-from operators.scene.class_sizes import CLASS_SIZES
 from operators.scene.cuboid import ImageView
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MapObject
@@ -15,7 +17,7 @@ from operators.scene.merging import are_one
 
 SIZE = np.array([0.16, 0.04, 0.23])
 NAMES = ("book", "mug")
-KINDS = Kinds((), {k: CLASS_SIZES[name] for k, name in enumerate(NAMES)})
+KINDS = Kinds.of(LabelSpace.read(Path(labels_file("simulator"))), NAMES)
 VIEW = ImageView(np.eye(3, 4), np.array([0.0, 0.0, 9.0, 9.0]), np.ones(4, np.bool_), np.zeros(3))
 
 

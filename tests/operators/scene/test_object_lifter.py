@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -150,7 +151,8 @@ def test_a_body_whose_box_is_too_small_is_as_high_as_its_mask() -> None:
         return boxes.sizes[:, 2].tolist()
 
     masked = {"segmentation": [segmentation]}
-    assert height(more=masked, bodies=["box"]) == pytest.approx([1.3], abs=0.1)
-    assert height(more=masked, bodies=["box"], min_body_score=0.3) == []
+    hands = str(Path(__file__).parent / "label_spaces" / "boxes_have_hands.yaml")
+    assert height(more=masked, labels=hands) == pytest.approx([1.3], abs=0.1)
+    assert height(more=masked, labels=hands, min_body_score=0.3) == []
     assert height(more=masked, min_score=0.2) < [1.15]
-    assert height(more={}, bodies=["box"]) == []  # so weak a box needs a mask that agrees
+    assert height(more={}, labels=hands) == []  # so weak a box needs a mask that agrees

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from operators.labels import SizePrior
 from operators.scene.cells import Cells
-from operators.scene.class_sizes import Usual
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings
@@ -69,21 +69,22 @@ def test_only_small_things_of_classes_that_move_or_are_taken_may_leave() -> None
     ball, crate = thing(2.0), thing(2.0, CRATE)
     assert KINDS.may_leave(ball)
     assert not KINDS.may_leave(crate)
-    assert Kinds([], {}, None, (), [CRATE]).may_leave(crate)
+    assert Kinds([], {}, (), [CRATE]).may_leave(crate)
     ball.size = np.full(3, 0.8)
     assert not KINDS.may_leave(ball)
 
 
-def test_an_object_is_too_large_for_its_class_four_spreads_beyond_every_usual_size() -> None:
-    usual = (Usual((0.1, 0.2, 0.3), (0.1, 0.2, 0.3)), Usual((0.3, 0.4, 0.1), (0.1, 0.1, 0.1)))
+def test_an_object_is_doubted_whose_size_is_four_spreads_above_every_usual_one() -> None:
+    usual = (SizePrior((0.1, 0.2, 0.3), (0.1, 0.2, 0.3)), SizePrior((0.3, 0.4, 0.1), (0.1, 0.1, 0.1)))
     kinds, crate, rng = Kinds([BALL], {CRATE: usual, BALL: usual}), thing(1.0, CRATE), np.random.default_rng(0)
-    told = []
+    fits = []
     for _ in range(300):
         crate.size = np.exp(rng.uniform(-3, 0.5, 3))
         logs = np.log([*np.sort(crate.size[:2]), crate.size[2]])
-        told.append(kinds.may_be_so_large(crate))
-        assert told[-1] == any((logs - np.log(u.size) <= 4 * np.array(u.spread)).all() for u in usual)
-    assert 0 < sum(told) < len(told)
+        fits.append(kinds.has_usual_size(crate))
+        assert fits[-1] == any((logs - np.log(u.size) <= 4 * np.array(u.spread)).all() for u in usual)
+        assert kinds.doubt(crate, 0.35) == (0.0 if fits[-1] else 0.5)
+    assert 0 < sum(fits) < len(fits)
     ball = thing(1.0, BALL)
     ball.size = np.full(3, 9.0)
-    assert kinds.may_be_so_large(ball)  # what moves is told by its motion
+    assert kinds.has_usual_size(ball)  # the motion of a mover says what it is

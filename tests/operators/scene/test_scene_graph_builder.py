@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from operators.scene import SceneGraphBuilder
 from operators.scene.bodies import Body, footprint_share, gap
 from operators.scene.relations import Hysteresis
 
+Builder = partial(SceneGraphBuilder, labels="simulator")
 STEP = 200_000_000  # ns
 Thing = tuple[int, str, Sequence[float], Sequence[float]]
 """Id, class, centre, full size."""
@@ -56,7 +58,10 @@ def robot(k: int, frame: str = "world") -> Pose:
 
 def built(rooms: Sequence[Sequence[Thing]], **params: Any) -> Played:
     nodes = [room(k, things) for k, things in enumerate(rooms)]
-    return play(SceneGraphBuilder(**params), {"nodes": nodes, "robot": [robot(k) for k in range(len(rooms))]})
+    return play(
+        Builder(**params),
+        {"nodes": nodes, "robot": [robot(k) for k in range(len(rooms))]},
+    )
 
 
 def relations(message: Any) -> Mapping[tuple[int, str, int], float]:
@@ -152,7 +157,7 @@ def test_left_and_front_are_those_of_the_view_of_the_moment() -> None:
     nodes = [room(k, [ahead, beside]) for k in range(4)]
     turns = quaternion_from_yaw(np.radians([0.0, 90.0, 45.3, 44.0]))
     poses = [robot(k).replace(orientation=turns[k]) for k in range(4)]
-    found = [relations(m) for m in play(SceneGraphBuilder(), {"nodes": nodes, "robot": poses})["graph"]]
+    found = [relations(m) for m in play(Builder(), {"nodes": nodes, "robot": poses})["graph"]]
     spatial = [{r for r in each if r[1] in ("left_of", "in_front_of")} for each in found]
     left, front = (2, "left_of", 1), (1, "in_front_of", 2)
     assert spatial == [{left}, {front}, {front}, {left}]
@@ -165,7 +170,7 @@ def test_of_two_things_on_the_bisector_that_holds_which_held_before() -> None:
     nodes = [room(k, [ahead, beside]) for k in range(6)]
     turns = quaternion_from_yaw(np.radians([30.0, 44.9, 45.1, 44.9, 45.1, 60.0]))
     poses = [robot(k).replace(orientation=turns[k]) for k in range(6)]
-    found = [relations(m) for m in play(SceneGraphBuilder(), {"nodes": nodes, "robot": poses})["graph"]]
+    found = [relations(m) for m in play(Builder(), {"nodes": nodes, "robot": poses})["graph"]]
     assert [(2, "left_of", 1) in each for each in found] == [True] * 5 + [False]
 
 
@@ -224,7 +229,7 @@ def recognised(stamp: int, name: str) -> Activity:
 def test_a_recognised_activity_counts_while_it_is_fresh(said: str) -> None:
     nodes = [room(k, [TABLE, person(0, 3)]) for k in range(8)]
     told = recognised(3 * STEP, said)
-    played = play(SceneGraphBuilder(), {"nodes": nodes, "recognized": [told]})
+    played = play(Builder(), {"nodes": nodes, "recognized": [told]})
     names = [m.class_names[m.class_ids[0]] for m in played["activities"] if isinstance(m, Activity)]
     assert names[2:4] == [said, said]
     assert names[-1] == "standing"
@@ -232,7 +237,7 @@ def test_a_recognised_activity_counts_while_it_is_fresh(said: str) -> None:
 
 @pytest.mark.parametrize(("ago", "name"), [(1.0, "unknown"), (2.0, "standing")])
 def test_of_who_is_out_of_sight_what_was_done_last_counts_where_nothing_is_recognised(ago: float, name: str) -> None:
-    operator = SceneGraphBuilder()
+    operator = Builder()
     operator.setup()
     for k in range(8):
         operator.process(room(k, [TABLE, person(0, 3)]))
@@ -245,34 +250,49 @@ def test_of_who_is_out_of_sight_what_was_done_last_counts_where_nothing_is_recog
 
 def test_nodes_without_a_place_are_counted_and_other_frames_refused() -> None:
     nowhere: Thing = (2, "mug", (np.nan, 0, 0), (0.1, 0.1, 0.1))
-    operator = SceneGraphBuilder()
+    operator = Builder()
     operator.setup()
     graph = operator.process(room(0, [TABLE, nowhere]))["graph"]
     assert 2 not in graph.ids.tolist()
     assert operator.summary()["unusable nodes"] == 1
     with pytest.raises(OperatorFailure, match="the robot is in 'odom', the map in 'world'"):
-        play(SceneGraphBuilder(), {"nodes": [room(0, [TABLE])], "robot": [robot(0, "odom")]})
+        play(Builder(), {"nodes": [room(0, [TABLE])], "robot": [robot(0, "odom")]})
     assert built([[]])["graph"][0].stamp == STEP
 
 
-def test_classes_in_parameters_that_no_network_tells_apart_are_counted_and_named(
+def test_classes_without_an_entry_in_the_label_space_are_related_and_named_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    operator = SceneGraphBuilder(goals=["tabel", "person"], agents=["person", "robot", "ball"])
+    operator = SceneGraphBuilder()
     operator.setup()
     for k in range(2):
-        operator.process(room(k, [TABLE, person(0, 3)]))
-    assert operator.summary()["unknown classes"] == 1
-    assert [record.getMessage() for record in caplog.records] == [
-        "goals: no class is called 'tabel'; did you mean 'table'?"
-    ]
+        graph = operator.process(room(k, [(1, "zorb", TABLE[2], TABLE[3]), MUG, (4, "dax", CHAIR[2], CHAIR[3])]))[
+            "graph"
+        ]
+    assert (2, "on", 1) in relations(graph)
+    assert operator.summary()["unknown classes"] == 2
+    (record,) = caplog.records
+    assert record.getMessage() == (
+        "the label space coco has no entry for 'zorb', 'dax': they have no roles and no usual size; "
+        "`labels` names another"
+    )
+
+
+def test_with_the_classes_of_coco_things_are_in_a_refrigerator_and_persons_sit_on_couches() -> None:
+    refrigerator: Thing = (1, "refrigerator", (0, 0, 0.9), (0.6, 0.6, 1.8))
+    bottle: Thing = (2, "bottle", (0, 0, 1.0), (0.08, 0.08, 0.3))
+    couch: Thing = (3, "couch", (3, 0.1, 0.4), (0.9, 1.8, 0.8))
+    found = relations(built([[refrigerator, bottle, couch, person(3, 0.6, 1.25)]] * 5, labels="coco")["graph"][-1])
+    assert (2, "in", 1) in found
+    assert (9, "sitting_on", 3) in found
+    assert (2, "under", 1) not in found
 
 
 def test_two_plays_are_equal_and_a_restored_graph_goes_on_the_same() -> None:
     rooms = [[TABLE, MUG, CHAIR, person(5 - 0.15 * k, -0.9)] for k in range(20)]
     whole = built(rooms)
     assert whole.digests() == built(rooms).digests()
-    first, second = SceneGraphBuilder(), SceneGraphBuilder()
+    first, second = Builder(), Builder()
     for operator in (first, second):
         operator.setup()
     for k in range(10):
@@ -304,7 +324,7 @@ def test_hysteresis_forgets_what_is_no_more() -> None:
 
 def test_orientation_turns_a_footprint() -> None:
     nodes = room(0, [TABLE]).replace(orientations=quaternion_from_yaw(np.array([np.pi / 2])))
-    graph = play(SceneGraphBuilder(), {"nodes": [nodes]})["graph"][0]
+    graph = play(Builder(), {"nodes": [nodes]})["graph"][0]
     assert isinstance(graph, SceneGraph)
     floor = graph.ids.tolist().index(0)
     np.testing.assert_allclose(graph.sizes[floor, :2], [0.8, 1.5], atol=1e-9)

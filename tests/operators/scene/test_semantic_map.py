@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,10 @@ from dataflow.firing.failure import OperatorFailure
 from dataflow.messages import Boxes3D, Clusters, PointCloud, Pose, SceneGraph
 from dataflow.messages.geometry import yaw_of
 from dataflow.testing import Played, play
+from operators.labels import SizePrior
 from operators.scene import ObjectLifter, SemanticMap
 from operators.scene.box_overlap import upright_iou
 from operators.scene.cells import Cells
-from operators.scene.class_sizes import Usual
 from operators.scene.map_object import completed
 
 SECOND = 1_000_000_000
@@ -24,7 +25,9 @@ CRATE: Solid = ((2.5, 0.5, 0.25), (0.5, 0.4, 0.5), 0.3, 0)
 OTHER: Solid = ((2.8, -0.8, 0.2), (0.4, 0.4, 0.4), 0.0, 0)
 AROUND = [((0.3 * np.sin(k), 0.9 * np.sin(0.7 * k), 1.0), 0.15 * np.sin(k)) for k in range(12)]
 
-BOOK = Usual((0.04, 0.17, 0.22), (0.3, 0.1, 0.1))
+BOOK = SizePrior((0.04, 0.17, 0.22), (0.3, 0.1, 0.1))
+
+MUGS_MOVE = str(Path(__file__).parent / "label_spaces" / "mugs_move.yaml")
 
 View = tuple[Boxes3D, Clusters, PointCloud, Pose]
 
@@ -46,7 +49,7 @@ def views(scenes: Sequence[Sequence[Solid]], **more: Any) -> list[View]:
 def mapped(given: Sequence[View], **params: Any) -> Played:
     names = ("boxes", "clusters", "cloud", "pose")
     streams = {name: [view[k] for view in given] for k, name in enumerate(names)}
-    return play(SemanticMap(movers=["mug"], **params), streams)
+    return play(SemanticMap(labels=MUGS_MOVE, **params), streams)
 
 
 def last(played: Played, index: int = -1) -> Boxes3D:
@@ -143,7 +146,7 @@ def test_two_plays_are_equal_and_a_restored_map_goes_on_the_same() -> None:
     given = views([[CRATE, OTHER]] * 8)
     whole = mapped(given)
     assert whole.digests() == mapped(given).digests()
-    first, second = SemanticMap(movers=["mug"]), SemanticMap(movers=["mug"])
+    first, second = SemanticMap(labels=MUGS_MOVE), SemanticMap(labels=MUGS_MOVE)
     for operator in (first, second):
         operator.setup()
     for view in given[:4]:

@@ -173,7 +173,7 @@ PARTS = [
 
 
 def test_the_map_has_surfaces_as_nodes_beside_its_objects() -> None:
-    known = SemanticMap()
+    known = SemanticMap(labels="simulator")
     known.setup()
     for k in range(2):
         nodes = step(known, (k + 1) * SECOND, surfaces((k + 1) * SECOND, PARTS))
@@ -188,7 +188,7 @@ def test_the_map_has_surfaces_as_nodes_beside_its_objects() -> None:
 
 
 def test_surfaces_of_another_time_are_not_used_and_of_another_frame_are_refused() -> None:
-    known = SemanticMap(surface_views=1)
+    known = SemanticMap(labels="simulator", surface_views=1)
     known.setup()
     assert step(known, 2 * SECOND, surfaces(SECOND, PARTS)).count == 0
     with pytest.raises(ValueError, match="the surfaces are in 'lidar', the cloud in 'camera'"):
@@ -196,7 +196,7 @@ def test_surfaces_of_another_time_are_not_used_and_of_another_frame_are_refused(
 
 
 def test_a_restored_map_goes_on_with_its_surfaces() -> None:
-    first, other = SemanticMap(), SemanticMap()
+    first, other = SemanticMap(labels="simulator"), SemanticMap(labels="simulator")
     for each in (first, other):
         each.setup()
     for k in range(3):

@@ -13,21 +13,22 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dataflow.messages import Image
-from operators.detection.fit import Fit
+from operators.image.letterbox import Fit
 from operators.segmentation import Segmenter
 from operators.segmentation.borders import BLOCK, Blocks, best_cells, found_blocks, look_again, worked
 from operators.weights import NetworkFileError, open_network
 
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
+from operators.learning.augmentation import Variation  # noqa: E402
+from operators.learning.export import attach_second, export_network, without_second  # noqa: E402
+from operators.learning.files import TrainingFileError  # noqa: E402
+from operators.learning.loop import Settings, train  # noqa: E402
 from operators.segmentation.border_training import BorderTask  # noqa: E402
 from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData  # noqa: E402
 from operators.segmentation.network import DeployedSegmenter, ScoringSegmenter, SegmentationNetwork  # noqa: E402
 from operators.segmentation.training import SegmenterTask  # noqa: E402
-from operators.training.augmentation import Variation  # noqa: E402
-from operators.training.export import attach_second, export_network, without_second  # noqa: E402
-from operators.training.files import TrainingFileError  # noqa: E402
-from operators.training.loop import Settings, train  # noqa: E402
+from operators.training.options import ImageTraining  # noqa: E402
 from operators.training.quantization import quantize_network  # noqa: E402
 from operators.training.refining import add_second  # noqa: E402
 
@@ -69,8 +70,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Segment
     data, plain, out = data_of(folder / "data", 16, 4), folder / "plain.onnx", folder / "finer.onnx"
     task = SegmenterTask(data, (96, 80), width=0.25, variation=GENTLE)  # 96x72 of it are the image
     train(task, Settings(epochs=12, batch=4, learning_rate=5e-3, threads=1, evaluate_every=12), plain)
-    own = Settings(epochs=16, batch=4, learning_rate=4e-3, threads=1, evaluate_every=16)
-    outcome = add_second(BorderTask(data, plain, variation=GENTLE), plain, out, own, resume=False, quiet=True)
+    own = ImageTraining(epochs=16, batch=4, learning_rate=4e-3, threads=1, evaluate_every=16, json=True)
+    outcome = add_second(BorderTask(data, plain, variation=GENTLE), plain, out, own)
     assert outcome.best["miou"] > outcome.best["miou_before"]
     return plain, out, data
 

@@ -13,19 +13,19 @@ from hypothesis import strategies as st
 from dataflow.messages import Image
 from operators.detection.custom.dataset import DataError
 from operators.inference import ModelError
+from operators.learning.augmentation import Variation
 from operators.segmentation import Segmenter
 from operators.segmentation.dataset import VOID, read_segmentation_data
 from operators.segmentation.score import class_iou, confusion, mean_iou
-from operators.training.augmentation import Variation
 from operators.weights import NetworkFileError
 
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
+from operators.learning.export import export_network  # noqa: E402
+from operators.learning.loop import Settings, train  # noqa: E402
 from operators.segmentation.assessment import assess  # noqa: E402
 from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork, enlarged  # noqa: E402
 from operators.segmentation.training import SegmenterTask, class_weights, dice_loss  # noqa: E402
-from operators.training.export import export_network  # noqa: E402
-from operators.training.loop import Settings, train  # noqa: E402
 
 
 def scene(seed: int) -> tuple[np.ndarray, np.ndarray]:

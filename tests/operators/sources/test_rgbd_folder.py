@@ -213,3 +213,19 @@ def test_the_real_frames_have_their_known_properties(data_dir: Path) -> None:
     info = source.static_outputs()["depth_info"]
     assert isinstance(info, CameraInfo)
     assert info.fx == 585
+
+
+def test_rows_of_nan_in_the_truth_are_moments_without_a_known_pose(tmp_path: Path) -> None:
+    file = write_tum(tmp_path) / "groundtruth.txt"
+    file.write_text("9.999 nan nan nan nan nan nan nan\n10.1 1 2 3 0 0 0 1\n")
+
+    _, frames = read(tmp_path)
+
+    assert ["ground_truth" in frame for frame in frames] == [False, True]
+
+
+def test_a_truth_of_another_clock_is_named_with_both_times(tmp_path: Path) -> None:
+    (write_tum(tmp_path) / "groundtruth.txt").write_text("1700000000.0 0 0 0 0 0 0 1\n")
+
+    with pytest.raises(SourceError, match=r"groundtruth\.txt: none of its 1 poses .* 1700000000\.000 to"):
+        read(tmp_path)

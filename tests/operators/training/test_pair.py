@@ -12,13 +12,13 @@ torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 from operators.detection import CustomDetector  # noqa: E402
 from operators.detection.custom.dataset import DataError  # noqa: E402
 from operators.detection.custom.folder import read_detection_data  # noqa: E402
+from operators.learning.augmentation import Variation  # noqa: E402
+from operators.learning.backbone import SmallResNet  # noqa: E402
+from operators.learning.loop import Settings, train  # noqa: E402
 from operators.segmentation import Segmenter  # noqa: E402
 from operators.segmentation.dataset import VOID, read_segmentation_data  # noqa: E402
 from operators.simulator.classes import CLASSES  # noqa: E402
 from operators.training import simulated_worlds  # noqa: E402
-from operators.training.augmentation import Variation  # noqa: E402
-from operators.training.backbone import SmallResNet  # noqa: E402
-from operators.training.loop import Settings, train  # noqa: E402
 from operators.training.pair import PairTask  # noqa: E402
 
 SIZE = (160, 128)

@@ -25,9 +25,10 @@ from operators.weights import NetworkFileError
 
 pytest.importorskip("torch", reason="training needs the extra [train]")
 
+from operators.learning.balance import class_weights
 from operators.recognition.posture_training import PostureTask, mirrored
-from operators.training.balance import class_weights
 from operators.training.commands import train
+from operators.weights import trained_in_simulation
 
 
 def made(seed: int) -> Episode:
@@ -76,6 +77,7 @@ def test_the_activity_network_is_trained_scored_and_written(folder: Path, tmp_pa
     told = json.loads(done.stdout)
     assert 0 <= told["scores"]["score"] <= 1
     assert len(told["history"]) == 2
+    assert trained_in_simulation(out)
     model = ActivityModel.open(out)
     features = np.zeros((3, COUNT), np.float32)
     probabilities, states = model.step(features, np.stack([model.fresh()] * 3))
@@ -177,6 +179,7 @@ def test_the_posture_network_is_trained_scored_and_written(tmp_path: Path) -> No
     done = CliRunner().invoke(train, [*words, "--json"])
     assert done.exit_code == 0, done.output
     assert 0 <= json.loads(done.stdout)["scores"]["score"] <= 1
+    assert trained_in_simulation(out)
     model = PostureModel.open(out)
     both = model.judge(shapes[:2].astype(np.float32) / 127)
     np.testing.assert_allclose(both.sum(axis=1), 1, rtol=1e-5)

@@ -15,9 +15,9 @@ pytest.importorskip("torch", reason="training needs the extra [train]")
 from dataflow.cli.main import app
 from dataflow.messages import Image
 from operators.detection.custom.folder import read_detection_data
+from operators.learning.loop import Settings, train
 from operators.segmentation import Segmenter
 from operators.segmentation.dataset import read_segmentation_data
-from operators.training.loop import Settings, train
 from operators.training.pair import PairTask
 from operators.training.quantization import quantize_network
 from operators.weights import NetworkFileError, open_network, read_facts

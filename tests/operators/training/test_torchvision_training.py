@@ -17,13 +17,13 @@ pytest.importorskip("torchvision", reason="needs the extra [torch]")
 from dataflow.messages import Image  # noqa: E402
 from operators.detection import TorchvisionDetector  # noqa: E402
 from operators.detection.custom.folder import read_detection_data  # noqa: E402
+from operators.learning.augmentation import NONE  # noqa: E402
+from operators.learning.files import TrainingFileError, load_safely  # noqa: E402
+from operators.learning.loop import Settings, Silent  # noqa: E402
+from operators.learning.loop import train as loop  # noqa: E402
 from operators.segmentation import TorchvisionSegmenter  # noqa: E402
 from operators.torch_models import family_of, new_model  # noqa: E402
-from operators.training.augmentation import NONE  # noqa: E402
 from operators.training.commands import train  # noqa: E402
-from operators.training.files import TrainingFileError, load_safely  # noqa: E402
-from operators.training.loop import Settings, Silent  # noqa: E402
-from operators.training.loop import train as loop  # noqa: E402
 from operators.training.torchvision_tasks import TorchvisionDetectorTask, weights_in  # noqa: E402
 
 DETECTOR, SEGMENTER = "ssdlite320_mobilenet_v3_large", "lraspp_mobilenet_v3_large"

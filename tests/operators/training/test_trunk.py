@@ -14,9 +14,9 @@ pytest.importorskip("torch", reason="training needs the extra [train]")
 
 from dataflow.cli.main import app
 from operators.detection.custom.folder import read_detection_data
+from operators.learning.files import TrainingFileError
+from operators.learning.loop import Settings, train
 from operators.segmentation.dataset import read_segmentation_data
-from operators.training.files import TrainingFileError
-from operators.training.loop import Settings, train
 from operators.training.pair import PairTask
 from operators.training.quantization import quantize_network
 from operators.training.trunk import share_trunk

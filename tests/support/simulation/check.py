@@ -21,6 +21,7 @@ from typing import Any
 from dataflow.graph import Graph
 from dataflow.graph.load import load_bundle
 from dataflow.recording import Recording, RecordingError
+from dataflow.recording.parts import Storage
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.plan import RunPlan
@@ -55,6 +56,8 @@ def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
     outcome = simulate(_plan(scenario, graph, path), scenario.machine, scenario.happenings, limit=scenario.limit)
     if outcome.failure is not None and not scenario.may_fail:
         raise Violation(f"the run failed: {outcome.failure}\n{outcome.failure.details}")
+    if scenario.only_paused:
+        _check_pauses(outcome)
     try:
         verdict = _verify(path, outcome, scenario)
         report = outcome.report
@@ -62,7 +65,7 @@ def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
             _verify_from_middle(path)
         drops = 0
         if report is not None:
-            drops = _check_losses(path, graph, report)
+            drops = _check_losses(path, graph, report, live=scenario.live)
             if not scenario.live:
                 _check_window(path, graph, scenario, report)
         replayed = replay and report is not None and verdict == "identical" and _may_replay(scenario, report)
@@ -80,11 +83,24 @@ def _plan(scenario: Scenario, graph: Graph, path: Path) -> RunPlan:
         placement=scenario.placement,
         record=path,
         live=scenario.live,
+        rate=scenario.rate,
+        storage=Storage(on_failure="end"),
         faults=iter(scenario.faults) if scenario.faults and scenario.live else None,
         window=(scenario.window, 1 << 20),
         start_timeout=TIMEOUT,
         stall_timeout=TIMEOUT,
     )
+
+
+def _check_pauses(outcome: Outcome) -> None:
+    """A pause of the supervisor, alone or with others, is no evidence against any process."""
+    blamed = [line for line in _notes(outcome) if "nobody waits for it" in line or "started again" in line]
+    if outcome.killed or blamed:
+        raise Violation(f"a pause killed or blamed {sorted(outcome.killed)}: {'; '.join(blamed)}")
+
+
+def _notes(outcome: Outcome) -> tuple[str, ...]:
+    return () if outcome.report is None else outcome.report.notes
 
 
 # Verification
@@ -185,7 +201,7 @@ Place = tuple[str, int, int]
 """Stream, incarnation and number of a message."""
 
 
-def _check_losses(path: Path, graph: Graph, report: RunReport) -> int:
+def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) -> int:
     """Every message that was made is taken by each trigger it reaches, or dropped or missed and counted."""
     counted = 0
     with Recording(path) as recording:
@@ -206,9 +222,14 @@ def _check_losses(path: Path, graph: Graph, report: RunReport) -> int:
             unlisted += sum(number for _, _, number in record.detail.get("unlisted_drops", ()))
         counted += drops.total() + unlisted
         missed = sum(n for _, why, n in report.drops.get(name, ()) if why in ("missed", "reset"))
+        last = max((record.stamp for record in log.of(name) if record.kind in ("fire", "tick")), default=None)
+        over = any(record.kind == "finish" for record in log.of(name))
         for input_name in triggers:
             for stream in node.inputs.get(input_name, ()):
-                lost = _made(graph, log, stream, report) - taken
+                made = _made(graph, log, stream, report)
+                if over and node.spec.inputs[input_name].kind == "batch":  # what comes after its end is for nothing
+                    made = {p: stamp for p, stamp in made.items() if not live and last is not None and stamp <= last}
+                lost = made.keys() - taken
                 if len(lost) > missed + unlisted:
                     raise Violation(
                         f"{name}.{input_name} lost {len(lost)} messages of {stream}, and {missed} are counted: "
@@ -217,17 +238,15 @@ def _check_losses(path: Path, graph: Graph, report: RunReport) -> int:
     return counted
 
 
-def _made(graph: Graph, log: FiringLog, stream: str, report: RunReport) -> set[Place]:
-    """The messages of a stream, by its maker's records; none of a static stream, or of a maker that was restarted."""
+def _made(graph: Graph, log: FiringLog, stream: str, report: RunReport) -> dict[Place, int]:
+    """The messages of a stream with their stamps, by its maker's records; none of a static stream, or of a maker that
+    was restarted."""
     made = graph.streams[stream]
     if made.static or report.restarts.get(made.node):
-        return set()
+        return {}
     port = list(graph.nodes[made.node].outputs.values()).index(stream)
-    return {
-        (stream, record.incarnation, record.outputs[port].seq)  # type: ignore[union-attr]
-        for record in log.of(made.node)
-        if port < len(record.outputs) and record.outputs[port] is not None and record.outputs[port].seq >= 0  # type: ignore[union-attr]
-    }
+    outputs = ((r.incarnation, r.outputs[port]) for r in log.of(made.node) if port < len(r.outputs))
+    return {(stream, life, m.seq): m.stamp for life, m in outputs if m is not None and m.seq >= 0}
 
 
 # Flow control
@@ -272,14 +291,17 @@ MOST_OF_A_STEP = 2
 
 
 def _may_replay(scenario: Scenario, report: RunReport) -> bool:
-    """Whether a replay is to give the same: not of a run that was stopped, nor of one whose clock went back.
+    """Whether a replay is to give the same: not of a run that was stopped, of one whose clock went back, nor of one of
+    which parameters were set.
 
     Nor is one run whose timer would make up for a long silence: it makes more ticks than a simulated run has time for.
     """
     silent = any(happening.fields.get("span", 0) > PATIENCE for happening in scenario.happenings)
     if scenario.graph == TICKING and silent:
         return False
-    return not report.interrupted and all(fault.kind != "jump" for fault in scenario.faults)
+    changed = any(happening.kind == "set" for happening in scenario.happenings)
+    went_back = any(fault.kind == "jump" for fault in scenario.faults) or any("PAIR" in p for p in scenario.parts)
+    return not (report.interrupted or changed or (scenario.live and went_back))
 
 
 def _check_replay(scenario: Scenario, path: Path, report: RunReport) -> None:

@@ -12,9 +12,10 @@ from dataflow.firing.admission import AdmissionQueue, Patience
 from dataflow.firing.live import LiveRunner
 from dataflow.firing.ports import OutputPorts
 from dataflow.firing.runner import OperatorRunner
+from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import ChannelClosed, QueuedChannel
 from dataflow.process.losses import LossTold
-from dataflow.sync import FOREVER
+from dataflow.sync import FOREVER, NEVER
 
 
 class Mutant:
@@ -174,6 +175,31 @@ class SilentDrop(Mutant):
         return {(AdmissionQueue, "_drop"): drop}
 
 
+class DeafToItself(Mutant):
+    """A live operator forgets what it gave to itself while it was asked."""
+
+    said = "an operator does not notice what it gives to itself"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        def decide(self: LiveRunner) -> bool:
+            fired = OperatorRunner.step(self)
+            self._told = fired and self.idle == NEVER
+            if fired:
+                self._wake_again()
+            return fired
+
+        return {(LiveRunner, "_decide"): decide}
+
+
+class SleeplessClock(Mutant):
+    """The clock of the supervisor goes on while it is stopped."""
+
+    said = "a pause counts against processes"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        return {(AwakeClock, "__call__"): lambda self: self._clock()}
+
+
 MUTANTS: Mapping[str, Mutant] = {
     "credit": CreditLost(),
     "acknowledgement": EarlyAcknowledgement(),
@@ -183,4 +209,6 @@ MUTANTS: Mapping[str, Mutant] = {
     "frozen": BlockingSupervisor(),
     "gap": SilentGap(),
     "drop": SilentDrop(),
+    "itself": DeafToItself(),
+    "pause": SleeplessClock(),
 }

@@ -156,8 +156,15 @@ class Smooth(Operator, every="25ms"):
     def restore(self, state: Any) -> None:
         self.state, self.calls = state["state"], state["calls"]
 
-    def finish(self) -> FeatureVector:
+    def finish(self) -> FeatureVector | None:
         return value(2 * START, self.state)
+
+
+class Mean(Smooth):
+    """As `Smooth`, without a last message, which lies far ahead: for graphs with other timers."""
+
+    def finish(self) -> None:
+        return None
 
 
 class Merge(Operator, merge=True):
@@ -206,3 +213,166 @@ class Sum(Operator):
 
     def summary(self) -> Mapping[str, Any]:
         return {"count": self.count, "total": self.total}
+
+
+class Pair(Counter):
+    """Gives on one port, then on the other."""
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        for step in super().stream():
+            k = int(number(step["fast"]))  # type: ignore[arg-type]
+            yield {"fast": step["fast"]} if k % 2 else {"slow": step["fast"]}
+
+
+class JumpingPair(Device):
+    """Gives on one port, then on the other; in its middle its clock jumps back, between the two."""
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        for step in super().stream():
+            message = step["fast"]
+            k = int(number(message))  # type: ignore[arg-type]
+            message = message if k < self.count // 2 else message.replace(stamp=message.stamp - 300_000_000)
+            yield {"fast": message} if k % 2 else {"slow": message}
+
+
+class Loop(Operator):
+    """Samples what it gave last, and what another stream gave last."""
+
+    x: In[FeatureVector]
+    last: Sampled[FeatureVector] = Sampled(before=True, required=False)
+    beside: Sampled[FeatureVector] = Sampled(required=False)
+    y: Out[FeatureVector]
+    work: float = Param(0.0, ge=0, doc="longest time that a call takes, s")
+
+    def process(self, x: FeatureVector, last: FeatureVector | None, beside: FeatureVector | None) -> FeatureVector:
+        labour(x.stamp, self.work)
+        known = [0.0 if message is None else number(message) for message in (last, beside)]
+        return value(x.stamp, (number(x) + 0.5 * known[0] + known[1]) % 1000)
+
+
+class LoopedBatch(Operator):
+    """Samples what it gave last, and takes all that another stream gave since; it gives nothing for some."""
+
+    x: In[FeatureVector]
+    last: Sampled[FeatureVector] = Sampled(before=True, required=False)
+    rest: Batch[FeatureVector]
+    y: Out[FeatureVector]
+    work: float = Param(0.0, ge=0, doc="longest time that a call takes, s")
+
+    def process(
+        self, x: FeatureVector, last: FeatureVector | None, rest: tuple[FeatureVector, ...]
+    ) -> FeatureVector | None:
+        labour(x.stamp, self.work)
+        before = 0.0 if last is None else number(last)
+        return None if len(rest) % 5 == 3 else value(x.stamp, (before + number(x) + sum(map(number, rest))) % 1000)
+
+
+class Delayed(Operator):
+    """Looks at what was 20 ms ago, if it is not too old."""
+
+    x: In[FeatureVector]
+    old: Sampled[FeatureVector] = Sampled(before="20ms", max_age="60ms", required=False)
+    y: Out[FeatureVector]
+
+    def process(self, x: FeatureVector, old: FeatureVector | None) -> FeatureVector:
+        return value(x.stamp, number(x) if old is None else (number(x) + number(old)) % 1000)
+
+
+class Lagging(Operator):
+    """Gives stamps 7 ms before those that it fires at."""
+
+    x: In[FeatureVector]
+    y: Out[FeatureVector] = Out(lag="10ms")
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        return value(x.stamp - 7_000_000, number(x))
+
+
+class Leading(Operator):
+    """Gives stamps 2 ms after those that it fires at, and every second one on another port too."""
+
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+    half: Out[FeatureVector]
+
+    def process(self, x: FeatureVector) -> Mapping[str, FeatureVector]:
+        made = value(x.stamp + 2_000_000, number(x))
+        return {"y": made, "half": made} if int(number(x)) % 2 else {"y": made}
+
+
+class Near(Operator, tolerance="3ms"):
+    """Joins three streams by nearest stamp."""
+
+    a: In[FeatureVector]
+    b: In[FeatureVector]
+    c: In[FeatureVector]
+    y: Out[FeatureVector]
+    work: float = Param(0.0, ge=0, doc="longest time that a call takes, s")
+
+    def process(self, a: FeatureVector, b: FeatureVector, c: FeatureVector) -> FeatureVector:
+        labour(a.stamp, self.work)
+        return value(a.stamp, (number(a) + 2 * number(b) + 3 * number(c)) % 1000)
+
+
+class Both(Operator):
+    """Joins two streams by equal stamps."""
+
+    a: In[FeatureVector]
+    b: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(self, a: FeatureVector, b: FeatureVector) -> FeatureVector:
+        return value(a.stamp, (number(a) - number(b)) % 1000)
+
+
+class Either(Operator, merge=True):
+    """Fires for each of two streams, and counts how often their clock jumped back."""
+
+    a: In[FeatureVector]
+    b: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def setup(self) -> None:
+        self.jumps = 0
+
+    def on_reset(self, input: str) -> None:
+        self.jumps += 1
+
+    def process(self, a: FeatureVector | None, b: FeatureVector | None, context: Any) -> FeatureVector:
+        there = [number(message) for message in (a, b) if message is not None]
+        return value(context.stamp, (sum(there) + self.jumps) % 1000)
+
+
+class Beat(Operator, every="10ms"):
+    """Ticks where there is a fresh message, with the newest three of another stream."""
+
+    x: Sampled[FeatureVector] = Sampled(max_age="30ms")
+    rest: Batch[FeatureVector] = Batch(max=3)
+    y: Out[FeatureVector]
+
+    def process(self, x: FeatureVector, rest: tuple[FeatureVector, ...], context: Any) -> FeatureVector:
+        return value(context.stamp, (number(x) + len(rest)) % 1000)
+
+
+class Placed(Operator):
+    """Needs a static message, and can be tuned; what it gives is large."""
+
+    x: In[FeatureVector]
+    constant: Sampled[FeatureVector]
+    y: Out[FeatureVector]
+    gain: float = Param(1.0, doc="factor", live=True)
+    size: int = Param(3000, ge=1, doc="numbers in each message")
+
+    def process(self, x: FeatureVector, constant: FeatureVector) -> FeatureVector:
+        return value(x.stamp, *[(number(x) * self.gain + number(constant)) % 1000] * self.size)
+
+
+class Arm(Operator):
+    """Touches the world: what it gives is taken from the recording when others are executed again."""
+
+    external = True
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        return value(x.stamp, number(x))

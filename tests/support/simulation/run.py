@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +16,11 @@ from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import _metadata
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.transport import make_ring
+from dataflow.transport.keys import runtime_key
 from simulation import bindings, machine, memory, network, operators
 from simulation.disk import Disk
 from simulation.processes import SUPERVISOR, Nursery
+from simulation.sleep import watched
 from simulation.world import Process, Violation, World
 
 LIMIT = 200.0
@@ -30,6 +32,8 @@ MEGABYTES = 50_000_000
 class Happening:
     """What happens to a run from outside, `at` so many seconds after its sources were released.
 
+    `pause` freezes the supervisor (for `span` s) and with it the process `target`, or all where that is "*".
+    `set` changes the parameters `fields` of the operator `target`, `play` does the `action` to what is not live.
     `kill`, `freeze` (for `span` s) and `kill_before` (before the `effect`-th thing that it does and others can see, of
     the `life`-th process with that label) happen to the process `target`; `stop` asks for an orderly end.
     """
@@ -100,12 +104,14 @@ class Simulation:
         self._plan, self._happenings, self._mode, self._limit = plan, happenings, mode, limit
         self._supervisor: Supervisor | None = None
         self._lives: dict[str, int] = {}
+        self._served: dict[str, tuple[Process, Callable[[Any], object]]] = {}
 
     def run(self) -> Outcome:
         interval = sys.getswitchinterval()
         with contextlib.ExitStack() as stack:
             stack.callback(sys.setswitchinterval, interval)
             stack.enter_context(bindings.bound(self._bindings()))
+            stack.enter_context(watched(self.world))
             stack.enter_context(contextlib.redirect_stderr(_Words(self)))
             time = machine.Time(self.world)
             before = operators.Effort.sleep, operators.Effort.now
@@ -165,7 +171,7 @@ class Simulation:
             (f"{process}.inbox", "select"): machine.Select(system),
             (f"{process}.inbox", "threading"): threads,
             (f"{process}.polling", "select"): machine.Select(system),
-            (f"{process}.operator_process", "Bus"): network.Bus,
+            (f"{process}.operator_process", "Bus"): lambda config: network.Bus(world, self._served),
             (f"{process}.operator_process", "TapServer"): network.Nobody,
             (f"{process}.operator_process", "OutsidePublisher"): network.Nobody,
             (f"{process}.operator_process", "leave_network"): _nothing,
@@ -191,6 +197,7 @@ class Simulation:
             ("dataflow.process.handed", "BACKLOG"): (1, 1),
             (f"{supervision}.run", "machine_facts"): lambda environment: facts,
             ("dataflow.recording.container", "os"): self.disk,
+            ("dataflow.recording.parts", "os"): self.disk,
             ("dataflow.firing.source", "Tripwire"): _NoTripwire,
         }
 
@@ -222,11 +229,32 @@ class Simulation:
             case "stop":
                 assert self._supervisor is not None
                 self._supervisor.stop()
+            case "play":
+                assert self._supervisor is not None
+                self._supervisor.play(**fields)
+            case "set":
+                self._ask(runtime_key(self._plan.graph.namespace, "param", happening.target), fields)
             case "kill" if process is not None:
                 world.kill(process)
             case "freeze" if process is not None:
                 world.freeze(process)
                 world.after(fields["span"], lambda: world.thaw(process))
+            case "pause":
+                labels = {SUPERVISOR, happening.target}
+                for each in [
+                    p for p in world.processes if not p.dead and (happening.target == "*" or p.label in labels)
+                ]:
+                    world.freeze(each)
+                    world.after(fields["span"], functools.partial(world.thaw, each))
+
+    def _ask(self, key: str, fields: Mapping[str, Any]) -> None:
+        """Has the process that serves a key, if it lives, change parameters, as Zenoh's thread would."""
+        process, answer = self._served.get(key, (None, None))
+        if process is None or process.dead or answer is None:
+            return
+        for name, value in fields.items():
+            query = network.Query({"name": name, "value": value})
+            self.world.start("zenoh", process, functools.partial(answer, query))
 
 
 class _Words:

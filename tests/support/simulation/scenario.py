@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from dataflow.chaos.plan import Fault
-from dataflow.graph import Graph, load_text
+from dataflow.graph import Graph, GraphError, load_text
 from dataflow.graph.model import Placement
+from simulation.drawn import drawn, repeats
 from simulation.run import LIMIT, Happening, Machine
 
 _USE = "use: simulation.operators"
 _SOURCE = f"{_USE}:Counter, params: {{count: COUNT, period: PERIOD, work: READING}}"
 _DEVICE = f"{_USE}:Device, params: {{count: COUNT, period: PERIOD}}RESTARTED"
+_PAIR = f"{_USE}:Pair, params: {{count: COUNT, period: PERIOD}}"
+_JUMPS = f"{_USE}:JumpingPair, params: {{count: COUNT, period: PERIOD}}RESTARTED"
+_OTHER = f"{_USE}:Counter, params: {{count: COUNT, period: PERIOD, offset: 1000000, ratio: 2, work: READING}}"
+_SHORT = f"{_USE}:Counter, params: {{count: 1, period: PERIOD, offset: 30000000}}"
 _WORK = "params: {work: WORK}"
 
 GRAPHS: Mapping[str, str] = {
@@ -48,6 +54,10 @@ TICKS = f"""
 """A graph of which every step makes many messages, more than what keeps its source from running ahead knows of: those
 between two processes can become too many."""
 TICKING = "ticks"
+DRAWN = "drawn"
+"""A graph that its seed wires (`drawn`)."""
+MOST_TRIES = 30
+PLACEMENTS: tuple[Placement, ...] = ("graph", "graph", "process_each", "one_process")
 TICK = 250e-6
 """Its timer's period, s."""
 _RESTART = "restart: {max: 5, backoff: 10ms}"
@@ -89,10 +99,21 @@ class Scenario:
     machine: Machine
     happenings: tuple[Happening, ...] = ()
     faults: tuple[Fault, ...] = ()
+    parts: tuple[str, ...] = ()
+    """The operators of a drawn graph, a line of YAML each."""
+    rate: float | None = None
 
     def load(self) -> Graph:
         return load(
-            self.graph, self.live, self.count, self.period, self.work, self.reading, self.policy, self.snapshots
+            self.graph,
+            self.parts,
+            self.live,
+            self.count,
+            self.period,
+            self.work,
+            self.reading,
+            self.policy,
+            self.snapshots,
         )
 
     @property
@@ -102,15 +123,24 @@ class Scenario:
         A run that is stopped while a process is to be started again ends at once, as after a freeze beyond a deadline.
         """
         kinds = [h.kind for h in self.happenings]
-        ends = any(h.kind.startswith("kill") or h.fields.get("span", 0) > PATIENCE for h in self.happenings)
+        ends = any(
+            h.kind.startswith("kill") or (h.kind == "freeze" and h.fields["span"] > PATIENCE) for h in self.happenings
+        )
         ends = ends or kinds.count("stop") > 1 or ("deadline" in self.policy and {"freeze", "stop"} <= set(kinds))
         return ends or self.machine.room is not None or any(f.kind in ("raise", "hang") for f in self.faults)
 
     @property
+    def only_paused(self) -> bool:
+        """Whether nothing happens for which a process may be killed or blamed."""
+        harmless = all(h.kind in ("pause", "set", "play") for h in self.happenings)
+        return harmless and not self.faults and self.machine.room is None and self.machine.slow_disk == 0.0
+
+    @property
     def limit(self) -> float:
         """Simulated seconds after which the run hangs: ticks that came due during a freeze are all made up for."""
-        spans = sum(min(h.fields["span"], TIMEOUT) for h in self.happenings if h.kind == "freeze")
-        return LIMIT + (spans / TICK * self.work if self.graph == TICKING else 0.0)
+        spans: float = sum(min(h.fields["span"], TIMEOUT) for h in self.happenings if h.kind == "freeze")
+        pauses: float = sum(h.fields["span"] for h in self.happenings if h.kind == "pause")
+        return LIMIT + pauses + (spans / TICK * self.work if self.graph == TICKING else 0.0)
 
     def describe(self) -> str:
         """Tells what is run, and what happens, one line each."""
@@ -119,13 +149,15 @@ class Scenario:
         lines = [
             f"seed {self.seed}: graph {self.graph!r}, {how}, {self.placement}, {self.count} steps of "
             f"{self.period / 1e6:g} ms, work up to {self.work:g} s, window {self.window}"
-            + (", snapshots" if self.snapshots else ""),
+            + (", snapshots" if self.snapshots else "")
+            + ("" if self.rate is None else f", rate {self.rate:g}"),
             f"  machine: seed {machine.seed}, pace {machine.pace:g}, gives way {machine.preempt:g}"
             + ("" if machine.room is None else f", disk of {machine.room} bytes")
             + (f", writes take up to {machine.slow_disk:g} s" if machine.slow_disk else "")
             + (f", sockets hold {machine.socket_room} messages" if machine.socket_room != 278 else "")
             + (f", rings of {machine.ring_bytes} bytes" if machine.ring_bytes != 1 << 20 else ""),
         ]
+        lines += [f"  {part}" for part in self.parts]
         lines += [f"  {happening}" for happening in self.happenings]
         lines += [f"  {f.at:.4f} s after the release {f.kind} {f.operator} {dict(f.fields)}" for f in self.faults]
         return "\n".join(lines)
@@ -133,13 +165,26 @@ class Scenario:
 
 @functools.lru_cache(maxsize=4096)
 def load(
-    graph: str, live: bool, count: int, period: int, work: float, reading: float, policy: str, snapshots: bool
+    graph: str,
+    parts: tuple[str, ...],
+    live: bool,
+    count: int,
+    period: int,
+    work: float,
+    reading: float,
+    policy: str,
+    snapshots: bool,
 ) -> Graph:
     """Loads one of the graphs; loading takes longer than some runs, so each is loaded once."""
     record = "record: {snapshots: 60ms}\n" if snapshots else ""
-    text = f"graph: {graph}\nnamespace: sim\n{record}operators:{TICKS if graph == TICKING else GRAPHS[graph]}"
+    drawn_here = "".join(f"\n  {part}" for part in parts) + "\n"
+    operators = {TICKING: TICKS, DRAWN: drawn_here}.get(graph) or GRAPHS[graph]
+    text = f"graph: {graph}\nnamespace: sim\n{record}operators:{operators}"
     words = {
         "SOURCE": _DEVICE if live else _SOURCE,
+        "PAIR": _JUMPS if live else _PAIR,
+        "OTHER": _OTHER,
+        "SHORT": _SHORT,
         "LIVE": f", live: {{{policy}}}" if policy else "",
         "LINE": f"\n    live: {{{policy}}}" if policy else "",
         "RESTARTED": f", live: {{{_RESTART}}}" if "restart" in policy else "",
@@ -183,13 +228,29 @@ def scenario_of(seed: int) -> Scenario:
     )
     if live and random.Random(f"ticks {seed}").random() < 0.05:
         plain = replace(plain, graph=TICKING)
+    elif random.Random(f"drawn {seed}").random() < 0.6:
+        plain = _drawn(plain, random.Random(f"wired {seed}"))
     return _with_events(plain, r)
+
+
+def _drawn(plain: Scenario, r: random.Random) -> Scenario:
+    """The same with a graph that is wired at random; some of what is not live keeps the pace of a clock."""
+    rate = r.choice((0.5, 1.0, 4.0)) if not plain.live and r.random() < 0.2 else None
+    for _ in range(MOST_TRIES):
+        placement = r.choice(PLACEMENTS)
+        found = replace(plain, graph=DRAWN, parts=drawn(r, live=plain.live), rate=rate, placement=placement)
+        with contextlib.suppress(GraphError):  # its feedback would wait for itself
+            found.load()
+            if repeats(found.parts):
+                return found
+    return plain
 
 
 def _with_events(plain: Scenario, r: random.Random) -> Scenario:
     graph = plain.load()
     labels = [*graph.processes(plain.placement)]
     happenings = [_happening(plain, labels, r) for _ in range(r.choice((0, 0, 1, 1, 2, 3)))]
+    happenings += _gentle(plain, graph, r)
     faults = [_fault(graph, r) for _ in range(r.choice((0, 0, 1, 2)))] if plain.live else []
     return replace(
         plain,
@@ -211,6 +272,27 @@ def _happening(plain: Scenario, labels: list[str], r: random.Random) -> Happenin
             return Happening(at, kind)
         case _:
             return Happening(at, kind, target)
+
+
+def _gentle(plain: Scenario, graph: Graph, r: random.Random) -> list[Happening]:
+    """What happens to a run that it outlives: parameters are set, its machine or its supervisor stands still for a
+    while, what is not live is paused and goes on."""
+    found = []
+    for name, node in graph.nodes.items():
+        if "gain" in node.params and r.random() < 0.5:
+            found.append(Happening(round(r.random() * 0.3, 4), "set", name, {"gain": r.choice((2.0, 3.0))}))
+    if r.random() < 0.15:
+        where = r.choice(("*", "*", "", r.choice([*graph.processes(plain.placement), "@recorder"])))
+        at = round(r.random() * 0.3, 4)
+        found.append(Happening(at, "pause", where, {"span": r.choice((1.0, 4.0, 6.0, 15.0, 40.0))}))
+    if not plain.live and r.random() < 0.1:
+        at = round(r.random() * 0.2, 4)
+        found.append(Happening(at, "play", "", {"action": "pause"}))
+        found.append(
+            Happening(round(at + r.random(), 4), "play", "", {"action": r.choice(("resume", "resume", "step"))})
+        )
+        found.append(Happening(round(at + 1.0 + r.random(), 4), "play", "", {"action": "resume"}))
+    return found
 
 
 def _fault(graph: Graph, r: random.Random) -> Fault:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from simulation.check import check
+from simulation.drawn import without
 from simulation.run import Machine
 from simulation.scenario import Scenario
 from simulation.world import Violation
@@ -71,11 +72,13 @@ def _smaller(scenario: Scenario) -> Iterator[Scenario]:
                 yield replace(scenario, policy=", ".join(parts[:k] + parts[k + 1 :]))
     if scenario.snapshots:
         yield replace(scenario, snapshots=False)
-    for name, value in (("work", 0.0), ("reading", 0.0), ("window", 256)):
+    for fewer in without(scenario.parts):
+        yield replace(scenario, parts=fewer)
+    for name, value in (("rate", None), ("work", 0.0), ("reading", 0.0), ("window", 256)):
         if getattr(scenario, name) != value:
             yield replace(scenario, **{name: value})  # type: ignore[arg-type]
     if not scenario.happenings and not scenario.faults and scenario.graph != "chain":
-        yield replace(scenario, graph="chain")
+        yield replace(scenario, graph="chain", parts=())
     for count in (2, 4, scenario.count // 2, scenario.count - 1):
         if 0 < count < scenario.count:
             yield replace(scenario, count=count)

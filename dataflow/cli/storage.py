@@ -1,0 +1,133 @@
+"""Storage of a recording, as options say it: its name by the time, its parts, limits, and readers."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from dataflow.cli.arguments import output_file
+from dataflow.cli.output import fail
+from dataflow.cli.quantities import parsed_duration, parsed_size
+
+if TYPE_CHECKING:
+    from dataflow.recording.parts import Splitting, Storage
+
+RECORDING = "Recording"
+PARTS_KEPT = 10
+"""Parts into which the bytes to keep are divided, where no size of one is given."""
+
+SplitEvery = Annotated[
+    str | None,
+    typer.Option(
+        "--split-every",
+        metavar="TIME",
+        rich_help_panel=RECORDING,
+        help="A new file, NAME_000.mcap and so on, after this event time: 60s, 5min.",
+    ),
+]
+SplitSize = Annotated[
+    str | None,
+    typer.Option(
+        "--split-size",
+        metavar="SIZE",
+        rich_help_panel=RECORDING,
+        help="A new file after so many bytes: 500MB, 2GB.",
+    ),
+]
+KeepDisk = Annotated[
+    str | None,
+    typer.Option(
+        "--keep-disk",
+        metavar="SIZE",
+        rich_help_panel=RECORDING,
+        help="Delete the oldest files of this recording while all of them take more than this: 20GB. It is split by "
+        "a tenth of that, or by --split-size.",
+    ),
+]
+OnFailure = Annotated[
+    Literal["go_on", "end"] | None,
+    typer.Option(
+        "--record-failure",
+        metavar="go_on|end",
+        rich_help_panel=RECORDING,
+        help="When the disk is full or the recorder fails: the run goes on, and what is lost is counted (default of a "
+        "live run), or it ends (default of any other).",
+    ),
+]
+Readable = Annotated[
+    Literal["owner", "group", "all"],
+    typer.Option(
+        "--readable",
+        metavar="owner|group|all",
+        rich_help_panel=RECORDING,
+        help="Who may read the files that are written. Default: you alone.",
+    ),
+]
+MODES = {"owner": 0o600, "group": 0o640, "all": 0o644}
+
+
+def named(path: Path) -> Path:
+    """A file name with `{time}` replaced by the date and time now (UTC), such as 2026-11-28T211030Z."""
+    if "{time}" not in path.name:
+        return path
+    now = time.strftime("%Y-%m-%dT%H%M%SZ", time.gmtime())
+    suffixes = ("", *(f"-{k}" for k in range(2, 1000)))  # for a clock that stands still: a machine without a battery
+    names = (path.with_name(path.name.replace("{time}", now + suffix)) for suffix in suffixes)
+    return next(name for name in names if not _taken(name))
+
+
+def _taken(path: Path) -> bool:
+    from dataflow.recording.parts import parts_of
+
+    return path.exists() or bool(parts_of(path))
+
+
+def recording_file(path: Path, splitting: Splitting | None, *, overwrite: bool, option: str) -> Path:
+    """`path`, checked as a recording to write, which may be split: none of its parts may be there unasked."""
+    from dataflow.recording.parts import parts_of
+
+    splits = splitting is not None and splitting.splits
+    if splits and not overwrite and (there := parts_of(path)):
+        raise fail(f"{there[0]} exists; name another file, or replace its parts with --overwrite")
+    return output_file(path, ".mcap", overwrite=overwrite or splits, option=option)
+
+
+def splitting_of(every: str | None, size: str | None, keep: str | None = None) -> Splitting:
+    """The limits of one file, by the options."""
+    from dataflow.recording.parts import Splitting
+
+    time_ns = None if every is None else parsed_duration("--split-every", every)
+    if time_ns == 0:
+        raise fail(f"--split-every {every}: expected more than nothing")
+    most = None if size is None else parsed_size("--split-size", size)
+    if keep is not None:
+        whole = parsed_size("--keep-disk", keep)
+        if most is not None and most > whole // 2:
+            raise fail(f"--keep-disk {keep} holds less than two files of --split-size {size}")
+        most = most or max(whole // PARTS_KEPT, 1)
+    return Splitting(most, time_ns)
+
+
+def storage_of(
+    record: Path | None,
+    every: str | None,
+    size: str | None,
+    keep: str | None,
+    on_failure: Literal["go_on", "end"] | None,
+    readable: str,
+    *,
+    flight: bool = False,
+) -> Storage:
+    """The storage of a run's recording, by the options, which are refused where nothing is recorded."""
+    from dataflow.recording.parts import Storage
+
+    for option, given in (("--split-every", every), ("--split-size", size), ("--keep-disk", keep)):
+        if given is not None and record is None:
+            raise fail(f"{option} is of a recording: name one with --record")
+    if on_failure is not None and record is None and not flight:
+        raise fail("--record-failure is of a recording: name one with --record")
+    kept = None if keep is None else parsed_size("--keep-disk", keep)
+    return Storage(splitting_of(every, size, keep), kept, on_failure, MODES[readable])

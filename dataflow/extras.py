@@ -1,0 +1,66 @@
+"""Names the extra of this distribution that installs a missing package."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from functools import cache
+from importlib.metadata import PackageNotFoundError, requires
+
+DISTRIBUTION = "robot-dataflow"
+_OF_MODULES = {
+    "cv2": "opencv-python-headless",
+    "foxglove": "foxglove-sdk",
+    "rerun": "rerun-sdk",
+    "ruamel": "ruamel.yaml",
+    "small_gicp": "small-gicp",
+}
+"""Module → distribution, where the names differ."""
+_COLLECTIONS = ("all", "dev")
+_BY_CALLER = {"operators.": "perception", "dataflow.view": "view", "dataflow.": "bags"}
+"""Package of the importing module → the extra that serves it, where several extras bring what is missing."""
+
+_REQUIREMENT = re.compile(r"([\w.-]+)[^;]*;.*extra\s*==\s*['\"](\w+)['\"]")
+
+
+def missing_extra(error: BaseException | None) -> str:
+    """Returns "it comes with: pip install ..." for an error that a missing package caused; "" if no extra has it."""
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError) and error.name:
+            extras = _extras().get(_distribution(error.name), ())
+            return f"it comes with: pip install '{DISTRIBUTION}[{_chosen(extras, error)}]'" if extras else ""
+        error = error.__cause__ or error.__context__
+    return ""
+
+
+def is_optional(module: str) -> bool:
+    """Returns whether only extras bring a module."""
+    return _distribution(module) in _extras()
+
+
+def _distribution(module: str) -> str:
+    top = module.partition(".")[0]
+    return _OF_MODULES.get(top, top)
+
+
+@cache
+def _extras() -> dict[str, tuple[str, ...]]:
+    try:
+        declared = requires(DISTRIBUTION) or []
+    except PackageNotFoundError:
+        return {}
+    found: dict[str, set[str]] = {}
+    for text in declared:
+        if (match := _REQUIREMENT.match(text)) and match[2] not in _COLLECTIONS and match[1] != DISTRIBUTION:
+            found.setdefault(match[1], set()).add(match[2])
+    return {name: tuple(sorted(extras)) for name, extras in found.items()}
+
+
+def _chosen(extras: tuple[str, ...], error: BaseException) -> str:
+    """Returns the extra that the importing module belongs to, else the first."""
+    for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
+        caller = str(frame.f_globals.get("__name__", ""))
+        for package, extra in _BY_CALLER.items():
+            if caller.startswith(package) and extra in extras:
+                return extra
+    return extras[0]

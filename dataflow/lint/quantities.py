@@ -1,0 +1,157 @@
+"""Values that cannot be: units that a driver has mixed up, clocks that are years apart, marks that pass for data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import islice
+
+import numpy as np
+
+from dataflow.lint.finding import Finding
+from dataflow.lint.material import Material
+from dataflow.lint.timing import Timing
+from dataflow.messages import DepthImage, Imu, LaserScan, Message, NavSatFix, PointCloud
+
+LOOKED_AT = 200
+"""Messages of a stream that are looked at, evenly spread where their number is known."""
+GRAVITY = 9.81
+FASTEST = 35.0
+"""rad/s, 2000 degrees a second: what gyroscopes of robots measure at most."""
+SPINNING = 0.3
+"""Gyroscopes in degrees read over this many times 35 already when a robot turns at leisure."""
+DEEPEST = 300.0
+"""Metres beyond which no depth camera measures."""
+LONGEST_SWEEP = 60.0
+"""Seconds that the points of one cloud may take."""
+YEARS = 86400.0 * 30
+"""Seconds by which the stamps of streams of one recording do not differ."""
+
+
+@dataclass(slots=True)
+class _Seen:
+    """What the messages of a stream hold."""
+
+    accelerations: list[float] = field(default_factory=list)
+    rates: list[float] = field(default_factory=list)
+    negative: int = 0
+    deepest: float = 0.0
+    sweep: float = 0.0
+    farthest: float = 0.0
+    ranges: list[float] = field(default_factory=list)
+    unplaced: int = 0
+    looked: int = 0
+
+
+def check_quantities(material: Material, timings: Mapping[str, Timing]) -> Iterator[Finding]:
+    """Looks at some messages of every stream of sensors, and at the stamps of all streams."""
+    for name, facts in material.streams.items():
+        if not (facts.readable and facts.count):
+            continue
+        seen = _Seen()
+        step = max(1, facts.count // LOOKED_AT)
+        for message in islice(material.messages(name), 0, None, step):
+            if not _look(message, seen):
+                break
+            seen.looked += 1
+            if seen.looked >= LOOKED_AT:
+                break
+        yield from _findings(name, seen)
+    yield from check_spans(timings)
+
+
+def _look(message: Message, seen: _Seen) -> bool:
+    """Takes in a message; False for a type of which nothing is known."""
+    match message:
+        case Imu():
+            seen.accelerations.append(float(np.linalg.norm(message.linear_acceleration)))
+            seen.rates.append(float(np.linalg.norm(message.angular_velocity)))
+        case DepthImage():
+            data = message.data[np.isfinite(message.data)]
+            seen.negative += int((data < 0).sum())
+            seen.deepest = max(seen.deepest, float(np.quantile(data, 0.9)) if data.size else 0.0)
+        case PointCloud():
+            if message.time_offsets is not None and len(message.time_offsets):
+                times = message.time_offsets[np.isfinite(message.time_offsets)].astype(np.float64)
+                seen.sweep = max(seen.sweep, float(np.ptp(times)) if times.size else 0.0)
+                seen.farthest = max(seen.farthest, float(np.abs(times).max(initial=0.0)))
+        case LaserScan():
+            ranges = message.ranges[np.isfinite(message.ranges) & (message.ranges > 0)]
+            if ranges.size:
+                seen.ranges.append(float(np.median(ranges)))
+                seen.unplaced += int(np.median(ranges) > message.range_max)
+        case NavSatFix():
+            seen.unplaced += int(message.status != "no_fix" and message.latitude == message.longitude == 0.0)
+        case _:
+            return False
+    return True
+
+
+def _findings(name: str, seen: _Seen) -> Iterator[Finding]:
+    def found(text: str, **values: float) -> Finding:
+        return Finding("quantity", name, "warning", text, None, values)
+
+    if seen.accelerations:
+        pull = float(np.median(seen.accelerations))
+        if 0.7 < pull < 1.3:
+            yield found(f"gravity is {pull:.2f}: acceleration is in g, and m/s² is wanted (times 9.81)", gravity=pull)
+        elif 700 < pull < 1300:
+            yield found(
+                f"gravity is {pull:.0f}: acceleration is in mg, and m/s² is wanted (times 0.00981)", gravity=pull
+            )
+        elif pull < 0.3:
+            text = f"gravity is {pull:.2f}: it is taken out, or the readings are of another unit than m/s²"
+            yield found(text, gravity=pull)
+        elif not 0.7 * GRAVITY < pull < 1.5 * GRAVITY:
+            yield found(f"gravity is {pull:.3g}, and 9.81 m/s² is wanted: which unit is it in?", gravity=pull)
+        fastest = float(np.quantile(seen.rates, 0.95))
+        if fastest > SPINNING * FASTEST:
+            slower = np.radians(fastest)
+            text = f"turns at {fastest:.3g} rad/s; if that is in degrees, it is {slower:.2g} rad/s, which is wanted"
+            yield found(text, rate=fastest)
+    if seen.negative:
+        text = f"{seen.negative:,} depths are negative; no return is 0 or NaN"
+        yield found(text, pixels=seen.negative)
+    if seen.deepest > DEEPEST:
+        metres = seen.deepest / 1000
+        text = (
+            f"a tenth of its depths is beyond {seen.deepest:.0f} m; if they are in millimetres, beyond {metres:.1f} m"
+        )
+        yield found(text, depth=seen.deepest)
+    if max(seen.sweep, seen.farthest) > LONGEST_SWEEP:
+        worst = max(seen.sweep, seen.farthest)
+        fits = next((u for u, s in (("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9)) if worst * s < 1.0), "")
+        text = f"its points were measured up to {worst:.3g} s from the stamp of their cloud"
+        yield found(text + (f"; in {fits} that would be {_small(worst, fits)}" if fits else ""), seconds=worst)
+    if seen.ranges and seen.unplaced:
+        text = f"in {seen.unplaced:,} of {seen.looked:,} scans most ranges are beyond range_max"
+        yield found(text + ": are they in millimetres?", scans=seen.unplaced)
+    elif seen.unplaced:
+        yield found(f"{seen.unplaced:,} fixes lie at 0° N 0° E: the receiver had none", fixes=seen.unplaced)
+
+
+def _small(seconds: float, unit: str) -> str:
+    return f"{seconds * {'ms': 1e-3, 'µs': 1e-6, 'ns': 1e-9}[unit]:.3g} s"
+
+
+def check_spans(timings: Mapping[str, Timing]) -> Iterator[Finding]:
+    """Streams whose stamps are of another time than most, and single stamps far from their stream's."""
+    if not timings:
+        return
+    middles = {name: (t.first + t.last) / 2 for name, t in timings.items()}
+    typical = float(np.median(list(middles.values())))
+    for name, timing in timings.items():
+        apart = (middles[name] - typical) * 1e-9
+        length = (timing.last - timing.first) * 1e-9
+        if length > YEARS and timing.count * max(timing.period, 1e-3) < length / 100:
+            text = f"its stamps span {_long(length)}, with {timing.count:,} messages: some are of another clock"
+            yield Finding("clocks", name, "error", text, timing.first, {"seconds": length})
+        elif abs(apart) > YEARS:
+            when = "later" if apart > 0 else "earlier"
+            text = f"its stamps are {_long(abs(apart))} {when} than those of the others: they are of another clock"
+            yield Finding("clocks", name, "error", text, timing.first, {"seconds": apart})
+
+
+def _long(seconds: float) -> str:
+    days = seconds / 86400
+    return f"{days / 365.25:.1f} years" if days > 365 else f"{days:.0f} days"

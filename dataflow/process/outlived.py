@@ -1,0 +1,24 @@
+"""Tells of failures that an operator or a process outlives: nothing else would say where they happened."""
+
+from __future__ import annotations
+
+from dataflow.firing.failure import OperatorFailure
+from dataflow.process.channel import Channel
+from dataflow.process.speech import log_failure
+
+
+def tell_outlived(channel: Channel, failure: OperatorFailure, pause: float) -> None:
+    """Logs the traceback of a failure, and tells the supervisor that the operator is made anew in `pause` s.
+
+    Raises `ChannelClosed`.
+    """
+    log_failure(failure)
+    channel.send(
+        "restarting",
+        operator=failure.operator,
+        when=failure.when,
+        summary=failure.summary,
+        where=failure.where,
+        traceback=failure.traceback,
+        pause=pause,
+    )

@@ -1,0 +1,338 @@
+"""The recorder of a run: writes one file, or parts one after the other, and goes on after a full disk.
+
+Each part is a recording by itself: it holds the run's metadata, the static messages, and for every operator, in front
+of its first record, one that stands in for those before (`dataflow.records.cuts`). So parts before it may be missing,
+because they were deleted or because the disk was full, and all that are there join into one recording again.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dataflow.editing.spans import folded
+from dataflow.graph.model import Graph
+from dataflow.messages import Diagnostics
+from dataflow.messages.base import Message
+from dataflow.process.outage import Lost, Outage
+from dataflow.process.recorder import GOES_ON, RecorderSink
+from dataflow.recording import LogLine, RecordingError
+from dataflow.recording.cutting import Cut
+from dataflow.recording.layout import CUT
+from dataflow.recording.parts import Storage, part_path, parts_of
+from dataflow.records.firing import CALLS, FiringRecord, consecutive, encode_batch
+
+SETTLES = 1.0
+"""Seconds for which a full part stays open for what lies before its end: batches of firing records come later."""
+
+
+@dataclass(slots=True)
+class Part:
+    """One file. `start`: the stamp (ns) with which it begins, None for the beginning of the run; `ready`: when it may
+    be closed (s, steady); `messages` and `bytes`: what it holds, once it is closed."""
+
+    path: Path
+    sink: RecorderSink
+    start: int | None
+    ready: float = 0.0
+    messages: int = 0
+    bytes: int = 0
+
+
+class PartsSink:
+    """Takes everything that a run gives, and stores it in the files of one recording.
+
+    `options`: those of `RecorderSink`, and `storage`. `life`: how many recorders the run has had, this one included.
+    """
+
+    def __init__(
+        self, path: Path, graph: Graph, streams: list[str], options: Mapping[str, Any], *, life: int = 1
+    ) -> None:
+        self._path, self._graph, self._streams, self._options = path, graph, streams, options
+        self._storage: Storage = options["storage"]
+        self._before = life - 1
+        self._earlier: dict[Path, int] = {}
+        """Parts of the recorders before, and their sizes."""
+        self._numbered = self._storage.splitting.splits or life > 1
+        self._static = {stream for stream in streams if graph.streams[stream].static}
+        self._statics: dict[str, tuple[Message, int, int]] = {}
+        self._folded: dict[str, list[FiringRecord]] = {}
+        self._introduced: set[str] = set()
+        self._ends: dict[str, tuple[int | None, str]] = {}
+        self._clock = self._begun = self._diagnosed = 0
+        self._given: Counter[str] = Counter()
+        self._saved: Counter[str] = Counter()
+        self._closed: list[Part] = []
+        self._deleted = 0
+        self._full: Part | None = None
+        """The part before the current one, until what belongs into it has come."""
+        self._after_gap = False
+        self._outage = Outage(path.parent)
+        self.lost = Lost()
+        if options["overwrite"] and self._storage.splitting.splits and life == 1:
+            for old in parts_of(path):
+                old.unlink()
+        elif life > 1 and self._storage.splitting.splits:
+            self._earlier = {file: file.stat().st_size for file in parts_of(path)}
+        self._current: Part | None = self._open(None)
+
+    # What comes
+
+    def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
+        """Stores a message; begins the next part when it is time to."""
+        self._given[stream] += 1
+        if stream in self._static:
+            self._statics[stream] = message, seq, incarnation
+        elif message.stamp > self._clock:
+            self._clock = message.stamp
+            self._begun = self._begun or self._clock
+            if self._current is not None and self._storage.splitting.due(
+                self._current.sink.writer.saved_bytes, self._clock - self._begun
+            ):
+                self._split(self._clock)
+        part = self._part_at(message.stamp)
+        if part is not None:
+            self._store(part, lambda: part.sink.message(stream, message, seq, incarnation))
+
+    def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
+        """Stores firing records; those of calls before the current part in the one before, while it is open."""
+        start = None if self._current is None else self._current.start
+        k = 0 if start is None else next((k for k, r in enumerate(records) if r.stamp >= start), len(records))
+        if self._full is None and not self._after_gap:
+            k = 0
+        early, rest = list(records[:k]), list(records[k:])
+        if early:
+            self._store_records(self._full, operator, early, encode_batch(early))
+        if rest:
+            payload = encode_batch(rest, last=rest[-1].kind == "finish") if early else payload
+            self._store_records(self._current, operator, rest, payload)
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        self._ends[stream] = final_stamp, reason
+
+    def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
+        """Takes an event. After a jump of the clock, stamps are new again that were old before."""
+        if name == "clock_jump":
+            self._clock = min(self._clock, data["stamp"])
+            self._begun = min(self._begun, self._clock)
+        if (part := self._current) is not None:
+            self._store(part, lambda: part.sink.event(name, stamp, data))
+
+    def diagnostics(self, message: Diagnostics) -> None:
+        if (part := self._current) is not None:
+            part.sink.diagnosed = self._diagnosed
+            self._store(part, lambda: part.sink.diagnostics(message))
+        self._diagnosed += 1
+
+    def log(self, line: LogLine) -> None:
+        if (part := self._current) is not None:
+            self._store(part, lambda: part.sink.log(line))
+
+    def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
+        """Sums of operators are told by their finish records."""
+
+    def flush(self) -> None:
+        """Hands everything to the operating system, about once a second; a disk that had refused is tried again."""
+        for part in self._open_parts():
+            self._store(part, part.sink.flush)
+        if self._full is not None and time.monotonic() >= self._full.ready:
+            self._close_full()
+        if self._current is None and self._outage.over():
+            self._resume()
+        self._keep_to_limit()
+
+    def close(self, outcome: str) -> Mapping[str, Any]:
+        """Completes the last part."""
+        self._close_full()
+        if (part := self._current) is not None:
+            self._current = None
+            self._finish(part, outcome, None)
+        self.lost.messages = self._given - self._saved
+        self._keep_to_limit()
+        facts = {
+            "path": str(self._closed[0].path if self._closed else self._path),
+            "messages": sum(part.messages for part in self._closed),
+            "bytes": self.size,
+            "parts": [str(part.path) for part in self._closed],
+            "deleted": self._deleted,
+            "deaths": self._before,
+        }
+        return {**facts, "lost": self.lost.as_json()} if self.lost.any else facts
+
+    @property
+    def size(self) -> int:
+        """Bytes of all parts that there are."""
+        closed = sum(part.bytes for part in self._closed) + sum(self._earlier.values())
+        return closed + sum(part.sink.writer.saved_bytes for part in self._open_parts())
+
+    # Parts
+
+    def _open_parts(self) -> Iterator[Part]:
+        yield from [part for part in (self._full, self._current) if part is not None]
+
+    def _part_at(self, stamp: int) -> Part | None:
+        current = self._current
+        if self._full is not None and current is not None and stamp < (current.start or 0):
+            return self._full
+        return current
+
+    def _open(self, start: int | None) -> Part:
+        """Begins a file with what every part holds. Raises `RecordingError`."""
+        path = self._free_name()
+        try:
+            sink = RecorderSink(path, self._graph, self._streams, {**self._options, "mode": self._storage.mode})
+        except RecordingError:
+            if start is not None:
+                path.unlink(missing_ok=True)
+            raise
+        self._introduced.clear()
+        part = Part(path, sink, start)
+        try:
+            if start is not None:
+                sink.writer.add_metadata(CUT, Cut(self._path.name, start, None).metadata())
+            for stream, (message, seq, incarnation) in self._statics.items():
+                sink.message(stream, message, seq, incarnation)
+        except RecordingError:
+            self._abandon(part)
+            raise
+        return part
+
+    def _free_name(self) -> Path:
+        """The name of the next part. None is used twice, not even that of one that was deleted."""
+        if not self._numbered:
+            self._numbered = True
+            return self._path
+        first = self._before + len(self._closed) + self._deleted + (self._full is not None)
+        numbers = range(first, first + 10**6)
+        names = (part_path(self._path, number) for number in numbers)
+        return next(name for name in names if not name.exists())
+
+    def _split(self, start: int) -> None:
+        self._close_full()
+        self._full, self._current = self._current, None
+        assert self._full is not None
+        self._full.ready = time.monotonic() + SETTLES
+        self._after_gap = False
+        self._begin(start)
+
+    def _begin(self, start: int) -> None:
+        try:
+            self._current = self._open(start)
+        except RecordingError as error:
+            self._refused(error)
+        else:
+            self._begun = start
+
+    def _resume(self) -> None:
+        start = self._clock + 1
+        self._begin(start)
+        part = self._current
+        if part is None:
+            return
+        self._after_gap = True
+        since, _ = self.lost.spans[-1]
+        self.lost.spans[-1] = since, start
+        text = f"recording goes on in {part.path}: {(start - since) * 1e-9:.1f} s are not recorded"
+        print(text, flush=True)
+        self._store(part, lambda: part.sink.event("not_recorded", start, {"text": text, "since": since}))
+
+    def _close_full(self) -> None:
+        if (part := self._full) is not None:
+            self._full = None
+            following = self._current.start if self._current is not None else None
+            self._finish(part, GOES_ON, (following or self._clock + 1) - 1)
+
+    def _finish(self, part: Part, outcome: str, end: int | None) -> None:
+        """Completes a part, which ends with the stamp `end`; None: with the run."""
+
+        def finish() -> None:
+            for stream, (final, reason) in self._ends.items():
+                part.sink.end(stream, final, reason)
+            if end is not None:
+                part.sink.writer.add_metadata(CUT, Cut(self._path.name, part.start, end).metadata())
+            part.sink.close(outcome)
+
+        self._store(part, finish)
+        if not part.sink.writer.failed:
+            self._count(part)
+
+    def _abandon(self, part: Part) -> None:
+        """Closes a file whose disk refuses."""
+        with suppress(RecordingError):  # the refusal once more; the file is closed
+            part.sink.writer.close()
+        self.lost.firings += part.sink.unsaved_calls
+        self._count(part)
+
+    def _count(self, part: Part) -> None:
+        saved = Counter({stream: part.sink.writer.saved(stream) for stream in self._streams})
+        repeated = Counter(self._statics.keys()) if part.start is not None else Counter()
+        self._saved += saved - repeated
+        part.messages, part.bytes = (saved - repeated).total(), part.sink.writer.saved_bytes
+        if part.messages or part.start is None:
+            self._closed.append(part)
+        else:  # the disk refused before it held anything
+            part.path.unlink(missing_ok=True)
+
+    def _keep_to_limit(self) -> None:
+        """Deletes the oldest parts while all together take more of the disk than they may."""
+        most = self._storage.keep
+        while most is not None and (self._earlier or self._closed) and self.size > most:
+            oldest = next(iter(self._earlier)) if self._earlier else self._closed.pop(0).path
+            self._earlier.pop(oldest, None)
+            oldest.unlink(missing_ok=True)
+            self._deleted += 1
+
+    # Firing records
+
+    def _store_records(self, part: Part | None, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
+        """Stores records of an operator, behind what stands in for those before the part; without one they are lost."""
+        calls = sum(record.kind in CALLS for record in records)
+        if part is None:
+            self.lost.firings += calls
+        else:
+            if part is self._current and operator not in self._introduced:
+                self._introduced.add(operator)
+                for before in consecutive(self._folded.get(operator, ())):
+                    told = partial(part.sink.firings, operator, part.start or 0, encode_batch(before))
+                    self._store(part, told)
+            self._store(part, lambda: part.sink.firings(operator, records[-1].stamp, payload, calls=calls))
+        self._folded[operator] = folded([*self._folded.get(operator, ()), *records])
+
+    # Failures
+
+    def _store(self, part: Part, act: Callable[[], object]) -> None:
+        """Does what stores something in a part; where that fails, the run goes on or ends, as it is to."""
+        try:
+            act()
+        except RecordingError as error:
+            if self._storage.on_failure != "go_on":
+                raise
+            if not part.sink.writer.failed:  # it refuses this one thing alone
+                if self.lost.because(str(error)):
+                    print(f"not recorded: {error}", flush=True)
+            elif part in self._open_parts():
+                was_current = part is self._current
+                self._full = None if part is self._full else self._full
+                self._current = None if was_current else self._current
+                self._abandon(part)
+                if was_current:
+                    self._refused(error)
+            else:
+                self._abandon(part)
+                self.lost.because(str(error))
+
+    def _refused(self, error: RecordingError) -> None:
+        """Nothing is recorded from here on, until the disk takes something again."""
+        if self._storage.on_failure != "go_on":
+            raise error
+        self._outage.begin()
+        self.lost.because(str(error))
+        if not self.lost.spans or self.lost.spans[-1][1] is not None:
+            self.lost.spans.append((self._clock, None))
+            print(f"recording stops, the run goes on: {error}", flush=True)

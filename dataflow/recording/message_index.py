@@ -1,0 +1,221 @@
+"""Places of the messages of an MCAP file, by channel: all in memory, or of a long file read as they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from dataflow.recording.chunk_indexes import ChunkIndexes
+from dataflow.recording.chunks import Chunks, Column
+from dataflow.recording.contents import Contents, Entries
+from dataflow.recording.rawfile import RECORD, RawFile
+from dataflow.recording.seals import Seal, seal_of
+
+STEP = 4096
+"""Chunks whose messages are looked up together: what the messages of a long file take in memory meanwhile."""
+SAMPLED = 1024
+"""Chunks of a long file by which the sizes of its streams are estimated."""
+
+_NONE = Entries(*(np.empty(0, np.int64) for _ in range(3)))
+
+
+class MessageIndex(Protocol):
+    """The places of the messages of each channel."""
+
+    def count(self, channel: int) -> int:
+        """Messages of a channel."""
+
+    def span(self, channel: int) -> tuple[int, int] | None:
+        """The smallest and the largest log time (ns) of a channel; None where it has no message."""
+
+    def entries(self, channel: int) -> Entries:
+        """All messages of a channel."""
+
+    def blocks(self, channel: int, start: int | None, end: int | None) -> Iterator[Entries]:
+        """The messages of a channel in parts, all log times of one before those of the next: at least those with start
+        ≤ log time ≤ end."""
+
+    def in_file_order(
+        self, channels: Collection[int], start: int | None = None, end: int | None = None
+    ) -> Iterator[Mapping[int, Entries]]:
+        """The messages of some channels in parts that follow each other in the file: at least those with start ≤ log
+        time ≤ end."""
+
+    def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
+        """Messages by channel from which sizes are told, and the chunks that hold them (None: all)."""
+
+
+class LoadedIndex:
+    """The messages in memory, 24 bytes each."""
+
+    def __init__(self, entries: Mapping[int, Entries]) -> None:
+        self._entries = entries
+
+    def count(self, channel: int) -> int:
+        return len(self.entries(channel))
+
+    def span(self, channel: int) -> tuple[int, int] | None:
+        times = self.entries(channel).times
+        return (int(times.min()), int(times.max())) if len(times) else None
+
+    def entries(self, channel: int) -> Entries:
+        return self._entries.get(channel, _NONE)
+
+    def blocks(self, channel: int, start: int | None, end: int | None) -> Iterator[Entries]:
+        yield self.entries(channel)
+
+    def in_file_order(
+        self, channels: Collection[int], start: int | None = None, end: int | None = None
+    ) -> Iterator[Mapping[int, Entries]]:
+        yield {channel: self.entries(channel) for channel in channels}
+
+    def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
+        return self._entries, None
+
+
+class LongIndex:
+    """The messages of a file of very many chunks, whose message indexes are read as they are needed.
+
+    `counts`: messages by channel, where the file's statistics count them. What is damaged is then noted in `damage`.
+    """
+
+    def __init__(
+        self,
+        file: RawFile,
+        chunks: Chunks,
+        indexes: ChunkIndexes,
+        *,
+        sealed: bool,
+        counts: Mapping[int, int] | None,
+        damage: list[str],
+    ) -> None:
+        self._file, self._chunks, self._indexes = file, chunks, indexes
+        self._sealed, self._counts, self._damage = sealed, counts, damage
+        self._spans: dict[int, tuple[int, int] | None] = {}
+
+    def count(self, channel: int) -> int:
+        return self._counts.get(channel, 0) if self._counts is not None else len(self.entries(channel))
+
+    def span(self, channel: int) -> tuple[int, int] | None:
+        if channel not in self._spans:
+            self._spans[channel] = self._found_span(channel)
+        return self._spans[channel]
+
+    def _found_span(self, channel: int) -> tuple[int, int] | None:
+        first = self._least(channel, self._indexes.firsts, 1)
+        last = self._least(channel, self._indexes.lasts, -1)
+        return None if first is None or last is None else (first, -last)
+
+    def _least(self, channel: int, bounds: Column, sign: int) -> int | None:
+        """The least log time of a channel, times `sign`; `bounds`: by chunk the least that it can have."""
+        least: int | None = None
+        for numbers in self._indexes.holding([channel]):
+            can = sign * bounds[numbers]
+            order = np.argsort(can, kind="stable")
+            at, step = 0, 1
+            while at < len(order) and (least is None or can[order[at]] < least):
+                times = self._load(numbers[order[at : at + step]], [channel])[channel].times
+                if len(times):
+                    found = int((sign * times).min())
+                    least = found if least is None else min(least, found)
+                at, step = at + step, min(4 * step, STEP)
+        return least
+
+    def entries(self, channel: int) -> Entries:
+        return self._all.get(channel, _NONE)
+
+    @cached_property
+    def _all(self) -> Mapping[int, Entries]:
+        return self._load(np.arange(len(self._indexes)), np.unique(self._indexes.channels).tolist())
+
+    def blocks(self, channel: int, start: int | None, end: int | None) -> Iterator[Entries]:
+        firsts, held = self._indexes.firsts, _NONE
+        for numbers in self._by_time(channel, start, end):
+            before = held.times < firsts[numbers[0]]
+            if before.any():
+                yield held.where(before)
+                held = held.where(~before)
+            held = _joined(held, self._load(numbers, [channel])[channel])
+        yield held
+
+    def _by_time(self, channel: int, start: int | None, end: int | None) -> Iterator[Column]:
+        """The numbers of a channel's chunks in the order of their first times, `STEP` at a time."""
+        found = self._indexes.holding([channel], start, end)
+        if not self._ordered:
+            numbers = np.concatenate([np.empty(0, np.int64), *found])
+            found = iter([numbers[np.argsort(self._indexes.firsts[numbers], kind="stable")]])
+        for numbers in found:
+            for at in range(0, len(numbers), STEP):
+                yield numbers[at : at + STEP]
+
+    @cached_property
+    def _ordered(self) -> bool:
+        return self._indexes.ordered
+
+    def in_file_order(
+        self, channels: Collection[int], start: int | None = None, end: int | None = None
+    ) -> Iterator[Mapping[int, Entries]]:
+        for numbers in self._indexes.holding(list(channels), start, end):
+            for at in range(0, len(numbers), STEP):
+                yield self._load(numbers[at : at + STEP], channels)
+
+    def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
+        numbers = np.unique(np.linspace(0, len(self._indexes) - 1, SAMPLED).astype(np.int64))
+        return self._load(numbers, np.unique(self._indexes.channels).tolist()), numbers
+
+    def _load(self, numbers: Column, channels: Collection[int]) -> dict[int, Entries]:
+        """The messages of some channels in some chunks."""
+        wanted = frozenset(channels)
+        found = Contents(self._file, self._chunks)
+        for number in numbers.tolist():
+            take_messages(found, self._indexes, number, sealed=self._sealed, wanted=wanted)
+        self._damage += [note for note in found.damage if note not in self._damage]
+        loaded = found.entries()
+        return {channel: loaded.get(channel, _NONE) for channel in channels}
+
+
+def take_messages(
+    contents: Contents, indexes: ChunkIndexes, number: int, *, sealed: bool, wanted: frozenset[int] | None = None
+) -> None:
+    """Takes the messages of a chunk: by its message indexes, or where they are damaged by its content, with a note."""
+    at = int(indexes.starts[number]) + int(indexes.lengths[number])
+    bodies = _message_indexes(contents.file, at, indexes, number, sealed, wanted)
+    if bodies is None or not contents.add_indexes(number, bodies):
+        contents.take_chunk(number)
+        contents.damage.append(
+            f"the message index at byte {at} is damaged; {contents.chunks.where(number)} was read instead"
+        )
+
+
+def _message_indexes(
+    file: RawFile, start: int, indexes: ChunkIndexes, number: int, sealed: bool, wanted: frozenset[int] | None
+) -> list[bytes] | None:
+    """The bodies of the message indexes behind a chunk, all or those of `wanted` channels; None where they are not what
+    the chunk index says."""
+    data = file.read(start, int(indexes.index_lengths[number]))
+    bodies: list[bytes] = []
+    found: list[int] = []
+    position = 0
+    while position + RECORD.size + 2 <= len(data):
+        opcode, length = RECORD.unpack_from(data, position)
+        end = position + RECORD.size + length
+        if opcode != Opcode.MESSAGE_INDEX or end > len(data):
+            return None
+        channel = int.from_bytes(data[position + RECORD.size : position + RECORD.size + 2], "little")
+        found.append(channel)
+        if wanted is None or channel in wanted:
+            if sealed and seal_of(data[position:end]) is not Seal.SOUND:
+                return None
+            bodies.append(data[position + RECORD.size : end])
+        position = end
+    return bodies if position == len(data) and sorted(found) == sorted(indexes.channels_of(number)) else None
+
+
+def _joined(a: Entries, b: Entries) -> Entries:
+    if not len(a):
+        return b
+    return Entries(*(np.concatenate(pair) for pair in zip(a.columns, b.columns, strict=True)))

@@ -1,0 +1,154 @@
+"""Tries culprits again as the recorded run had them: what ran in a process apart is re-executed apart.
+
+Operators of one process share modules, settings of libraries and the memory of messages. A worker puts operators
+together that may never have shared a process, so no operator is a culprit for what it makes there alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from dataflow.records.comparison import Verification
+from dataflow.supervision.report import RunFailed
+
+Answer = Mapping[str, Any]
+"""The answer of `part.verify_part`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Operators to be re-executed in one process, until each of those `asked` has differed, or to their end.
+
+    `wired`: they are given what they make themselves, as in the run, not what was recorded of it.
+    """
+
+    operators: frozenset[str]
+    asked: tuple[str, ...] = ()
+    wired: bool = False
+
+
+Try = Callable[[Sequence[Trial]], Sequence[Answer]]
+
+
+@dataclass(frozen=True, slots=True)
+class Retrial:
+    """The outcome for culprits that were tried again.
+
+    `repeated` tells whether they differed alike both times, in the process that they had. `instead` are the answers
+    that count for operators rather than those of the first trial. `shared` names, by operator that makes what was
+    recorded, those that share its process where it does not, or where alone it does. `wrote`: the messages that
+    operators wrote into, by operator.
+    """
+
+    repeated: dict[str, bool] = field(default_factory=dict)
+    instead: dict[str, Answer] = field(default_factory=dict)
+    shared: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    wrote: dict[str, str] = field(default_factory=dict)
+
+
+def retry(
+    culprits: Iterable[str], of: Mapping[str, Answer], mates: Mapping[str, frozenset[str]], attempt: Try
+) -> Retrial:
+    """Tries `culprits` again. `of`: the answer by which each is one; `mates`: the operators of its recorded process."""
+    outcome = Retrial()
+    first = {name: _first(of[name], name) for name in culprits}
+    told = _try(outcome, _grouped(first, mates), attempt)
+    alike = [name for name in told if _first(told[name], name) == first[name]]
+    outcome.repeated.update(dict.fromkeys(alike, True))
+    _acquit_in_company(outcome, [name for name in alike if len(mates[name]) > 1], of, mates, attempt)
+    apart = {name: answer for name, answer in told.items() if name not in alike}
+    outcome.repeated.update(dict.fromkeys(apart, False))
+    others = {name: answer for name, answer in apart.items() if _others(of[name], answer)}
+    _acquit_apart(outcome, {n: a for n, a in others.items() if _first(a, n) is None}, of, attempt)
+    _confirm(outcome, {n: a for n, a in others.items() if _first(a, n) is not None}, mates, attempt)
+    return outcome
+
+
+def _acquit_apart(outcome: Retrial, suspects: Mapping[str, Answer], of: Mapping[str, Answer], attempt: Try) -> None:
+    """Acquits operators that make what was recorded in the process that they had, if beside those of the first trial
+    they differ again, and alike."""
+    beside = _grouped(suspects, {name: frozenset(of[name]["operators"]) for name in suspects})
+    for name, answer in _try(outcome, beside, attempt).items():
+        if _first(answer, name) == _first(of[name], name):
+            del outcome.repeated[name]
+            outcome.instead[name] = suspects[name]
+            outcome.shared[name] = _others(of[name], suspects[name])
+
+
+def _acquit_in_company(
+    outcome: Retrial,
+    suspects: Iterable[str],
+    of: Mapping[str, Answer],
+    mates: Mapping[str, frozenset[str]],
+    attempt: Try,
+) -> None:
+    """Acquits operators that had company if they make what was recorded alone, or given what that company makes."""
+    for name in suspects:
+        for trial in Trial(frozenset({name}), (name,)), Trial(mates[name], (name,), wired=True):
+            try:
+                answer = _try(outcome, [trial], attempt)[name]
+            except RunFailed as failure:
+                if failure.interrupted:
+                    raise
+                continue  # it needs the company that it had
+            found = Verification.from_wire(answer["operators"][name])
+            if found.first is None and found.tainted is None and found.whole:
+                del outcome.repeated[name]
+                outcome.instead[name] = answer
+                outcome.shared[name] = _others(of[name], answer) or tuple(sorted(mates[name] - {name}))
+                break
+
+
+def _confirm(
+    outcome: Retrial, suspects: Mapping[str, Answer], mates: Mapping[str, frozenset[str]], attempt: Try
+) -> None:
+    """Takes the differences of operators in the process that they had for theirs, if they differ alike once more."""
+    trials = [Trial(operators) for operators in dict.fromkeys(mates[name] for name in suspects)]
+    for trial, answer in zip(trials, attempt(trials) if trials else (), strict=True):
+        for name in trial.operators & suspects.keys():
+            if _first(answer, name) == _first(suspects[name], name):
+                outcome.repeated[name] = True
+                outcome.instead[name] = answer
+
+
+def _grouped(names: Iterable[str], mates: Mapping[str, frozenset[str]]) -> list[Trial]:
+    """One trial for all that share a process."""
+    groups: dict[frozenset[str], list[str]] = {}
+    for name in names:
+        groups.setdefault(mates[name], []).append(name)
+    return [Trial(operators, tuple(asked)) for operators, asked in groups.items()]
+
+
+def _try(outcome: Retrial, trials: Sequence[Trial], attempt: Try) -> dict[str, Answer]:
+    """The answer for each operator that is asked for."""
+    told: dict[str, Answer] = {}
+    for trial, answer in zip(trials, attempt(trials) if trials else (), strict=True):
+        outcome.wrote.update(_wrote(answer))
+        told |= dict.fromkeys(trial.asked, answer)
+    return told
+
+
+def _others(answer: Answer, than: Answer) -> tuple[str, ...]:
+    """Returns the operators of an answer that are not in another one."""
+    return tuple(name for name in answer["operators"] if name not in than["operators"])
+
+
+def _wrote(answer: Answer) -> dict[str, str]:
+    return {name: values["wrote"] for name, values in answer["operators"].items() if values["wrote"]}
+
+
+def _first(answer: Answer, name: str) -> Any:
+    """The first difference of an operator in an answer: where and what; None where there is none."""
+    first = answer["operators"][name]["first"]
+    return None if first is None else (first["incarnation"], first["index"], first["got"])
+
+
+def mates_of(placed: Mapping[str, str], operators: Collection[str]) -> dict[str, frozenset[str]]:
+    """By operator, those of `operators` that shared its process, itself included. `placed`: their processes' labels;
+    one of which that is not known was alone."""
+    return {
+        name: frozenset({name, *(o for o in operators if name in placed and placed.get(o) == placed[name])})
+        for name in operators
+    }

@@ -1,1 +1,0 @@
-"""Classes of small things, by close-ups in the image's own resolution."""

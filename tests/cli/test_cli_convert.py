@@ -1,0 +1,249 @@
+"""Every format and option of `dataflow convert` once, and what each command says of a source that is not whole."""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from made_bags import SECOND, header, imus, ros, transform, write_ros2, xyz, xyzw
+from typer import Context
+from typer.main import get_command
+
+from dataflow.cli.convert import Format, convert
+from dataflow.cli.main import app
+from dataflow.recording import Recording
+
+START = 1_700_000_000 * SECOND
+STAMPS = [START + i * SECOND // 10 for i in range(12)]
+K = np.array([20.0, 0, 4, 0, 20, 3, 0, 0, 1])
+
+
+def picture(stamp: int, encoding: str, pixels: np.ndarray, frame: str) -> Any:
+    height, width = pixels.shape[:2]
+    sizes = {"width": width, "height": height, "step": pixels.nbytes // height, "encoding": encoding}
+    return ros("sensor_msgs/Image", header=header(stamp, frame), data=pixels.reshape(-1).view(np.uint8), **sizes)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Colour, depth, calibrations, poses, inertial readings, clouds and transforms of one robot."""
+    rows: list[Any] = []
+    fields = [ros("sensor_msgs/PointField", name=n, offset=4 * k, datatype=7, count=1) for k, n in enumerate("xyz")]
+    for stamp in STAMPS:
+        color, depth = np.zeros((6, 8, 3), np.uint8), np.full((6, 8), 2000, np.uint16)
+        here = ros("geometry_msgs/Pose", position=xyz(1, 2, 3, "Point"), orientation=xyzw(0, 0, 0, 1))
+        points = np.ones((5, 3), np.float32)
+        layout = {"width": 5, "height": 1, "point_step": 12, "row_step": 60, "fields": fields}
+        cloud = ros("sensor_msgs/PointCloud2", header=header(stamp, "lidar"), data=points.view(np.uint8).reshape(-1),
+                    **layout)  # fmt: skip
+        rows += [
+            ("/color", stamp, picture(stamp, "rgb8", color, "camera")),
+            ("/depth", stamp, picture(stamp, "16UC1", depth, "camera")),
+            ("/info", stamp, ros("sensor_msgs/CameraInfo", header=header(stamp, "camera"), width=8, height=6, k=K)),
+            ("/pose", stamp, ros("geometry_msgs/PoseStamped", header=header(stamp, "map"), pose=here)),
+            ("/points", stamp, cloud),
+            ("/imu", stamp, ros("sensor_msgs/Imu", header=header(stamp, "imu"), linear_acceleration=xyz(0, 0, 9.8))),
+        ]
+    rows.append(("/tf_static", START, ros("tf2_msgs/TFMessage", transforms=[transform(START, "lidar", "camera")])))
+    return write_ros2(tmp_path_factory.mktemp("bags") / "drive", rows)
+
+
+SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
+NEEDS = {"parquet": "pyarrow", "lerobot": "pyarrow", "lerobot-v3": "pyarrow"}
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["bag", "recording"])
+@pytest.mark.parametrize("format_", get_args(Format))
+def test_every_format_is_written_from_the_command_line(
+    dataflow, drive: Path, tmp_path: Path, format_: str, own: bool
+) -> None:
+    if format_ in NEEDS:
+        pytest.importorskip(NEEDS[format_])
+    source = drive
+    if own:
+        source = tmp_path / "own.mcap"
+        dataflow("convert", drive, source, "--to", "mcap")
+    target = tmp_path / f"out{SUFFIXES.get(format_, '')}"
+
+    told = json.loads(dataflow("convert", source, target, "--to", format_, "--json").stdout)
+
+    assert target.exists()
+    assert told["files"]
+    assert all(Path(file).exists() for file in told["files"])
+    assert set(told["source"]) == {"notes", "missing", "repaired", "unread", "lost", "static"}
+
+
+OPTIONS = {
+    "--out": ("--to", "csv", "--out", "OUT"),
+    "--to": ("OUT", "--to", "7scenes"),
+    "--stream": ("OUT", "--to", "csv", "--stream", "/imu"),
+    "--without": ("OUT", "--to", "csv", "--without", "/p*"),
+    "--start": ("OUT", "--to", "csv", "--start", "0.5"),
+    "--end": ("OUT", "--to", "csv", "--end", "0.5"),
+    "--clock": ("OUT", "--to", "csv", "--clock", "log"),
+    "--action": ("OUT", "--to", "lerobot", "--action", "/pose"),
+    "--task": ("OUT", "--to", "lerobot", "--task", "look"),
+    "--depth": ("OUT", "--to", "csv", "--depth", "/depth"),
+    "--lossy": ("OUT", "--to", "kitti-raw", "--lossy"),
+    "--strict": ("OUT", "--to", "csv", "--strict"),
+    "--overwrite": ("OUT.mcap", "--to", "mcap", "--overwrite"),
+    "--quiet": ("OUT", "--to", "tum", "--quiet"),
+    "--json": ("OUT", "--to", "euroc", "--json"),
+}
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_every_option_works_from_the_command_line(dataflow, drive: Path, tmp_path: Path, option: str) -> None:
+    if "lerobot" in OPTIONS[option]:
+        pytest.importorskip("pyarrow")
+    words = [str(tmp_path / word) if word.startswith("OUT") else word for word in OPTIONS[option]]
+
+    dataflow("convert", drive, *words)
+
+    assert any(tmp_path.iterdir())
+
+
+def test_every_option_of_the_help_is_among_those_tried() -> None:
+    group = get_command(app)
+    command = group.get_command(Context(group), "convert")  # type: ignore[attr-defined]
+    offered = {option for p in command.params for option in p.opts if option.startswith("--") and option != "--help"}
+    described = set(re.findall(r"--to ([\w-]+)", convert.__doc__ or ""))
+
+    assert offered == set(OPTIONS)
+    assert described == set(get_args(Format))
+
+
+# --------------------------------------------------------------------------------------------- what is said
+
+
+@pytest.fixture(scope="module")
+def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording without its end, of which one chunk is whole."""
+    folder = tmp_path_factory.mktemp("torn")
+    with Path(folder / "whole.mcap").open("wb") as file:
+        from mcap.writer import Writer
+
+        from dataflow.interop.typestores import RosType
+        from dataflow.recording.codecs import SchemaText
+
+        kind = RosType("sensor_msgs/msg/Imu", "cdr", SchemaText("sensor_msgs/msg/Imu", "", b"")).as_ros2()
+        writer = Writer(file, chunk_size=4000)
+        writer.start(profile="ros2", library="test")
+        channel = writer.register_channel("/imu", "cdr", writer.register_schema(kind.name, kind.encoding, kind.data))
+        from made_bags import ROS2
+
+        for _, time, message in imus([START + k * SECOND // 100 for k in range(50)]):
+            writer.add_message(channel, time, bytes(ROS2.serialize_cdr(message, kind.name)), time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    data = (folder / "whole.mcap").read_bytes()
+    path = folder / "torn.mcap"
+    path.write_bytes(data[: int(len(data) * 0.6)])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("info", "{}"), 0),
+        (("lint", "{}"), 1),
+        (("convert", "{}", "{}.out.mcap", "--to", "mcap", "--overwrite"), 0),
+        (("convert", "{}", "{}.csv", "--to", "csv"), 0),
+        (("convert", "{}", "{}.ros2", "--to", "ros2"), 0),
+        (("cut", "{}", "--duration", "1s", "-o", "{}.cut.mcap", "--overwrite"), 0),
+        (("filter", "{}", "--stream", "/imu", "-o", "{}.filter.mcap", "--overwrite"), 0),
+        (("split", "{}", "--every", "100ms", "-o", "{}.split"), 0),
+        (("diff", "{}", "{}"), 0),
+        (("recover", "{}", "-o", "{}.saved.mcap", "--overwrite"), 1),
+    ],
+    ids=lambda words: words[0] if isinstance(words, tuple) else "",
+)
+def test_every_command_says_that_a_recording_has_no_end(
+    dataflow, torn: Path, tmp_path: Path, words: tuple[str, ...], code: int
+) -> None:
+    place = tmp_path / "torn.mcap"
+    place.write_bytes(torn.read_bytes())
+
+    told = dataflow(*(word.format(place) for word in words), code=code)
+
+    assert "no proper end" in " ".join((told.stdout + told.stderr).split())
+
+
+def test_a_recording_of_which_nothing_can_be_read_is_refused_with_the_reason(
+    dataflow, torn: Path, tmp_path: Path
+) -> None:
+    short = tmp_path / "short.mcap"
+    short.write_bytes(torn.read_bytes()[:100])
+
+    told = dataflow("convert", short, tmp_path / "o.mcap", "--to", "mcap", code=2).stderr
+
+    assert "holds no message that can be read" in told
+    assert "dataflow recover" in told
+    assert not (tmp_path / "o.mcap").exists()
+
+
+def test_fewer_messages_than_promised_fail_the_command_and_are_said(dataflow, tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
+    with sqlite3.connect(folder / "bag.db3") as database:
+        database.execute("delete from messages where id > 4")
+    database.close()
+
+    told = dataflow("convert", folder, tmp_path / "o.mcap", "--to", "mcap", code=1)
+    as_json = dataflow("convert", folder, tmp_path / "p.mcap", "--to", "mcap", "--json", code=1).stdout
+
+    assert "12 messages are promised, 4 are there" in told.stderr
+    assert json.loads(as_json)["source"]["missing"]
+    assert "12 messages are promised" in dataflow("lint", folder, code=1).stdout
+    assert "12 messages are promised" in dataflow("info", folder).stdout
+    with Recording(tmp_path / "o.mcap") as recording:
+        assert recording.streams["imu"].count == 4
+
+
+def test_repairs_are_said_and_stand_in_the_metadata(dataflow, tmp_path: Path) -> None:
+    rows = [("/imu", s, ros("sensor_msgs/Imu", header=header(STAMPS[i // 2]))) for i, s in enumerate(STAMPS)]
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    told = dataflow("convert", bag, tmp_path / "o.mcap", "--to", "mcap").stderr
+
+    assert "imu: 6 messages recorded twice, once left out" in told
+    assert '"repeated": 6' in dataflow("info", tmp_path / "o.mcap", "--metadata").stdout
+
+
+def test_depth_that_a_dataset_cannot_hold_is_counted_and_never_wraps(dataflow, tmp_path: Path) -> None:
+    import cv2
+
+    depth = np.full((6, 8), 2.0, np.float32)
+    depth[0], depth[1], depth[2, 0] = -1.0, 20.0, np.nan
+    rows: list[Any] = [("/depth", s, picture(s, "32FC1", depth, "camera")) for s in STAMPS[:2]]
+    rows += [("/color", s, picture(s, "rgb8", np.zeros((6, 8, 3), np.uint8), "camera")) for s in STAMPS[:2]]
+    bag = write_ros2(tmp_path / "bag", sorted(rows, key=lambda row: row[1]))
+
+    told = dataflow("convert", bag, tmp_path / "tum", "--to", "tum").stderr
+
+    written = cv2.imread(str(next((tmp_path / "tum" / "depth").iterdir())), cv2.IMREAD_UNCHANGED)
+    assert sorted(set(written.reshape(-1).tolist())) == [0, 10_000]
+    assert "negative depth (pixels), written as no return (16)" in told
+    assert "depth beyond 13.1 m (pixels), written as no return (16)" in told
+
+
+def test_narrowing_is_refused_until_it_is_asked_for(dataflow, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    rows = [("/warm", s, picture(s, "mono16", np.full((6, 8), 7000, np.uint16), "camera")) for s in STAMPS]
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    refused = dataflow("convert", bag, tmp_path / "l", "--to", "lerobot", code=2).stderr
+    dataflow("convert", bag, tmp_path / "l", "--to", "lerobot", "--lossy")
+
+    assert "16 bits, and LeRobot's images have 8; --lossy writes it all the same" in refused
+
+
+def test_the_types_of_messages_are_listed_and_described(dataflow) -> None:
+    assert "Odometry" in dataflow("messages").stdout
+    described = json.loads(dataflow("messages", "Imu", "--json").stdout)
+    assert {"name": "angular_velocity", "unit": "rad/s"}.items() <= {k: described["fields"][3][k] for k in ("name", "unit")}.items()  # fmt: skip  # noqa: E501
+    assert described["ros"] == ["sensor_msgs/Imu"]
+    assert "there is no message type 'Odo'; there are Odometry" in dataflow("messages", "Odo", code=2).stderr

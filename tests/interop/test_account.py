@@ -1,0 +1,243 @@
+"""The account of a bag: messages passed over, fields without a place, repairs, static transforms that change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_bags import ROS2, SECOND, header, imus, ros, transform, write_ros2, xyz
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import get_types_from_msg
+
+from dataflow.interop.bag import BagError
+from dataflow.interop.export.material import Material
+from dataflow.interop.export.own import export_own
+from dataflow.interop.export.report import Exported
+from dataflow.interop.export.ros2 import export_ros2
+from dataflow.interop.opening import open_bag
+from dataflow.interop.playing import Wishes, readable
+from dataflow.interop.seen import Seen
+from dataflow.interop.streams import BagStreams, Played
+from dataflow.messages import Image, Image16, Measurement, Number, PointCloud, RangeReading
+from dataflow.recording import Recording, RecordingWriter
+from dataflow.recording.layout import BAG
+
+STAMPS = [1_700_000_000 * SECOND + i * SECOND // 100 for i in range(6)]
+
+
+def image(stamp: int, encoding: str, data: bytes, width: int, height: int, step: int) -> Any:
+    return ros(
+        "sensor_msgs/Image",
+        header=header(stamp, "camera"),
+        width=width,
+        height=height,
+        encoding=encoding,
+        step=step,
+        data=np.frombuffer(data, np.uint8),
+    )
+
+
+def converted(bag: Path, file: Path, **options: Any) -> Material:
+    with Material(bag, **options) as material:
+        export_own(material, file, Exported())
+        return material
+
+
+def read(file: Path, stream: str) -> list[Any]:
+    with Recording(file) as recording:
+        return [m.message for m in recording.messages([stream])]
+
+
+@pytest.mark.parametrize("bad", [0, 3, 5])
+def test_one_message_that_cannot_be_read_is_passed_over_and_counted(tmp_path: Path, bad: int) -> None:
+    rows = [
+        ("/img", s, image(s, "rgb8", b"", 0, 0, 0) if i == bad else image(s, "rgb8", bytes(48), 4, 4, 12))
+        for i, s in enumerate(STAMPS)
+    ]
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    material = converted(bag, tmp_path / "o.mcap")
+
+    assert [m.stamp for m in read(tmp_path / "o.mcap", "img")] == [s for i, s in enumerate(STAMPS) if i != bad]
+    assert material.account.unread["/img"].count == 1
+    with Recording(tmp_path / "o.mcap") as recording:
+        assert [m.seq for m in recording.messages(["img"])] == [0, 1, 2, 3, 4]
+        assert '"messages": 1' in recording.metadata[BAG]["unread"]
+
+
+def test_strict_refuses_a_message_that_cannot_be_read_and_names_it(tmp_path: Path) -> None:
+    rows = [("/img", s, image(s, "rgb8", bytes(48) if i else b"", 4 * bool(i), 4 * bool(i), 12 * bool(i)))
+            for i, s in enumerate(STAMPS)]  # fmt: skip
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    with pytest.raises(BagError, match="'/img', message 0"):
+        converted(bag, tmp_path / "o.mcap", wishes=Wishes(strict=True))
+
+
+def test_a_message_that_is_cut_off_is_counted_while_times_are_looked_for(tmp_path: Path) -> None:
+    with Writer2(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=ROS2)
+        for i, (_, time, message) in enumerate(imus(STAMPS)):
+            data = ROS2.serialize_cdr(message, "sensor_msgs/msg/Imu")
+            writer.write(connection, time, bytes(data)[: 6 if i == 2 else None])
+
+    with BagStreams(tmp_path / "bag", {"imu": Played("/imu", "Imu")}) as streams:
+        assert len(list(streams.messages())) == 5
+        assert streams.account.unread["/imu"].count == 1
+
+
+def test_what_a_type_has_no_place_for_is_named_with_its_number(tmp_path: Path) -> None:
+    scan = {"ranges": np.ones(5, np.float32), "angle_increment": 0.1, "range_max": 9.0}
+    rows = [
+        ("/scan", s, ros("sensor_msgs/LaserScan", header=header(s, "laser"), scan_time=0.1 * (i > 2), **scan))
+        for i, s in enumerate(STAMPS)
+    ]
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    account = converted(bag, tmp_path / "o.mcap").account
+
+    assert account.lost["/scan"] == {"scan_time": 3}
+    assert "/scan: no place for scan_time (in 3 messages)" in account.lines()
+
+
+def test_a_field_that_a_newer_definition_has_more_is_named_and_the_rest_is_read(tmp_path: Path) -> None:
+    text = "std_msgs/Header header\ngeometry_msgs/Vector3 vector_more\nfloat64 temperature\nfloat64 variance\n"
+    types = get_types_from_msg(text, "sensor_msgs/msg/Temperature")
+    store = type(ROS2)()
+    store.fielddefs, store.types = dict(ROS2.fielddefs), dict(ROS2.types)
+    del store.fielddefs["sensor_msgs/msg/Temperature"], store.types["sensor_msgs/msg/Temperature"]
+    store.register(types)
+    kind = "sensor_msgs/msg/Temperature"
+    message = store.types[kind](header=header(STAMPS[0], "t"), vector_more=xyz(1, 2, 3), temperature=21.5, variance=0.5)
+    with Writer2(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/t", kind, typestore=store)
+        writer.write(connection, STAMPS[0], store.serialize_cdr(message, kind))
+
+    account = converted(tmp_path / "bag", tmp_path / "o.mcap").account
+
+    (found,) = read(tmp_path / "o.mcap", "t")
+    assert (found.value, found.unit, found.variance, found.frame) == (21.5, "°C", 0.5, "t")
+    assert set(account.lost["/t"]) == {"vector_more.x", "vector_more.y", "vector_more.z"}
+
+
+def test_fields_that_were_read_or_hold_nothing_are_not_named() -> None:
+    seen = Seen(ros("sensor_msgs/Range", header=header(5, "sonar"), range=1.5, max_range=4.0))
+
+    assert seen.range == 1.5
+    assert seen.unread() == ("max_range",)
+    assert seen.max_range == 4.0
+    assert "max_range" not in seen.unread()
+
+
+def test_16_bits_ranges_and_measurements_keep_what_they_hold_there_and_back(tmp_path: Path) -> None:
+    warm = (7000 + np.arange(24, dtype=np.uint16)).reshape(4, 6)
+    wide = np.array([[500_000.01, 5_000_000.02, 3.0], [500_000.02, 5_000_000.03, 4.0]])
+    cells = np.zeros(4, np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")]))
+    for axis, values in zip("xyz", np.vstack([wide, wide]).T, strict=True):
+        cells[axis] = values
+    fields = [ros("sensor_msgs/PointField", name=n, offset=8 * k, datatype=8, count=1) for k, n in enumerate("xyz")]
+    at = header(STAMPS[0], "sensor")
+    rows = [
+        ("/thermal", STAMPS[0], image(STAMPS[0], "mono16", warm.tobytes(), 6, 4, 12)),
+        ("/sonar", STAMPS[0], ros("sensor_msgs/Range", header=at, radiation_type=1, field_of_view=0.2, min_range=0.1,
+                                  max_range=4.0, range=1.5)),
+        ("/p", STAMPS[0], ros("sensor_msgs/FluidPressure", header=at, fluid_pressure=101325.0, variance=4.0)),
+        ("/cloud", STAMPS[0], ros("sensor_msgs/PointCloud2", header=at, width=2, height=2, fields=fields,
+                                  point_step=24, row_step=48, data=np.frombuffer(cells.tobytes(), np.uint8))),
+    ]  # fmt: skip
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    account = converted(bag, tmp_path / "o.mcap").account
+    with Material(tmp_path / "o.mcap") as material:
+        export_ros2(material, tmp_path / "back", Exported())
+    again = converted(tmp_path / "back", tmp_path / "again.mcap").account
+
+    assert not account.lost
+    assert not again.lost
+    (thermal,), (sonar,), (pressure,), (cloud,) = (read(tmp_path / "again.mcap", s) for s in ("thermal", "sonar", "p", "cloud"))  # fmt: skip  # noqa: E501
+    assert isinstance(thermal, Image16)
+    assert isinstance(cloud, PointCloud)
+    np.testing.assert_array_equal(thermal.data, warm)
+    assert sonar == RangeReading(stamp=STAMPS[0], frame="sensor", range=1.5, range_min=sonar.range_min, range_max=4.0,
+                                 field_of_view=sonar.field_of_view, radiation="infrared")  # fmt: skip
+    assert pressure == Measurement(stamp=STAMPS[0], frame="sensor", value=101325.0, unit="Pa", variance=4.0)
+    assert cloud.columns == 2
+    np.testing.assert_array_equal(cloud.precise, np.vstack([wide, wide]))
+
+
+def test_16_bit_images_are_8_bits_or_depth_where_that_is_asked_for(tmp_path: Path) -> None:
+    deep = np.full((4, 6), 1234, np.uint16)
+    bag = write_ros2(tmp_path / "bag", [("/d", s, image(s, "mono16", deep.tobytes(), 6, 4, 12)) for s in STAMPS])
+
+    converted(bag, tmp_path / "lossy.mcap", wishes=Wishes(lossy=True))
+    converted(bag, tmp_path / "depth.mcap", wishes=Wishes(depth=("/d",)))
+
+    assert type(read(tmp_path / "lossy.mcap", "d")[0]) is Image
+    assert read(tmp_path / "depth.mcap", "d")[0].data[0, 0] == np.float32(1.234)
+
+
+def test_static_transforms_that_change_are_told(tmp_path: Path) -> None:
+    rows = [("/tf_static", STAMPS[i], ros("tf2_msgs/TFMessage", transforms=[transform(0, "base", "laser", x)]))
+            for i, x in ((0, 0.1), (2, 0.1), (4, 9.9))]  # fmt: skip
+    bag = write_ros2(tmp_path / "bag", [*rows, *imus(STAMPS)])
+
+    account = converted(bag, tmp_path / "o.mcap").account
+
+    assert "laser" in account.static["/tf_static"]
+
+
+def test_topics_keep_their_names_and_numbers_their_units_both_ways(tmp_path: Path) -> None:
+    rows = [(f"/vicon/{c}", s, transform(s, "world", c)) for s in STAMPS for c in "ab"]
+    bag = write_ros2(tmp_path / "bag", rows)
+    converted(bag, tmp_path / "o.mcap")
+    with RecordingWriter(tmp_path / "n.mcap", metadata={}) as writer:
+        writer.add_stream("speed", Number)
+        writer.write("speed", Number(stamp=STAMPS[0], value=3.0, unit="m/s"), seq=0)
+
+    for name in ("o", "n"):
+        with Material(tmp_path / f"{name}.mcap") as material:
+            export_ros2(material, tmp_path / name, Exported())
+    converted(tmp_path / "n", tmp_path / "again.mcap")
+
+    back = open_bag(tmp_path / "o")
+    assert {t.name: t.schema.name for t in back.topics.values()} == {
+        "/vicon/a": "geometry_msgs/msg/TransformStamped",
+        "/vicon/b": "geometry_msgs/msg/TransformStamped",
+    }
+    back.close()
+    assert read(tmp_path / "again.mcap", "speed")[0].unit == "m/s"
+
+
+def test_all_of_a_bag_in_simulated_time_is_on_one_clock(tmp_path: Path) -> None:
+    wall = STAMPS[0]
+    rows = [("/odom", wall + i * SECOND, ros("nav_msgs/Odometry", header=header((900 + i) * SECOND, "odom")))
+            for i in range(5)]  # fmt: skip
+    rows += [("/grip", wall + i * SECOND, ros("geometry_msgs/Polygon")) for i in range(5)]
+    bag = write_ros2(tmp_path / "bag", sorted(rows, key=lambda row: row[1]))
+
+    converted(bag, tmp_path / "o.mcap")
+
+    with Recording(tmp_path / "o.mcap") as recording:
+        times = [t for info in recording.streams.values() for t in (info.first, info.last) if t is not None]
+    assert max(times) - min(times) == 4 * SECOND
+    assert min(times) == 900 * SECOND
+
+
+def test_a_depth_topic_that_is_none_is_refused_with_what_it_is(tmp_path: Path) -> None:
+    bag = write_ros2(tmp_path / "bag", imus(STAMPS))
+    opened = open_bag(bag)
+
+    with pytest.raises(BagError, match="read as Imu, which cannot be depth"):
+        readable(opened, bag, wishes=Wishes(depth=("/imu",)))
+    opened.close()
+
+
+def test_numbers_beyond_a_double_are_counted(tmp_path: Path) -> None:
+    rows = [("/n", s, ros("std_msgs/Int64", data=2**62 + 1)) for s in STAMPS]
+
+    account = converted(write_ros2(tmp_path / "bag", rows), tmp_path / "o.mcap").account
+
+    assert account.lost["/n"] == {"digits beyond 53 bits": 6}

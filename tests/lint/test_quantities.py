@@ -1,0 +1,80 @@
+"""Values that cannot be: each is named with the unit that would make sense."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lint_material import MadeMaterial, every
+
+from dataflow.lint.look import lint
+from dataflow.messages import DepthImage, Imu, Message, NavSatFix, PointCloud
+
+
+def imu(stamp: int, acceleration: float = 9.81, rate: float = 0.1) -> Imu:
+    return Imu(stamp=stamp, frame="imu", angular_velocity=[0, 0, rate], linear_acceleration=[0, 0, acceleration])
+
+
+def depth(stamp: int, metres: float) -> DepthImage:
+    return DepthImage(stamp=stamp, frame="camera", data=np.full((4, 4), metres, np.float32))
+
+
+def cloud(stamp: int, sweep: float) -> PointCloud:
+    offsets = np.linspace(0, sweep, 5, dtype=np.float32)
+    return PointCloud(stamp=stamp, frame="lidar", points=np.zeros((5, 3)), time_offsets=offsets)
+
+
+def fix(stamp: int) -> NavSatFix:
+    return NavSatFix(stamp=stamp, frame="gps", latitude=0.0, longitude=0.0, altitude=0.0)
+
+
+STAMPS = every(0.1)
+
+
+@pytest.mark.parametrize(
+    ("messages", "told"),
+    [
+        ([imu(s, 1.0) for s in STAMPS], "in g, and m/s² is wanted"),
+        ([imu(s, 1000.0) for s in STAMPS], "in mg"),
+        ([imu(s, 0.0) for s in STAMPS], "it is taken out"),
+        ([imu(s, rate=40.0) for s in STAMPS], "in degrees"),
+        ([depth(s, -1.0) for s in STAMPS], "depths are negative"),
+        ([depth(s, 1500.0) for s in STAMPS], "in millimetres"),
+        ([cloud(s, 1e5) for s in STAMPS], "in µs that would be 0.1 s"),
+        ([fix(s) for s in STAMPS], "0° N 0° E"),
+    ],
+)
+def test_what_cannot_be_is_named_with_the_unit_that_makes_sense(messages: list[Message], told: str) -> None:
+    found = [f.text for f in lint(MadeMaterial({"a": messages})).findings if f.check == "quantity"]
+
+    assert len(found) == 1
+    assert told in found[0]
+
+
+def test_what_can_be_is_not_named() -> None:
+    sound = {
+        "imu": [imu(s) for s in STAMPS],
+        "depth": [depth(s, 2.0) for s in STAMPS],
+        "cloud": [cloud(s, 0.1) for s in STAMPS],
+    }
+
+    assert not [f for f in lint(MadeMaterial(sound)).findings if f.check in ("quantity", "clocks")]
+
+
+def test_streams_that_are_decades_apart_are_of_two_clocks() -> None:
+    now = 1_700_000_000 * 10**9
+    material = MadeMaterial(
+        {"a": [imu(now + s) for s in STAMPS], "b": [imu(now + s) for s in STAMPS], "c": [imu(s) for s in STAMPS]}
+    )
+
+    (found,) = [f for f in lint(material).findings if f.check == "clocks"]
+
+    assert (found.stream, found.severity) == ("c", "error")
+    assert "53.9 years earlier" in found.text
+
+
+def test_one_stamp_that_is_decades_off_is_named() -> None:
+    now = 1_700_000_000 * 10**9
+
+    found = lint(MadeMaterial({"a": [imu(0), *(imu(now + s) for s in STAMPS)]})).findings
+
+    assert any(f.check == "clocks" and "some are of another clock" in f.text for f in found)

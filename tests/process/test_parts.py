@@ -1,0 +1,227 @@
+"""The recorder of a run: parts that join into the whole again, a disk that is full for a while, and who may read."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from process_doubles import Disk
+
+from dataflow.editing.merge import merge
+from dataflow.graph import Graph, load_graph
+from dataflow.messages import FeatureVector
+from dataflow.process.parts import PartsSink
+from dataflow.recording import Recording, RecordingError
+from dataflow.recording.copying import Origin
+from dataflow.recording.parts import Splitting, Storage, parts_of
+from dataflow.records.firing import CALLS, encode_batch
+from dataflow.records.reading import FiringLog
+from dataflow.supervision.run import run
+from dataflow.verification.verify import verify
+
+RUNTIME = Path(__file__).resolve().parent.parent / "runtime"
+SECOND = 1_000_000_000
+GRAPH = """
+graph: parted
+namespace: test
+operators:
+  left: {use: runtime_operators:Counter, params: {count: 200, period: 50000000, ratio: 20, padding: 200}}
+  first: {use: runtime_operators:Tuned, inputs: {x: left/fast}}
+  second: {use: runtime_operators:Tuned, inputs: {x: first/y}, params: {factor: 0.5}}
+record: {snapshots: 1s}
+"""
+GO_ON = Storage(on_failure="go_on")
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory: pytest.TempPathFactory) -> Graph:
+    sys.path.append(str(RUNTIME))
+    path = tmp_path_factory.mktemp("parted") / "parted.yaml"
+    path.write_text(GRAPH)
+    return load_graph(path)
+
+
+@pytest.fixture(scope="module")
+def recorded(graph: Graph, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 10 s in one file."""
+    path = tmp_path_factory.mktemp("parted") / "run.mcap"
+    run(graph, placement="one_process", record=path)
+    return path
+
+
+class Given:
+    """A recorder that is given what another one was: records `late` seconds after their calls, a flush each second."""
+
+    def __init__(self, recorded: Path, graph: Graph, out: Path, storage: Storage, *, late: float = 0.25) -> None:
+        self.recorded, self.late = recorded, round(late * SECOND)
+        with Recording(recorded) as recording:
+            about = {n: dict(v) for n, v in recording.metadata.items() if n not in ("recording", "digests")}
+        options = {"metadata": about, "compression": "zstd", "overwrite": False, "storage": storage}
+        self.sink = PartsSink(out, graph, list(graph.record.streams), options)
+
+    def all(self, at: Callable[[float], None] = lambda _: None) -> dict[str, Any]:
+        """Gives everything; `at` is called with the seconds since the beginning before each message."""
+        sink, flushed = self.sink, 0
+        with Recording(self.recorded) as recording:
+            records = _records(recording)
+            record = next(records, None)
+            for found in recording.messages():
+                while record is not None and record.stamp < found.stamp - self.late:
+                    sink.firings(record.operator, [record], encode_batch([record]))
+                    record = next(records, None)
+                if found.stamp > SECOND:
+                    at(found.stamp / SECOND - 1)
+                sink.message(found.stream, found.message, found.seq, found.incarnation)
+                if found.stamp // SECOND > flushed:
+                    flushed = found.stamp // SECOND
+                    sink.flush()
+            while record is not None:
+                sink.firings(record.operator, [record], encode_batch([record]))
+                record = next(records, None)
+        return dict(sink.close("complete"))
+
+
+def _records(recording: Recording) -> Iterator[Any]:
+    log = FiringLog.read(recording)
+    return iter(sorted((r for name in log.operators for r in log.of(name)), key=lambda r: r.stamp))
+
+
+def joined(files: list[Path], out: Path) -> Path:
+    with ExitStack() as stack:
+        merge([stack.enter_context(Origin(file)) for file in files], out)
+    return out
+
+
+def verdicts(path: Path) -> dict[str, str]:
+    return {v.operator: v.verdict for v in verify(path, jobs=1).operators}
+
+
+IDENTICAL = {"first": "identical", "second": "identical"}
+
+
+@pytest.mark.parametrize(
+    "splitting", [Splitting(every=2 * SECOND), Splitting(size=20_000), Splitting(size=20_000, every=SECOND)]
+)
+def test_parts_are_verified_each_and_join_into_the_whole(
+    recorded: Path, graph: Graph, tmp_path: Path, splitting: Splitting
+) -> None:
+    facts = Given(recorded, graph, tmp_path / "run.mcap", Storage(splitting)).all()
+
+    parts = parts_of(tmp_path / "run.mcap")
+    assert len(parts) >= 4
+    assert facts["parts"] == [str(part) for part in parts]
+    assert "lost" not in facts
+    whole = joined(parts, tmp_path / "whole.mcap")
+    with Recording(recorded) as was, Recording(whole) as again:
+        assert again.digests() == was.digests()
+        assert facts["messages"] == sum(info.count for info in was.streams.values())
+    assert verdicts(whole) == IDENTICAL
+    assert not verify(whole, jobs=1).cut
+    for part in parts:
+        assert set(verdicts(part).values()) <= {"identical", "unverifiable"}, part
+
+
+def test_the_oldest_parts_are_deleted_and_the_rest_verifies(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    (tmp_path / "other_000.mcap").write_bytes(b"of another recording")
+    storage = Storage(Splitting(size=10_000), keep=40_000)
+    facts = Given(recorded, graph, tmp_path / "run.mcap", storage).all()
+
+    parts = parts_of(tmp_path / "run.mcap")
+    assert facts["deleted"] >= 3
+    assert facts["parts"] == [str(part) for part in parts]
+    assert sum(part.stat().st_size for part in parts) == facts["bytes"] <= 40_000
+    assert not (tmp_path / "run_000.mcap").exists()
+    assert (tmp_path / "other_000.mcap").exists()
+    rest = joined(parts, tmp_path / "rest.mcap")
+    report = verify(rest, jobs=1)
+    assert report.cut
+    assert not [v for v in report.operators if v.verdict == "culprit"]
+    assert sum(v.firings for v in report.operators) > 20
+
+
+def test_a_full_disk_is_outlived_and_what_is_lost_is_counted(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def at(seconds: float) -> None:
+        disk.full = 3 <= seconds < 6
+
+    facts = Given(recorded, graph, tmp_path / "run.mcap", GO_ON).all(at)
+
+    first, second = tmp_path / "run.mcap", tmp_path / "run_001.mcap"
+    assert facts["parts"] == [str(first), str(second)]
+    said = capsys.readouterr().out
+    assert "recording stops, the run goes on" in said
+    assert "No space left" in said
+    assert f"recording goes on in {second}" in said
+    whole = joined([first, second], tmp_path / "whole.mcap")
+    with Recording(recorded) as was, Recording(whole) as again, Recording(second) as part:
+        given = {name: info.count for name, info in was.streams.items()}
+        stored = {name: info.count for name, info in again.streams.items()}
+        assert [event.name for event in part.events()] == ["not_recorded"]
+    lost = facts["lost"]["streams"]
+    assert lost["test/left/fast"] > 50
+    assert {name: stored[name] + lost.get(name, 0) for name in given} == given
+    with Recording(recorded) as was, Recording(whole) as again:
+        before, after = (sum(record.kind in CALLS for record in _records(each)) for each in (was, again))
+    assert before - after == facts["lost"]["firings"] > 100
+    for path in (first, second, whole):
+        assert "culprit" not in verdicts(path).values()
+
+
+def test_a_disk_that_stays_full_leaves_a_readable_recording(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
+) -> None:
+    def at(seconds: float) -> None:
+        disk.full = seconds >= 3
+
+    facts = Given(recorded, graph, tmp_path / "run.mcap", GO_ON).all(at)
+
+    assert list(tmp_path.iterdir()) == [tmp_path / "run.mcap"]  # tries that failed leave nothing behind
+    assert facts["lost"]["spans"][0][1] is None
+    assert verdicts(tmp_path / "run.mcap") == IDENTICAL
+    with Recording(tmp_path / "run.mcap") as part:
+        assert part.streams["test/left/fast"].count == 40
+
+
+def test_a_full_disk_ends_what_is_to_end(recorded: Path, graph: Graph, tmp_path: Path, disk: Disk) -> None:
+    def at(seconds: float) -> None:
+        disk.full = seconds >= 3
+
+    with pytest.raises(RecordingError, match="No space left"):
+        Given(recorded, graph, tmp_path / "run.mcap", Storage(on_failure="end")).all(at)
+
+
+def test_one_message_that_is_refused_costs_that_message_alone(
+    recorded: Path, graph: Graph, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = Given(recorded, graph, tmp_path / "run.mcap", GO_ON)
+    with Recording(recorded) as recording:
+        found = next(iter(recording.messages(["test/left/fast"])))
+    before = FeatureVector(stamp=-5, vectors=np.zeros((1, 1), np.float32), model="test")
+    given.sink.message(found.stream, before, 0, 0)
+
+    facts = given.all()
+
+    assert "not recorded:" in capsys.readouterr().out
+    assert facts["lost"]["streams"] == {"test/left/fast": 1}
+    assert verdicts(tmp_path / "run.mcap") == IDENTICAL
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o644])
+def test_a_recording_is_readable_by_whom_it_is_meant_for(graph: Graph, tmp_path: Path, mode: int) -> None:
+    before = os.umask(0o000)
+    try:
+        storage = Storage(Splitting(every=SECOND), mode=mode)
+        options = {"metadata": {}, "compression": "zstd", "overwrite": False, "storage": storage}
+        PartsSink(tmp_path / "run.mcap", graph, list(graph.record.streams), options).close("complete")
+    finally:
+        os.umask(before)
+
+    (file,) = tmp_path.iterdir()
+    assert file.stat().st_mode & 0o777 == mode

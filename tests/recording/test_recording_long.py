@@ -1,0 +1,139 @@
+"""Recordings of very many chunks: their messages are looked up as they are needed, with the same result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.opcode import Opcode
+
+from dataflow.messages import Image, Pose
+from dataflow.recording import Recording, RecordingWriter, chunk_indexes, contents, message_index, summary
+
+
+def write(path: Path, pose: Callable[..., Pose]) -> None:
+    """Streams with and without a companion, a static one, one whose clock jumps back, firing records and events."""
+    with RecordingWriter(path, metadata={}, namespace="r", overwrite=True) as writer:
+        writer.add_stream("r/mount/out", Pose, static=True)
+        writer.write("r/mount/out", pose(5), seq=0)
+        for name, kind in (("r/camera/image", Image), ("r/pose/out", Pose), ("r/jump/out", Pose)):
+            writer.add_stream(name, kind)
+        for k in range(60):
+            stamp = 1000 + 10 * k
+            image = Image(stamp=stamp, frame="camera", data=np.full((3, 4), k, np.uint8))
+            writer.write("r/camera/image", image, seq=k)
+            writer.write("r/pose/out", pose(stamp - 3), seq=2 * k)
+            if k % 7:
+                writer.write("r/pose/out", pose(stamp + 2), seq=2 * k + 1)
+            writer.write("r/jump/out", pose(stamp - 400 * (k >= 30)), seq=k % 30, incarnation=k // 30)
+            writer.write_firings("pose", stamp, bytes([k]) * 9)
+            if k % 20 == 3:
+                writer.write_event("gap", stamp, {"from": k})
+            writer.flush()
+
+
+def content(path: Path) -> dict[str, Any]:
+    with Recording(path) as recording:
+        streams = recording.streams.values()
+        return {
+            "streams": [(i.name, i.count, i.first, i.last, i.static, i.incarnations) for i in streams],
+            "messages": [(m.stream, m.stamp, m.seq, m.incarnation, m.message.digest()) for m in recording.messages()],
+            "ranged": [(m.stream, m.stamp, m.seq) for m in recording.messages(start=1203, end=1377)],
+            "before": list(recording.messages(["r/pose/out"], end=3)),
+            "raw": [(r.stream, r.log_time, r.sequence, r.data) for r in recording.raw(start=1100, end=1480)],
+            "stamps": [list(recording.stamps(name, 1155, None)) for name in recording.streams],
+            "counts": [recording.counts(name) for name in recording.streams],
+            "firings": list(recording.firings()),
+            "events": list(recording.events()),
+            "indexed": [recording.index("r/pose/out", 1100, 1300).read(k).stamp for k in range(9)],
+            "damage": recording.damage,
+        }
+
+
+def index_behind(data: bytes, *, chunk: int) -> int:
+    """The place of the first message index behind a chunk."""
+    at, number = 8, -1
+    while number < chunk or data[at] == Opcode.CHUNK:
+        number += data[at] == Opcode.CHUNK
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    return at
+
+
+@pytest.fixture
+def path(tmp_path: Path, pose: Callable[..., Pose]) -> Path:
+    path = tmp_path / "a.mcap"
+    write(path, pose)
+    return path
+
+
+def long(monkeypatch: pytest.MonkeyPatch, step: int = 4) -> None:
+    """Has every recording be one of many chunks."""
+    monkeypatch.setattr(summary, "LONG", 0)
+    monkeypatch.setattr(message_index, "STEP", step)
+    monkeypatch.setattr(chunk_indexes, "SEGMENT", 7 * step)
+
+
+@pytest.mark.parametrize("step", [1, 4, 1000])
+def test_a_long_recording_reads_as_a_short_one(path: Path, step: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = content(path)
+    long(monkeypatch, step)
+    assert content(path) == expected
+
+
+def test_a_summary_is_read_in_blocks_of_any_size(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = content(path)
+    for size in (150, 300, 1000):  # less than some records take, and some of them
+        monkeypatch.setattr(summary, "BLOCK_BYTES", size)
+        assert content(path) == expected
+
+
+def test_the_number_of_chunks_is_not_limited(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit on records that are parsed counted them: nothing opened a recording of 262,145 chunks."""
+    monkeypatch.setattr(contents, "MAX_PARSED", 40)
+    expected = content(path)
+    torn = path.with_name("torn.mcap")
+    torn.write_bytes(path.read_bytes()[:-9])
+    with Recording(torn) as recording:
+        assert recording.torn
+        assert [m.stamp for m in recording.messages()] == [m[1] for m in expected["messages"]]
+
+
+def test_only_the_chunks_of_a_span_are_looked_up(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    long(monkeypatch)
+    taken: list[int] = []
+    real = message_index.take_messages
+
+    def noting(contents: Any, indexes: Any, number: int, **options: Any) -> None:
+        taken.append(number)
+        real(contents, indexes, number, **options)
+
+    with Recording(path) as recording:
+        monkeypatch.setattr(message_index, "take_messages", noting)
+        assert len(list(recording.messages(["r/camera/image"], 1200, 1240))) == 5
+    assert 5 <= len(set(taken)) < 40  # of 120; many reach over the span, as one stream lags by 400 ns
+
+
+def test_damaged_message_indexes_are_noted_when_they_are_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = content(path)
+    long(monkeypatch)
+    data = bytearray(path.read_bytes())
+    at = index_behind(data, chunk=40) + 20
+    data[at] ^= 1
+    path.write_bytes(data)
+    got = content(path)
+    assert any("is damaged; chunk 40" in note for note in got.pop("damage"))
+    expected.pop("damage")
+    assert got == expected
+
+
+def test_sizes_of_streams_are_estimated_from_some_chunks(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Recording(path) as recording:
+        exact = {name: info.bytes for name, info in recording.streams.items()}
+    long(monkeypatch)
+    monkeypatch.setattr(message_index, "SAMPLED", 30)
+    with Recording(path) as recording:
+        for name in ("r/camera/image", "r/jump/out"):
+            assert recording.streams[name].bytes == pytest.approx(exact[name], rel=0.05)

@@ -1,0 +1,97 @@
+"""A folder of the parts of a recording opens, seeks and reads as the recording that it was."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dataflow.editing.split import split
+from dataflow.interop.opening import is_foreign
+from dataflow.messages import Pose
+from dataflow.recording import Recording, RecordingError, RecordingWriter, describe
+from dataflow.recording.attachments import Attachment
+from dataflow.recording.copying import Origin
+from dataflow.recording.part_folder import parts_in
+from dataflow.records.reading import FiringLog, whole
+from dataflow.verification.gate import recordings_in
+
+KEPT = Path(__file__).resolve().parent.parent / "recordings_of" / "live.mcap"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The kept recording in parts, which hold firing records, and messages and static streams more than once."""
+    folder = tmp_path_factory.mktemp("split")
+    with pytest.MonkeyPatch.context() as patched, Origin(KEPT) as origin:
+        patched.syspath_prepend(str(KEPT.parent))
+        span = origin.span()
+        assert span is not None
+        list(split(origin, folder, every=(span[1] - span[0]) // 4))
+    assert len(parts_in(folder)) >= 4
+    return folder
+
+
+def test_parts_read_as_the_whole(folder: Path) -> None:
+    with Recording(KEPT) as expected, Recording(folder) as recording:
+        for name, info in expected.streams.items():
+            found = recording.streams[name]
+            assert (found.count, found.first, found.last, found.incarnations) == (
+                info.count,
+                info.first,
+                info.last,
+                info.incarnations,
+            ), name
+        assert recording.digests() == expected.digests()
+        names = [name for name, info in expected.streams.items() if not info.static and info.count]
+        first = min(info.first or 0 for name, info in expected.streams.items() if name in names)
+        last = max(info.last or 0 for name, info in expected.streams.items() if name in names)
+        for begin, end in ((first + (last - first) // 3, last - (last - first) // 3), (last - 10**8, None)):
+            assert [(m.stream, m.stamp, m.seq) for m in recording.messages(names, begin, end)] == [
+                (m.stream, m.stamp, m.seq) for m in expected.messages(names, begin, end)
+            ]
+        assert sorted(e.stamp for e in recording.events()) == sorted(e.stamp for e in expected.events())
+        assert "dataflow:cut" not in recording.metadata
+        assert describe(recording).bytes == sum(part.stat().st_size for part in parts_in(folder))
+
+
+def test_firing_records_of_parts_are_those_of_the_whole(folder: Path) -> None:
+    with Recording(KEPT) as expected, Recording(folder) as recording:
+        one, other = FiringLog.read(expected), FiringLog.read(recording)
+        for operator in one.operators:
+            assert whole(other.of(operator)) == whole(one.of(operator)), operator
+
+
+def test_a_folder_of_parts_is_one_recording_for_commands(folder: Path) -> None:
+    assert not is_foreign(folder)
+    assert recordings_in([folder]) == [(folder, folder.name)]
+
+
+def test_a_missing_part_is_named(folder: Path, tmp_path: Path) -> None:
+    there = tmp_path / "parts"
+    shutil.copytree(folder, there)
+    parts_in(there)[1].unlink()
+
+    with pytest.raises(RecordingError, match=r"the part after live_000\.mcap is missing: number 1"):
+        Recording(there)
+
+
+def test_parts_without_what_they_share_follow_each_other(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    """As a recorder makes them that begins a new file: times go on, and so do numbers and firing records."""
+    for part in range(3):
+        with RecordingWriter(tmp_path / f"a_{part:03}.mcap", metadata={"note": {"part": str(part)}}) as writer:
+            writer.add_stream("a", Pose)
+            writer.add_attachment(Attachment("file", "text/plain", 0, 0, b"the same"))
+            for k in range(4 * part, 4 * part + 4):
+                writer.write("a", pose(100 + k), seq=k)
+                writer.write_firings("op", 100 + k, bytes([k]))
+    with Recording(tmp_path) as recording:
+        assert [(m.stamp, m.seq) for m in recording.messages()] == [(100 + k, k) for k in range(12)]
+        assert [m.stamp for m in recording.messages(start=105, end=108)] == [105, 106, 107, 108]
+        assert list(recording.firings()) == [("op", bytes([k])) for k in range(12)]
+        assert [a.data for a in recording.attachments()] == [b"the same"]
+        assert recording.metadata["note"] == {"part": "2"}
+    (tmp_path / "b.mcap").write_bytes(b"")
+    assert parts_in(tmp_path) == []

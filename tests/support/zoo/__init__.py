@@ -1,0 +1,1 @@
+"""Hard operators, and the verdict that is right for each."""

@@ -1,0 +1,93 @@
+"""What ran apart is re-executed apart before anything is called a culprit, and what ran together, together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from dataflow.graph.load import load_text
+from dataflow.supervision.run import run
+from dataflow.verification.report import VerifyReport
+from dataflow.verification.verify import verify
+
+Placement = Literal["one_process", "process_each"]
+
+
+def recorded(path: Path, operators: str, placement: Placement = "process_each") -> Path:
+    """A run of operators (`name: Class`, and parameters) that all take the matrices of one source."""
+    lines = ["graph: test", "operators:", "  src: {use: 'sharing_operators:Matrices'}"]
+    for line in operators.splitlines():
+        name, _, rest = line.strip().partition(": ")
+        use, _, more = rest.partition(" ")
+        taken = "src/out" if "from" not in more else more.partition("from ")[2]
+        params = f"params: {more}" if more.startswith("{") else ""
+        fields = [f"use: 'sharing_operators:{use}'", f"inputs: {{x: {taken}}}", params]
+        lines.append(f"  {name}: {{{', '.join(filter(None, fields))}}}")
+    run(load_text("\n".join(lines)), placement=placement, record=path)
+    return path
+
+
+def verdicts(report: VerifyReport) -> dict[str, str]:
+    return {v.operator: v.verdict for v in report.operators}
+
+
+def test_operators_that_share_a_module_are_identical_when_they_ran_apart(tmp_path: Path) -> None:
+    report = verify(recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count"), jobs=1)
+
+    assert verdicts(report) == {"one": "identical", "two": "identical"}
+    assert report.identical
+    assert report.shared == {"one": ("two",), "two": ("one",)}
+    assert report.messages == 16
+
+
+def test_an_operator_is_no_culprit_for_what_another_one_sets_in_a_library(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", "strict: Strict\ndivide: Divide")
+
+    report = verify(path, jobs=1)
+
+    assert report.identical
+    assert report.shared == {"divide": ("strict",)}
+
+
+@pytest.mark.parametrize("placement", ["process_each", "one_process"])
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_the_writer_is_the_culprit_and_not_its_readers(tmp_path: Path, jobs: int, placement: Placement) -> None:
+    report = verify(recorded(tmp_path / "run.mcap", "solve: Solve\ndouble: Double", placement), jobs=jobs)
+
+    assert verdicts(report) == {"solve": "culprit", "double": "identical"}
+    [wrote] = [v.wrote for v in report.operators if v.operator == "solve"]
+    assert wrote == "its input 'x' (FeatureVector at stamp 1000000000)"
+
+
+def test_one_that_writes_only_later_is_named_where_a_reader_differs(tmp_path: Path) -> None:
+    report = verify(recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}\ndouble: Double"), jobs=1)
+
+    assert verdicts(report) == {"solve": "culprit", "double": "identical"}
+    assert report.shared == {"double": ("solve",)}
+
+
+def test_paranoid_names_it_where_nothing_reads_beside_it(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}")
+
+    assert verdicts(verify(path)) == {"solve": "identical"}
+    assert verdicts(verify(path, paranoid=True)) == {"solve": "culprit"}
+
+
+def test_a_reader_of_a_message_that_its_maker_changed_in_their_process_is_no_culprit(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", "keep: Keep\nlate: Late from keep/out", "one_process")
+
+    report = verify(path, jobs=1)
+
+    assert verdicts(report) == {"keep": "culprit", "late": "identical"}
+    assert report.shared == {"late": ("keep",)}
+
+
+def test_operators_that_shared_a_module_in_the_run_and_differ_apart_are_named_with_those_beside(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count", "one_process")
+
+    report = verify(path, only=["one"])
+
+    assert report.culprits == ("one",)
+    assert report.repeats("one")
