@@ -168,24 +168,24 @@ def ambiguous(worlds: list[str]) -> None:
 
 def measure() -> None:
     """CPU time of single updates with 1,000 particles, one thread, the look for another place included."""
-    from operators.localization.vote import Vote
+    from operators.localization.weighted_cloud import WeightedCloud
 
     static, streams = drive("office", 21, seconds=20, kidnaps=())
     times: dict[str, list[float]] = {}
-    hear, move = Vote.hear, Vote.move
+    update, move = WeightedCloud.update, WeightedCloud.move
 
     def timed(name: str, method: Any) -> Any:
         def call(self: Any, *arguments: Any) -> Any:
             began, injected = time.process_time(), self.injected
             result = method(self, *arguments)
-            kind = name if name == "move" else f"hear {type(arguments[2]).__name__}"
+            kind = name if name == "move" else f"update {type(arguments[2]).__name__}"
             kind += ", with injection" if self.injected > injected else ""
             times.setdefault(kind, []).append(1e3 * (time.process_time() - began))
             return result
 
         return call
 
-    Vote.hear, Vote.move = timed("hear", hear), timed("move", move)  # type: ignore[method-assign]
+    WeightedCloud.update, WeightedCloud.move = timed("update", update), timed("move", move)  # type: ignore[method-assign]
     localized(static, streams, SENSORS["both"], min_particles=1000, max_particles=1000, modality_particles=0)
     for kind, spans in sorted(times.items()):
         print(f"{kind}: median {np.median(spans):.2f} ms, 95 % {np.percentile(spans, 95):.2f} ms of {len(spans)}")

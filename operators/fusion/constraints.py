@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.fusion.filter_history import Sample, plain_sample, sample_of
 from operators.fusion.gate import GateConfig
 from operators.fusion.measurements import AngularRate, Model, Velocity
-from operators.fusion.nodes import Sample, plain_sample, sample_of
 from operators.fusion.sensor_settings import SensorSettings
 
 Array = NDArray[np.float64]

@@ -23,20 +23,20 @@ from dataflow.messages import (
     Twist,
 )
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
-from operators.fusion.beginning import Prior, coasting_node, prior_of
 from operators.fusion.constraints import Constraints
 from operators.fusion.control import Command
 from operators.fusion.covariances import Unusable
 from operators.fusion.error_state import Noise
-from operators.fusion.heard import Heard
+from operators.fusion.filter_history import Measurement
+from operators.fusion.imu_dropout import ImuDropout
 from operators.fusion.inertial import InertialConfig, InertialSensor
+from operators.fusion.initialisation import Prior, coasting_node, prior_of
+from operators.fusion.last_measurements import LastMeasurements
 from operators.fusion.late_filter import FilterConfig, LateFilter
-from operators.fusion.nodes import Measurement
+from operators.fusion.lever_arms import LeverArms
 from operators.fusion.output import diagnostics, figures, odometry_of, unmeasured, well_known
-from operators.fusion.places import Places
 from operators.fusion.sensor_settings import SensorSettings, errors_of, name_of, never_yields, unheard, use_of
 from operators.fusion.sensors import Surroundings, measurements, turning
-from operators.fusion.silence import Silence
 
 Array = NDArray[np.float64]
 _DEFAULT = SensorSettings()
@@ -124,14 +124,14 @@ class EkfFusion(Operator):
         self._inertial = InertialSensor(
             InertialConfig(self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rest, self.patience)
         )
-        self._silence = Silence(self.max_gap, self.gravity, self._unknown())
+        self._dropout = ImuDropout(self.max_gap, self.gravity, self._unknown())
         self._reported = -1
         self._origin, self._sure = self.origin, False
         self._ignored: Counter[str] = Counter()
-        self._heard = Heard()
+        self._last = LastMeasurements()
         self._constraints = Constraints(self.standstill, self.slip)
         self._gates = self._constraints.gates | {name: s.gate(s.use) for name, s in self.sensors.items()}
-        self._places = Places(self.base_frame, "" if self.motion == "inertial" else self.base_frame)
+        self._lever_arms = LeverArms(self.base_frame, "" if self.motion == "inertial" else self.base_frame)
 
     def process(
         self,
@@ -141,8 +141,8 @@ class EkfFusion(Operator):
         landmark_map: LandmarkSightings | None = None,
     ) -> dict[str, Any] | None:
         """Raises ValueError for a message that its settings do not fit, or that has no place on the robot."""
-        self._places.given(extrinsics)
-        self._heard.hear(measurements)
+        self._lever_arms.given(extrinsics)
+        self._last.hear(measurements)
         named = {
             name: m
             for stream, m in measurements.items()
@@ -153,7 +153,7 @@ class EkfFusion(Operator):
             settings = self._settings(name)
             if isinstance(message, Imu) and use_of(name, message, settings) == "inertial":
                 felt = self._feel(name, message, settings)
-        around = Surroundings(self._places.of, self.world_frame, self._origin, landmark_map, self._ignored)
+        around = Surroundings(self._lever_arms.of, self.world_frame, self._origin, landmark_map, self._ignored)
         for name, message in named.items():
             if not (isinstance(message, Imu) and use_of(name, message, self._settings(name)) == "inertial"):
                 self._measure(name, message, around)
@@ -170,16 +170,16 @@ class EkfFusion(Operator):
         return {
             "filter": None if self._filter is None else self._filter.snapshot(),
             "inertial": self._inertial.snapshot(),
-            "silence": self._silence.snapshot(),
+            "silence": self._dropout.snapshot(),
             "constraints": self._constraints.snapshot(),
             "reported": self._reported,
-            "stamps": dict(self._heard.stamps),
-            "before": self._heard.odometry_state(),
+            "stamps": dict(self._last.stamps),
+            "before": self._last.odometry_state(),
             "origin": None if self._origin is None else list(self._origin),
-            "body": self._places.body,
+            "body": self._lever_arms.body,
             "sure": int(self._sure),
             "ignored": dict(self._ignored),
-            "heard": sorted(self._heard.streams),
+            "heard": sorted(self._last.streams),
             "strict": sorted(name for name, gate in self._gates.items() if never_yields(gate)),
         }
 
@@ -196,13 +196,13 @@ class EkfFusion(Operator):
             *stamps, self._reported = (int(stamp) for stamp in state["stamps"])
             self._inertial.restore({"samples": state["samples"], "stamps": stamps})
         if "silence" in state:
-            self._silence.restore(state["silence"])
+            self._dropout.restore(state["silence"])
         if "constraints" in state:
             self._constraints.restore(state["constraints"])
         last = state["stamps"] if "inertial" in state else {}
-        self._heard.restore(state.get("heard", ()), last, state["before"])
+        self._last.restore(state.get("heard", ()), last, state["before"])
         self._origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1], state["origin"][2])
-        self._places.body, self._sure, self._ignored = state["body"], bool(state["sure"]), Counter(state["ignored"])
+        self._lever_arms.body, self._sure, self._ignored = state["body"], bool(state["sure"]), Counter(state["ignored"])
 
     def summary(self) -> Mapping[str, float | int | str]:
         fused = self._filter
@@ -212,7 +212,7 @@ class EkfFusion(Operator):
 
     def _follows(self, name: str, stamp: int) -> bool:
         """Tells whether a message comes after the sensor's last; one that does not is counted."""
-        if self._heard.follows(name, stamp):
+        if self._last.follows(name, stamp):
             return True
         self._ignored[f"{name}: stamp not later than the last"] += 1
         return False
@@ -246,9 +246,9 @@ class EkfFusion(Operator):
     def _bridge(self, stamp: int) -> bool:
         """Takes the inertial sensor's place where it is silent; False where it is not."""
         assert self._filter is not None
-        if not self._silence.lasts(stamp):
+        if not self._dropout.lasts(stamp):
             return False
-        self._filter.feel(self._silence.sample(stamp, self._filter.estimate(stamp)[0]))
+        self._filter.feel(self._dropout.sample(stamp, self._filter.estimate(stamp)[0]))
         return True
 
     def _prior(self) -> Prior:
@@ -260,9 +260,9 @@ class EkfFusion(Operator):
         if self.motion == "constant_velocity":
             self._ignored[f"{name}: motion is constant_velocity"] += 1
             return False
-        if self._places.body not in ("", imu.frame):
+        if self._lever_arms.body not in ("", imu.frame):
             raise ValueError(
-                f"{name}: a second inertial sensor, {imu.frame!r} beside {self._places.body!r}: only one can move"
+                f"{name}: a second inertial sensor, {imu.frame!r} beside {self._lever_arms.body!r}: only one can move"
             )
         if settings.offset_sigma:
             raise ValueError(f"{name}: its clock is the one that offsets are related to: it has no offset_sigma")
@@ -271,14 +271,14 @@ class EkfFusion(Operator):
         except Unusable as reason:
             self._ignored[f"{name}: {reason}"] += 1
             return False
-        self._places.body = imu.frame
-        self._silence.felt(sample.time)
+        self._lever_arms.body = imu.frame
+        self._dropout.felt(sample.time)
         if self._filter is not None:
             self._filter.feel(sample)
-            for sensor, model, noise in self._constraints.after(sample, self._places.of(self.base_frame)):
+            for sensor, model, noise in self._constraints.after(sample, self._lever_arms.of(self.base_frame)):
                 self._filter.measure(Measurement(sample.time, sensor, model, noise))
             return True
-        begun = self._inertial.begun(sample, self._prior(), self.gravity, self._places.of(self.base_frame))
+        begun = self._inertial.begun(sample, self._prior(), self.gravity, self._lever_arms.of(self.base_frame))
         if begun is None:
             return False
         self._filter = LateFilter(self._config(), begun[0])
@@ -291,7 +291,7 @@ class EkfFusion(Operator):
         settings = self._settings(name)
         if never_yields(gate := settings.gate(use_of(name, message, settings))):  # by the setting, or by its type
             self._gates[name] = gate
-        before = self._heard.before(name, message)
+        before = self._last.before(name, message)
         if self._filter is None:
             self._ignored[f"{name}: before the beginning"] += 1
             return
@@ -300,7 +300,7 @@ class EkfFusion(Operator):
             return
         clock, assumed = self._clock(name)
         if (seen := turning(message, before, around)) is not None:
-            self._silence.saw(message.stamp, seen)
+            self._dropout.saw(message.stamp, seen)
         try:
             for time, sensor, model, noise in measurements(name, message, before, settings, around):
                 self._filter.measure(Measurement(time - assumed, sensor, model, noise, clock, assumed * 1e-9))
@@ -331,7 +331,7 @@ class EkfFusion(Operator):
         self._sure = self._sure or well_known(state.covariance, self.sure)
         if not self._sure:
             return None
-        T_body_base = self._places.of(self.base_frame)
+        T_body_base = self._lever_arms.of(self.base_frame)
         return odometry_of(state, rate, T_body_base, stamp, self.world_frame, self.base_frame)
 
     def _status(self, stamp: int) -> Diagnostics | None:
@@ -342,9 +342,9 @@ class EkfFusion(Operator):
         ignored = self._ignored + self._filter.ignored
         unused = {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
         unused |= unmeasured(self._filter.estimate(stamp)[0].covariance)
-        if self._silence.lasts(stamp):
+        if self._dropout.lasts(stamp):
             unused["inertial sensor"] = "silent: the motion is bridged by what others see"
         return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, self._offsets(), unused)
 
     def _unheard(self) -> list[tuple[str, str]]:
-        return list(unheard(tuple(self.sensors), sorted(self._heard.streams)).items())
+        return list(unheard(tuple(self.sensors), sorted(self._last.streams)).items())

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from operators.fusion.error_state import ROTATION, SIZE, State, difference
-from operators.fusion.nodes import Hypothesis, Node
+from operators.fusion.filter_history import Hypothesis, Node
 
 
 def with_errors(node: Node, sigmas: Sequence[float]) -> Node:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Imu
-from operators.fusion.beginning import Prior, first_node, rests
 from operators.fusion.covariances import Unusable
 from operators.fusion.error_state import Noise
-from operators.fusion.nodes import Node, Sample, plain_sample, sample_of
+from operators.fusion.filter_history import Node, Sample, plain_sample, sample_of
+from operators.fusion.initialisation import Prior, first_node, rests
 
 Array = NDArray[np.float64]
 _LONGEST = 0.1

@@ -26,10 +26,7 @@ from operators.fusion.error_state import (
     shifted,
     updated,
 )
-from operators.fusion.gate import Doubt, GateConfig, Health, judge
-from operators.fusion.hypotheses import combined, reduced, with_errors
-from operators.fusion.measurements import from_plain, to_plain
-from operators.fusion.nodes import (
+from operators.fusion.filter_history import (
     Entry,
     Hypothesis,
     Measurement,
@@ -40,6 +37,9 @@ from operators.fusion.nodes import (
     plain_sample,
     sample_of,
 )
+from operators.fusion.gate import Doubt, GateConfig, Health, judge
+from operators.fusion.hypotheses import combined, reduced, with_errors
+from operators.fusion.measurements import from_plain, to_plain
 from operators.fusion.sensor_errors import SensorErrors
 
 Array = NDArray[np.float64]

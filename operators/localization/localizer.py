@@ -37,7 +37,7 @@ from operators.localization.monte_carlo import CloudConfig
 from operators.localization.motion import DriveNoise
 from operators.localization.reading import MODALITIES, Surroundings, Unusable, observation
 from operators.localization.status import status_of
-from operators.localization.vote import Vote
+from operators.localization.weighted_cloud import WeightedCloud
 
 Array = NDArray[np.float64]
 
@@ -119,9 +119,11 @@ class ParticleFilterLocalizer(Operator, merge=True):
 
     def _begin(self) -> None:
         config = CloudConfig(least=self.min_particles, most=self.max_particles, error=self.kld_error)
-        self._fused = Vote(config)
+        self._fused = WeightedCloud(config)
         own = CloudConfig(least=self.modality_particles, most=self.modality_particles)
-        self._votes = {m: Vote(own) for m in sorted(set(MODALITIES.values()))} if self.modality_particles else {}
+        self._modalities = (
+            {m: WeightedCloud(own) for m in sorted(set(MODALITIES.values()))} if self.modality_particles else {}
+        )
         self._reckoning = DeadReckoning(self.noise)
         self._pending: list[tuple[int, str, Message]] = []
         self._ignored: Counter[str] = Counter()
@@ -179,7 +181,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
             return None
         return {
             "fused": self._fused.snapshot(),
-            "votes": {name: vote.snapshot() for name, vote in self._votes.items()},
+            "votes": {name: vote.snapshot() for name, vote in self._modalities.items()},
             "reckoning": self._reckoning.snapshot(),
             "ignored": dict(self._ignored),
             "states": dict(self._states),
@@ -190,7 +192,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
     def restore(self, state: Mapping[str, Any]) -> None:
         self._begin()
         self._fused.restore(state["fused"])
-        for name, vote in self._votes.items():
+        for name, vote in self._modalities.items():
             vote.restore(state["votes"][name])
         self._reckoning.restore(state["reckoning"])
         self._ignored, self._states = Counter(state["ignored"]), Counter(state["states"])
@@ -223,7 +225,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
     def _advance(self, odometry: Odometry, around: Surroundings) -> None:
         """Moves to an odometry message, with the measurements on the way."""
         if self.start is not None and not self._fused.begun:
-            for vote in (self._fused, *self._votes.values()):
+            for vote in (self._fused, *self._modalities.values()):
                 vote.begin_at(np.array(self.start), self.start_sigma, self.rng)
         due, self._pending = self._pending, []
         stepped = self._reckoning.step(odometry)
@@ -240,7 +242,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
 
     def _move(self, step: Array, covariance: Array, share: float) -> None:
         if share > 0:
-            for vote in (self._fused, *self._votes.values()):
+            for vote in (self._fused, *self._modalities.values()):
                 vote.move(step * share, covariance * share, self.rng)
 
     def _observe(self, stamp: int, name: str, message: Message, around: Surroundings) -> None:
@@ -249,9 +251,9 @@ class ParticleFilterLocalizer(Operator, merge=True):
         except Unusable as reason:
             self._ignored[f"{name}: {reason}"] += 1
             return
-        self._fused.hear(name, stamp, seen, self.rng)
-        if self._votes:
-            self._votes[MODALITIES[type(message)]].hear(name, stamp, seen, self.rng)
+        self._fused.update(name, stamp, seen, self.rng)
+        if self._modalities:
+            self._modalities[MODALITIES[type(message)]].update(name, stamp, seen, self.rng)
 
     def _outputs(self, odometry: Odometry) -> dict[str, Any]:
         stamp = odometry.stamp
@@ -267,8 +269,8 @@ class ParticleFilterLocalizer(Operator, merge=True):
                 child_frame=odometry.frame,
             )
         for modality, port in (("lidar", "lidar_pose"), ("landmarks", "landmark_pose"), ("positions", "position_pose")):
-            if modality in self._votes:
-                own = self._votes[modality].estimate()
+            if modality in self._modalities:
+                own = self._modalities[modality].estimate()
                 if own.word == "localised":
                     result[port] = self._odometry(own, odometry)
         if self._fused.begun and (self._shown < 0 or stamp - self._shown >= self.cloud_every):
@@ -277,7 +279,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
             result["particles"] = ParticleSet(stamp=stamp, frame=self.map_frame, poses=poses, weights=weights)
         if self._reported < 0 or stamp - self._reported >= 10**9 or fused.word != self._word:
             self._reported, self._word = stamp, fused.word
-            result["status"] = status_of(stamp, fused, self._fused, self._votes, self._ignored)
+            result["status"] = status_of(stamp, fused, self._fused, self._modalities, self._ignored)
         return result
 
     def _odometry(self, estimate: Estimate, odometry: Odometry) -> Odometry:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics
 from dataflow.messages.diagnostics import Level
 from operators.localization.estimate import Estimate, apart
-from operators.localization.says import CONSISTENT
-from operators.localization.vote import Vote
+from operators.localization.sensor_weights import CONSISTENT
+from operators.localization.weighted_cloud import WeightedCloud
 from operators.status import Row, status_of_rows
 
 Array = NDArray[np.float64]
@@ -31,18 +31,22 @@ def written(pose: Array) -> str:
 
 
 def status_of(
-    stamp: int, fused: Estimate, filter: Vote, modalities: Mapping[str, Vote], ignored: Mapping[str, int]
+    stamp: int,
+    fused: Estimate,
+    filter: WeightedCloud,
+    modalities: Mapping[str, WeightedCloud],
+    ignored: Mapping[str, int],
 ) -> Diagnostics:
     """Returns a status for the filter, one for every sensor, and one for every modality beside the fused estimate."""
     figures = {**filter.figures(), "share in one place": f"{fused.share:.2f}", "injected": str(filter.injected)}
     if fused.other is not None:
-        figures |= {"other place": written(fused.other), "likelier than the other": f"{filter.rival.lead:.1f} nats"}
+        figures |= {"other place": written(fused.other), "likelier than the other": f"{filter.competing.lead:.1f} nats"}
     figures |= {f"ignored, {reason}": str(count) for reason, count in sorted(ignored.items())}
     said = "ambiguous: another place explains as much" if fused.other is not None else fused.word
     rows: list[Row] = [("filter", said, _LEVELS[fused.word], figures)]
-    counts = filter.says.counts(stamp)
+    counts = filter.sensor_weights.counts(stamp)
     for sensor, fit in sorted(filter.fits().items()):
-        ratio, count = filter.says.ratio(sensor), counts.get(sensor, 1.0)
+        ratio, count = filter.sensor_weights.ratio(sensor), counts.get(sensor, 1.0)
         text = "consistent" if ratio <= CONSISTENT else "innovations larger than usual"
         if count < 1:
             text = "disagrees with the others and counts less"

@@ -11,7 +11,7 @@ import numpy as np
 from operators.slam.keyframe_graph import Node
 from operators.slam.place_graph import PlaceGraph
 from operators.slam.pose_graph import Edge
-from operators.slam.sights import Surprise
+from operators.slam.sensor_model import Surprise
 
 V = TypeVar("V")
 

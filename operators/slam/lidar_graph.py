@@ -14,7 +14,7 @@ from operators.slam.keyframe_graph import SAVED, Node
 from operators.slam.lidar_view import LidarEyes, LidarView
 from operators.slam.place_graph import PlaceGraph
 from operators.slam.scan_context import likeness
-from operators.slam.sights import Added, Eyes, PlaceSettings, Sighting, alike
+from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting, alike
 
 DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # what odometry may be off besides what it says, over a metre
 STEP = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # and at each keyframe

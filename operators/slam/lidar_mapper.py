@@ -15,7 +15,7 @@ from operators.slam.graph_memory import graph_from_plain, graph_to_plain, plain
 from operators.slam.lidar_graph import LidarGraph
 from operators.slam.lidar_view import LidarView
 from operators.slam.place import Place, place_of
-from operators.slam.sights import Added
+from operators.slam.sensor_model import Added
 
 
 @dataclass(frozen=True, eq=False)

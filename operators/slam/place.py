@@ -6,7 +6,7 @@ from enum import StrEnum
 from typing import Any
 
 from operators.slam.place_graph import PlaceGraph
-from operators.slam.sights import Added
+from operators.slam.sensor_model import Added
 
 
 class Place(StrEnum):

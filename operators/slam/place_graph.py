@@ -12,7 +12,7 @@ from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import KeyframeGraph, Node
-from operators.slam.sights import Added, Eyes, Index, Moved, PlaceSettings, Sighting, Surprise, V, alike
+from operators.slam.sensor_model import Added, Eyes, Index, Moved, PlaceSettings, Sighting, Surprise, V, alike
 
 UNKNOWN = np.diag([1.0] * 3 + [1.0] * 3)  # covariance (6, 6) of a motion that nothing measured, m² and rad²
 WINDOW = 10  # newest keyframes, which are settled at every new one

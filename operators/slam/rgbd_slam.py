@@ -20,7 +20,7 @@ from operators.odometry.tracking import Status, TrackResult
 from operators.slam.graph_memory import graph_from_plain, graph_to_plain
 from operators.slam.map_points import MapPoints
 from operators.slam.place import Place, place_of
-from operators.slam.sights import Added
+from operators.slam.sensor_model import Added
 from operators.slam.visual_graph import GraphSettings, VisualGraph
 from operators.slam.visual_view import view_from_plain, view_to_plain
 

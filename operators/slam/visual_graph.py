@@ -18,7 +18,7 @@ from operators.slam.local_bundle import adjust_newest
 from operators.slam.map_points import MapPoints
 from operators.slam.place_graph import WINDOW, PlaceGraph
 from operators.slam.place_index import PlaceIndex
-from operators.slam.sights import Added, Eyes, PlaceSettings, Sighting
+from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting
 from operators.slam.visual_view import Judge, Sight, View, sight
 
 DRIFT = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # what odometry may be off besides: it errs more where things move

@@ -162,7 +162,7 @@ RGBD = """
 graph: rgbd
 operators:
   camera: {use: "operators.sources:RecordedRgbdCamera"}
-  watch: {use: "operators.image:ImageWatch", inputs: {image: camera/image}}
+  watch: {use: "operators.monitoring:ImageWatch", inputs: {image: camera/image}}
 """
 
 

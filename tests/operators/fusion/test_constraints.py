@@ -13,7 +13,7 @@ from dataflow.operator import Context
 from operators.fusion import EkfFusion
 from operators.fusion.constraints import Constraints
 from operators.fusion.error_state import Noise
-from operators.fusion.nodes import Sample
+from operators.fusion.filter_history import Sample
 
 RATE, GRAVITY = 100, 9.80665
 BIAS = np.array([0.06, -0.04, 0.03])

@@ -10,7 +10,6 @@ from made_motion import GRAVITY, Motion
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from operators.fusion.beginning import Prior, first_node, rests
 from operators.fusion.error_state import (
     POSITION,
     ROTATION,
@@ -24,6 +23,8 @@ from operators.fusion.error_state import (
     propagated,
     updated,
 )
+from operators.fusion.filter_history import Measurement, Sample
+from operators.fusion.initialisation import Prior, first_node, rests
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.measurements import (
     AngularRate,
@@ -38,7 +39,6 @@ from operators.fusion.measurements import (
     from_plain,
     to_plain,
 )
-from operators.fusion.nodes import Measurement, Sample
 
 rng = np.random.default_rng(3)
 NOISE = Noise(gyro=2e-3, accel=2e-2, gyro_walk=1e-4, accel_walk=1e-3)

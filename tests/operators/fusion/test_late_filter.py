@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_motion import Motion
 
-from operators.fusion.beginning import Prior, first_node
 from operators.fusion.error_state import Noise
+from operators.fusion.filter_history import Measurement, Sample
 from operators.fusion.gate import GateConfig
+from operators.fusion.initialisation import Prior, first_node
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.measurements import Position
-from operators.fusion.nodes import Measurement, Sample
 
 NOISE = Noise(gyro=2e-3, accel=2e-2, gyro_walk=1e-4, accel_walk=1e-3)
 RATE = 50

@@ -9,11 +9,11 @@ import pytest
 from made_motion import GRAVITY, Motion
 
 from dataflow.messages import NavSatFix
-from operators.fusion.beginning import Prior, first_node
 from operators.fusion.error_state import SIZE, Noise, State
+from operators.fusion.filter_history import Measurement, Sample
+from operators.fusion.initialisation import Prior, first_node
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.measurements import Position, Velocity
-from operators.fusion.nodes import Measurement, Sample
 from operators.fusion.sensor_errors import SensorErrors
 from operators.fusion.sensor_settings import SensorSettings, errors_of
 from operators.fusion.sensors import Surroundings, measurements

@@ -12,11 +12,11 @@ from made_sensors import Robot, errors, fused
 from dataflow.messages import Diagnostics
 from dataflow.operator import Context
 from operators.fusion import EkfFusion
-from operators.fusion.beginning import Prior, first_node
 from operators.fusion.error_state import Noise
+from operators.fusion.filter_history import Measurement, Sample
+from operators.fusion.initialisation import Prior, first_node
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.measurements import AngularRate, Model, Orientation, Position, Velocity
-from operators.fusion.nodes import Measurement, Sample
 from operators.fusion.sensor_errors import SensorErrors
 
 MOTION = Motion()

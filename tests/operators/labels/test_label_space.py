@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from operators.sources.simulator.classes import THINGS
 
 from operators.detection.coco import COCO_CLASSES
 from operators.labels import ROLES, LabelSpace, LabelSpaceError, labels_file
+from operators.simulator.classes import THINGS
 
 OWN = """
 label_space: workshop

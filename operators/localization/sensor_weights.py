@@ -33,7 +33,7 @@ class _Innovations:
         return _Innovations(stamp, min(lately, LARGEST), usual)
 
 
-class Says:
+class SensorWeights:
     """Follows the innovations of several sensors: each counts less the larger they are, but only where another agrees.
 
     Where no sensor is consistent it is the pose that is wrong, and all count in full. Innovation-based adaptation:
@@ -43,7 +43,7 @@ class Says:
     def __init__(self) -> None:
         self._heard: dict[str, _Innovations] = {}
 
-    def hear(self, sensor: str, stamp: int, misfit: float) -> float:
+    def update(self, sensor: str, stamp: int, misfit: float) -> float:
         """Takes the squared innovation over the one explained; returns what the sensor counts now, (0, 1]."""
         known = self._heard.get(sensor, _Innovations())
         now = min(misfit, LARGEST) / known.usual

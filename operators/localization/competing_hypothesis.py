@@ -40,7 +40,7 @@ class _Other:
     logarithms: Array
     lead: float = 0.0
 
-    def hear(self, observation: Observation, count: float, rng: np.random.Generator) -> float:
+    def update(self, observation: Observation, count: float, rng: np.random.Generator) -> float:
         """Weighs the cloud; returns the logarithm of the observation's likelihood in it."""
         logarithms, _ = observation.score(self.poses)
         evidence = evidence_of(normalised(self.logarithms), count * logarithms)
@@ -52,7 +52,7 @@ class _Other:
         return evidence
 
 
-class Rival:
+class CompetingHypothesis:
     """Looks for another place until a few searches found none, and follows the one that it found."""
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class Rival:
         if self._other is not None:
             self._other.poses = moved(self._other.poses, step, covariance, rng)
 
-    def hear(
+    def update(
         self, mean: Array, evidence: float, observation: Observation, count: float, rng: np.random.Generator
     ) -> Array | None:
         """Takes an observation that has the given evidence, a logarithm, where the pose's mean (3,) is.
@@ -110,7 +110,7 @@ class Rival:
             if self._searched < _SEARCHES:
                 self._search(mean, evidence, observation, count, rng)
             return None
-        gained = evidence - self._other.hear(observation, count, rng)
+        gained = evidence - self._other.update(observation, count, rng)
         self._other.lead = (1.0 - _FORGETTING) * self._other.lead + gained
         place = self.mean
         assert place is not None

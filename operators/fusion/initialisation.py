@@ -20,8 +20,8 @@ from operators.fusion.error_state import (
     State,
     updated,
 )
+from operators.fusion.filter_history import Hypothesis, Node, Sample
 from operators.fusion.measurements import AngularRate, RestingForce
-from operators.fusion.nodes import Hypothesis, Node, Sample
 from operators.geometry.se3 import skew
 
 Array = NDArray[np.float64]

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.fusion.error_state import Noise, State
-from operators.fusion.nodes import Sample
+from operators.fusion.filter_history import Sample
 
 Array = NDArray[np.float64]
 _SEEN = 300_000_000  # ns for which a turning that was seen goes on
 _TURNING = 0.05  # rad/s/√Hz: density of the noise of a turning that another sensor sees
 
 
-class Silence:
+class ImuDropout:
     """Makes samples in the inertial sensor's place once it has given none for `patience` (s)."""
 
     def __init__(self, patience: float, gravity: float, unknown: Noise) -> None:

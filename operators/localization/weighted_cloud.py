@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.localization.competing_hypothesis import CompetingHypothesis
 from operators.localization.estimate import Estimate
 from operators.localization.monte_carlo import CloudConfig, MonteCarlo
 from operators.localization.observations import Observation
-from operators.localization.rival import Rival
-from operators.localization.says import Says
+from operators.localization.sensor_weights import SensorWeights
 
 Array = NDArray[np.float64]
 _WIDE, _TURNED, _MOST = 0.3, 0.15, 0.6
@@ -21,14 +21,14 @@ _LOST = 0.25
 """Doubt above which the robot is lost."""
 
 
-class Vote:
+class WeightedCloud:
     """A cloud that begins where the first observation puts it, and heeds sensors by their innovations."""
 
     def __init__(self, config: CloudConfig) -> None:
         self._config = config
         self._cloud: MonteCarlo | None = None
-        self.says = Says()
-        self.rival = Rival()
+        self.sensor_weights = SensorWeights()
+        self.competing = CompetingHypothesis()
         self.stamp = -1
 
     @property
@@ -43,28 +43,28 @@ class Vote:
         """Begins about a pose (3,); `sigma` in m and rad."""
         spread = np.array([sigma[0], sigma[0], sigma[1]])
         self._cloud = MonteCarlo(self._config, pose + spread * rng.standard_normal((self._config.most, 3)))
-        self.rival.settle()
+        self.competing.settle()
 
     def move(self, step: Array, covariance: Array, rng: np.random.Generator) -> None:
         if self._cloud is not None:
             self._cloud.move(step, covariance, rng)
-            self.rival.move(step, covariance, rng)
+            self.competing.move(step, covariance, rng)
 
-    def hear(self, sensor: str, stamp: int, observation: Observation, rng: np.random.Generator) -> None:
+    def update(self, sensor: str, stamp: int, observation: Observation, rng: np.random.Generator) -> None:
         """Takes an observation (its time in ns); one that says too little to begin with is passed over."""
         self.stamp = stamp
         if self._cloud is None:
             self._cloud = MonteCarlo(self._config, observation.propose(self._config.most, rng))
             return
         mean, covariance, share = self._cloud.estimate()
-        says = self.says.counts(stamp)
+        says = self.sensor_weights.counts(stamp)
         if share > _MOST / 2:
-            says[sensor] = self.says.hear(sensor, stamp, observation.misfit(mean, covariance))
+            says[sensor] = self.sensor_weights.update(sensor, stamp, observation.misfit(mean, covariance))
         evidence = self._cloud.weigh(sensor, observation, rng, says)
         if self._cloud.doubt(says) > _LOST:
-            self.rival.forget()
+            self.competing.forget()
         elif self._narrow(covariance):
-            better = self.rival.hear(mean, evidence, observation, says.get(sensor, 1.0), rng)
+            better = self.competing.update(mean, evidence, observation, says.get(sensor, 1.0), rng)
             if better is not None:
                 self._cloud.replace(better)
 
@@ -73,13 +73,13 @@ class Vote:
         if self._cloud is None:
             return Estimate("waiting", np.zeros(3), np.eye(3) * 1e6, 0.0)
         mean, covariance, share = self._cloud.estimate()
-        doubt = self._cloud.doubt(self.says.counts(self.stamp))
+        doubt = self._cloud.doubt(self.sensor_weights.counts(self.stamp))
         if doubt > _LOST:
             return Estimate("lost", mean, covariance, share)
-        other = self.rival.mean
+        other = self.competing.mean
         if self._narrow(covariance) and other is not None:
             return Estimate("ambiguous", mean, covariance, share, other)
-        found = self._narrow(covariance) and share > _MOST and self.rival.decided
+        found = self._narrow(covariance) and share > _MOST and self.competing.decided
         return Estimate("localised" if found else "searching", mean, covariance, share)
 
     @staticmethod
@@ -103,10 +103,15 @@ class Vote:
 
     def snapshot(self) -> dict[str, Any]:
         cloud = None if self._cloud is None else self._cloud.snapshot()
-        return {"cloud": cloud, "says": self.says.snapshot(), "rival": self.rival.snapshot(), "stamp": self.stamp}
+        return {
+            "cloud": cloud,
+            "says": self.sensor_weights.snapshot(),
+            "rival": self.competing.snapshot(),
+            "stamp": self.stamp,
+        }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._cloud = None if state["cloud"] is None else MonteCarlo.restored(self._config, state["cloud"])
-        self.says.restore(state["says"])
-        self.rival.restore(state.get("rival", {}))
+        self.sensor_weights.restore(state["says"])
+        self.competing.restore(state.get("rival", {}))
         self.stamp = int(state["stamp"])

@@ -8,7 +8,7 @@ from typing import Any
 from dataflow.messages import Message, Odometry
 
 
-class Heard:
+class LastMeasurements:
     """Keeps the last stamp and odometry of each sensor, by its name in the settings, and the streams that there are."""
 
     def __init__(self) -> None:

@@ -12,7 +12,7 @@ from made_room import CELL, Drive, mounts
 from dataflow.messages import OccupancyGrid
 from dataflow.testing import Played, play
 from operators.localization import ParticleFilterLocalizer
-from operators.localization.rival import Rival, apart
+from operators.localization.competing_hypothesis import CompetingHypothesis, apart
 
 
 def hall(*, notch: bool = False) -> OccupancyGrid:
@@ -84,8 +84,8 @@ def test_a_known_start_or_a_position_decides() -> None:
 def test_what_is_followed_comes_back_from_a_snapshot() -> None:
     drive = HallDrive(2.0)
     _, operator = localized(drive, {"scan": drive.scans()})
-    rival = operator._fused.rival
-    other = Rival()
+    rival = operator._fused.competing
+    other = CompetingHypothesis()
     other.restore(rival.snapshot())
     assert other.mean is not None
     np.testing.assert_array_equal(other.mean, rival.mean)

@@ -12,7 +12,7 @@ from operators.geometry.extrinsics import transform_between
 Array = NDArray[np.float64]
 
 
-class Places:
+class LeverArms:
     """Looks frames up in the extrinsics, once each. `body` is the frame that moves, empty until it is known."""
 
     def __init__(self, base: str, body: str = "") -> None:
