@@ -62,9 +62,9 @@ The project is under the [Apache License 2.0](../LICENSE), weights, recording an
 no code, weights or data of others. The networks' weights were trained on images that the project rendered itself
 ([how](../operators/weights/README.md)).
 
-It imports libraries, each under its own licence. The table says what their packages' metadata say, here on Linux; what
-their wheels bring besides is noted where it is known to matter. The tests check that the installed package imports
-nothing that is under the GPL or AGPL, directly or through what it imports.
+It imports libraries, each under its own licence. The table lists those of their packages' metadata, here on Linux;
+other contents of their wheels are noted where they are known to matter. The tests check that the installed package
+imports nothing that is under the GPL or AGPL, directly or through what it imports.
 
 `[dev]` brings evo (GPL-3.0) for the tests, which compare our trajectory errors with its; neither `dataflow` nor
 `operators` imports it.

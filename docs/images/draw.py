@@ -66,7 +66,7 @@ class Drawing:
         )
 
     def text(self, x: float, y: float, words: str, color: str = INK, *, size: int = 14, anchor: str = "start") -> None:
-        """Writes words above a white edge. That is a text of its own: not every program knows `paint-order`."""
+        """Writes words above a white edge. The edge is a second text: not every program supports `paint-order`."""
         start = f'<text x="{x:g}" y="{y:g}" font-size="{size}" text-anchor="{anchor}"'
         edge = 'fill="none" stroke="#ffffff" stroke-width="4" stroke-linejoin="round" aria-hidden="true"'
         self._items.append(f"{start} {edge}>{escape(words)}</text>")

@@ -102,7 +102,7 @@ window twice as wide and high in pixels as it is asked for."""
 
 
 def rendered(shown: Path) -> Picture:
-    """What the viewer shows of a file, a moment after it is opened."""
+    """Returns a screenshot of the viewer, taken a moment after it opened a file."""
     large = shown.with_suffix(".png")
     subprocess.run(
         ["xvfb-run", "-a", "-s", f"-screen 0 {WIDE}x{HIGH}x24", str(PROGRAMS / "rerun"), "--screenshot-to", str(large),
@@ -116,7 +116,7 @@ def rendered(shown: Path) -> Picture:
 
 
 def complaints(shown: Path, moments: Iterable[float]) -> list[str]:
-    """What views of a file report as errors at these shares of its length, as the viewer itself says it."""
+    """Returns the errors that the viewer reports in views of a file at these shares of its length."""
     found = dict[str, None]()
     viewer = ViewerClient.spawn(headless=True, port=free_port(), executable_path=str(PROGRAMS / "rerun"))
     try:

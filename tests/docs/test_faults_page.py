@@ -1,4 +1,4 @@
-"""The page about faults: the tests it names exist, and its plan is the one that is shipped and can be followed."""
+"""The page about faults: tests show each of its rows, and its plan is the one that is shipped and can be followed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,100 @@ from dataflow.chaos import plan as chaos
 from dataflow.graph import load_graph
 from dataflow.supervision.core.health import LEVELS
 
+SHOWN_BY = {
+    "an operator raises": "an_operator_that_raises_is_made_anew_in_the_same_process",
+    "a process crashes": """
+        a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on
+        a_successor_says_where_its_predecessor_had_got_to_and_what_is_missing_of_that_is_lost
+        a_death_that_is_heard_of_late_is_not_taken_for_that_of_the_successor
+    """,
+    "the same operator fails again and again": "restarts_come_to_an_end_and_the_last_cause_is_named",
+    "a process fails in `setup()`, or dies while it starts": """
+        a_set_up_that_fails_is_tried_again_by_the_policy_until_it_is_used_up
+        a_process_that_is_killed_while_starting_is_restarted_by_its_policy
+    """,
+    "an operator hangs past its `deadline`": """
+        an_operator_that_hangs_is_killed_at_its_deadline_and_started_again
+        without_a_policy_a_hang_ends_the_run_and_names_operator_and_deadline
+    """,
+    "an operator without a `deadline` hangs": """
+        a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it
+        a_hang_without_a_deadline_is_ended_by_its_restart_policy
+    """,
+    "an operator leaks memory": """
+        a_process_that_leaks_past_its_limit_is_started_again
+        without_a_policy_a_leak_ends_the_run_before_the_machine_does
+    """,
+    "an operator is slow": "a_slow_operator_drops_by_its_policy_and_holds_up_nobody",
+    "a process gives no sign of life (stopped, swapped out)": """
+        a_stopped_process_is_killed_and_restarted_by_its_policy
+        a_stopped_consumer_holds_the_sources_back_for_nobody_and_begins_anew_when_it_is_back
+        what_did_not_reach_a_consumer_is_counted_against_it
+    """,
+    "a process lives and takes no messages (a call that holds the interpreter)": """
+        a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted
+    """,
+    "the whole run or its supervisor pauses (`docker pause`, a suspended laptop, heavy swapping)": """
+        a_pause_of_the_supervisor_and_others_kills_and_blames_nobody
+        a_time_in_which_the_process_was_stopped_is_no_part_of_a_call
+    """,
+    "the process that starts the others (the nursery) is killed": """
+        a_run_whose_nursery_is_killed_says_so_and_leaves_no_process
+    """,
+    "several faults at random": "a_run_under_faults_of_every_kind_is_verified_in_the_other_placement",
+    "a source crashes, or a live source raises (an unplugged camera)": """
+        a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is
+        a_source_that_raises_is_made_anew_in_the_same_process
+    """,
+    "a source stops": """
+        a_source_that_stops_is_an_event_in_the_diagnostics
+        a_source_that_stops_holds_up_no_other
+    """,
+    "nothing happens around the robot": "a_robot_at_which_nothing_happens_goes_on",
+    "a source is slower than the clock": """
+        a_source_behind_the_clock_is_named_at_once_and_at_the_end
+        a_process_that_is_busy_is_named_as_what_holds_its_source_up
+    """,
+    "a source floods": "a_flood_is_dropped_where_it_is_too_much_and_counted",
+    "a clock jumps back": """
+        a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told
+        a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late
+    """,
+    "a clock jumps ahead": """
+        a_clock_that_jumps_ahead_goes_on_there
+        a_source_whose_stamps_jumped_far_ahead_is_named
+    """,
+    "a message has a stamp in the past": "a_message_with_a_stamp_in_the_past_is_dropped_and_counted",
+    "the disk is full while recording": """
+        a_full_disk_stops_the_recording_until_it_has_room_and_never_the_run
+        a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable
+        a_recording_that_may_not_grow_ends_the_run_and_stays_readable
+    """,
+    "the recorder is killed": "a_recorder_that_is_killed_is_followed_by_another_and_the_run_goes_on",
+    "the recorder is stopped or slow": "only_operators_of_a_live_run_may_miss_what_they_do_not_take",
+    "a viewer or `dataflow echo` dies or stops": """
+        a_viewer_that_is_killed_is_not_missed
+        a_stopped_viewer_costs_nothing_and_loses_nothing
+    """,
+    "a Zenoh subscriber outside the run is slow or stopped": "a_slow_subscriber_from_outside_costs_nobody_anything",
+    "another program publishes on a key of the run, malformed or forged": """
+        a_malformed_message_from_outside_reaches_nobody
+        forged_ends_frontiers_and_messages_change_nothing
+    """,
+    "an envelope contradicts its stream": """
+        a_well_formed_envelope_that_contradicts_its_stream_ends_nothing_and_changes_nothing
+    """,
+}
+"""The faults of the page, with the tests that show the response to each, without `test_`."""
+
 
 def page(repository: Path) -> str:
     return (repository / "docs" / "faults.md").read_text(encoding="utf-8")
 
 
-def test_every_test_that_is_named_exists(repository: Path) -> None:
-    named = set(re.findall(r"`(test_\w+)`", page(repository)))
+def test_tests_show_the_response_to_every_fault_of_the_page(repository: Path) -> None:
+    tables = page(repository).split("## A recording that fails")[0]
+    rows = re.findall(r"^\| (?!---)(?!fault \|)([^|]+) \|", tables, re.MULTILINE)
     there = {
         node.name
         for folder in ("runtime", "process", "supervision", "transport", "simulation")
@@ -28,8 +115,10 @@ def test_every_test_that_is_named_exists(repository: Path) -> None:
         if isinstance(node, ast.FunctionDef)
     }
 
-    assert len(named) > 15
-    assert named <= there, named - there
+    assert rows == list(SHOWN_BY)
+    named = [f"test_{name}" for names in SHOWN_BY.values() for name in names.split()]
+    assert all(SHOWN_BY.values())
+    assert set(named) <= there, set(named) - there
 
 
 def test_the_plan_on_the_page_is_the_shipped_one_and_has_faults_of_every_kind(repository: Path) -> None:
