@@ -203,12 +203,12 @@ def markdown(
     lines += [
         "Both operators as they run in a graph, with the files in `operators/weights/`, on simulated worlds that were "
         f"used neither for training (seeds from {TRAINING}) nor for choosing the best epoch (seeds from {VALIDATION}): "
-        f"their seeds count from {HELD_OUT}. How they were trained is told in "
+        f"their seeds count from {HELD_OUT}. Their training is described in "
         "[operators/weights/README.md](../operators/weights/README.md).",
         "",
         f"Detections count for objects of which at least {VISIBLE:.0%} and {PIXELS} pixels (at 640x480; less in "
-        "smaller images by the area) are visible; it is neither asked for nor wrong to find the others. AP50 is "
-        "pycocotools', mean over classes. Time is for the whole operator: resizing, network, decoding, suppression; "
+        "smaller images by the area) are visible; other objects are neither required nor wrong. Labels are the "
+        "simulator's. AP50 is pycocotools', mean over classes. Time is for the whole operator: resizing, network, decoding, suppression; "
         f"each network on one thread, on {_processor()} ({os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}).",
         "",
         "| file | kB | network | input | trained on | validation |",
