@@ -208,8 +208,9 @@ def markdown(
         "",
         f"Detections count for objects of which at least {VISIBLE:.0%} and {PIXELS} pixels (at 640x480; less in "
         "smaller images by the area) are visible; other objects are neither required nor wrong. Labels are the "
-        "simulator's. AP50 is pycocotools', mean over classes. Time is for the whole operator: resizing, network, decoding, suppression; "
-        f"each network on one thread, on {_processor()} ({os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}).",
+        "simulator's. AP50 is pycocotools', mean over classes. Time is for the whole operator: resizing, network, "
+        f"decoding, suppression; each network on one thread, on {_processor()} "
+        f"({os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}).",
         "",
         "| file | kB | network | input | trained on | validation |",
         "|---|---|---|---|---|---|",
