@@ -34,7 +34,7 @@ from operators.training.simulated_worlds import FOCAL, HELD_OUT, TRAINING, VALID
 from operators.weights import read_facts, shipped
 
 VISIBLE, PIXELS = 0.6, 200
-"""What counts: objects of which at least this share is visible, and so many pixels at VGA."""
+"""Least visible share, and least number of pixels at VGA, of objects that count."""
 VGA = 640 * 480
 REPOSITORY = Path(__file__).resolve().parent.parent
 RECORDING, RECORDED = REPOSITORY / "recordings" / "demo.mcap", "recordings/demo.mcap"
@@ -74,8 +74,8 @@ def add(score: WorldScore, taken: WorldImage, detector: CustomDetector, segmente
     truth = taken.objects
     assert truth.visible is not None
     assert truth.pixel_counts is not None
-    assert found.class_names == THINGS, f"the detector knows {found.class_names}, the worlds have {THINGS}"
-    assert classes.class_names == CLASSES, f"the segmenter knows {classes.class_names}, the worlds have {CLASSES}"
+    assert found.class_names == THINGS, f"the detector has {found.class_names}, the worlds have {THINGS}"
+    assert classes.class_names == CLASSES, f"the segmenter has {classes.class_names}, the worlds have {CLASSES}"
     least = PIXELS * taken.image.width * taken.image.height / VGA
     ignored = (truth.visible < VISIBLE) | (truth.pixel_counts < least)
     boxes = Candidates(found.boxes, found.scores, found.class_ids)
@@ -282,7 +282,7 @@ def _figures(title: str, figures: dict[str, Any]) -> list[str]:
 
 
 def _processor() -> str:
-    """The processor's name where Linux tells it."""
+    """Returns the processor's name by /proc/cpuinfo, or else the architecture."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     found = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
