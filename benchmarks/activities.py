@@ -64,7 +64,7 @@ class Step:
 class Figures:
     """Counts (true|said) by method, and for each arrival the first goal by method, and the lead in seconds.
 
-    `seen` are counts of all agents in view: true|said with `not mapped`; `lost` says what became of them.
+    `seen` are counts of all agents in view: true|said with `not mapped`; `lost` has their outcomes.
     """
 
     acts: dict[str, Counter[str]] = field(default_factory=dict)

@@ -36,7 +36,7 @@ from operators.simulator.worlds import INDOOR
 
 HELD_OUT, EVERY = 41_000, 10
 VISIBLE, PIXELS = 0.6, 50
-"""What counts: objects of which this share and so many pixels are visible."""
+"""Least visible share and least number of pixels of objects that count."""
 LAMPS = [{"span": (4, 8), "level": 0.0}, {"span": (11, 15), "level": 0.25}]
 LOUD = {"read_noise": 12.0, "shot_noise": 0.5}
 CONDITIONS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -52,21 +52,20 @@ LIGHT = "brightness alone"
 MODES: dict[str, dict[str, Any]] = {"off": {"adapt": False}, "on": {}, LIGHT: {"usual_noise": 50.0}}
 ABOUT = {
     "networks": (
-        "The networks' operators see each image through `ImageAdapter` with the parameters that it comes with, which "
+        "The networks' operators see each image through `ImageAdapter` with its default parameters, which "
         "were chosen on two other worlds (office 40000, table_top 40001). Clean images and blurred ones pass bit for "
-        "bit: nothing is done about blur. In the core perception graph it is off unless `adapt: true`."
+        "bit: blur is not corrected. In the core perception graph it is off unless `adapt: true`."
     ),
     "odometry": (
         "All are errors of millimetres on a drive of some metres, and none depends on the light by more than it "
-        "varies from world to world: `VisualOdometry` follows the data by itself (each image is brought to the "
+        "varies from world to world: `VisualOdometry` adapts to the data (each image is brought to the "
         "keyframe's mean and contrast; the standard deviations of tracks and depths follow their residuals). Adapted "
         "images help it in some worlds and cost more than 5 % in others, so **the perception graph leaves them out "
-        "here, whatever `adapt` says**."
+        "here, whatever the value of `adapt`**."
     ),
     "threshold": (
-        "A score threshold that follows the image is not there, since it would gain nothing: the best one hardly "
-        "moves, and F1 at a fixed 0.6 is within 0.02 of F1 at the best in every condition. What darkness and noise "
-        "cost is in the scores' order."
+        "A score threshold that follows the image is omitted: the best one hardly moves, and F1 at a fixed 0.6 is "
+        "within 0.02 of F1 at the best in every condition. Darkness and noise change the order of the scores."
     ),
 }
 REPORT = Path(__file__).with_suffix(".md")
@@ -211,8 +210,8 @@ def markdown(worlds: Mapping[str, Figures], command: str) -> str:
         return f"{min(changes) + 0.0:+.1f} %"
 
     lines = ["# Adaptation to light and noise", "", f"    {command}", ""]
-    lines += [f"{len(worlds)} worlds: {', '.join(worlds)}. Means over worlds; *worst* is the change in the world that "
-              "loses most (a gain is positive).", ""]  # fmt: skip
+    lines += [f"{len(worlds)} simulated worlds with the simulator's labels: {', '.join(worlds)}. Means over worlds; "
+              "*worst* is the change in the world that loses most (a gain is positive).", ""]  # fmt: skip
     lines += ["## Detector and segmenter, behind ImageAdapter", "", ABOUT["networks"], ""]
     lines += ["| condition | AP50 off | on | worst | mIoU off | on | worst |", "|---|---|---|---|---|---|---|"]
     for name, (told, _) in CONDITIONS.items():

@@ -7,14 +7,14 @@
     python benchmarks/firings.py --apart                  # the CPU time of a firing where each operator has a process
 
 Chains (a source, relays, a sink) and fans (a source, sinks) of small messages run in one process as fast as they go,
-each in a Python of its own. Time is taken inside that process every 20 messages, so start-up is not in it; CPU time is
+each in a separate interpreter. Time is taken inside that process every 20 messages, without start-up; CPU time is
 the whole process's. The figures are those of the tenth of the time that was least disturbed (`--json` has the means,
 too): other work on the machine does not decide. With several rounds the table gives medians, and of ratios the smallest
 and the largest beside them. The floor is the same chain as plain calls of Python functions: makes the array
 and the message's dictionary, digests it, packs a record of 40 bytes; no checks, no order, no frontiers.
 
-With `--apart`, each operator and the source has a process of its own. The figure is what two runs of different lengths
-differ by in CPU time, all processes together, divided by the firings that they differ by: starting costs both the same.
+With `--apart`, each operator and the source has its process. The figure is the difference of a long and a short run
+in CPU time, all processes together, divided by the firings that they differ by: starting costs both the same.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ BAND = (0.05, 1.5)
 
 
 def robot(world: str, seed: int, seconds: int, **more: Any) -> SimulatedRobot:
-    """A robot on a tour among movers, with depth camera and LiDAR at 4 Hz unless `more` says otherwise."""
+    """A robot on a tour among movers, with depth camera and LiDAR at 4 Hz unless set in `more`."""
     truth_of: dict[str, Any] = {"poses": 4.0, "boxes": False, "relations": 0.0, "activities": 0.0}
     params: dict[str, Any] = {
         "color_camera": {"rate": 0.0},
@@ -99,12 +99,12 @@ class Scored:
         self.touched[cell[:, 1], cell[:, 0]] = True
 
     def row(self) -> list[float]:
-        """IoU of free, of taken, of taken to within a cell; precision and recall of the last, known share, ms.
+        """IoU of free, of occupied, of occupied to within a cell; precision and recall of the last, known share, ms.
 
-        Scored are the cells that the map knows or a point fell into. Taken cells that no point fell into (the inside
-        of furniture) are left out of taken, and count as wrong where the map calls them free. Cells that are neither
-        free nor hold a surface (the inside of walls, where no robot can be) are left out of taken. Where somebody stood
-        when the sensor last looked, neither is wrong.
+        Scored are the cells that are known in the map or contain a point. Occupied cells without a point (the inside
+        of furniture) are left out of occupied, and count as wrong where the map has them free. Cells that are neither
+        free nor hold a surface (the inside of walls, where no robot can be) are left out of occupied. Where a mover
+        stood when the sensor last looked, neither is wrong.
         """
         held = self.last_seen.held & ~self.solid
         found = _on_grid(self.mapper.process(*_last(self))["map"], self.truth)
@@ -166,8 +166,8 @@ def _on_grid(found: Message, truth: OccupancyGrid) -> NDArray[np.int16]:
 
 
 def occupancy(worlds: list[str], seeds: list[int], seconds: int) -> None:
-    columns = ("world", "sensor", "IoU free", "IoU taken, exact", "to a cell", "precision", "recall", "known", "CPU ms")
-    print("| " + " | ".join(columns) + " |")
+    columns = "world | sensor | IoU free | IoU occupied, exact | to a cell | precision | recall | known | CPU ms"
+    print(f"| {columns} |")
     print("| --- " * 9 + "|")
     rows: dict[str, list[list[float]]] = {"lidar": [], "depth": []}
     for world in worlds:

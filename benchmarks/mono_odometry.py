@@ -44,7 +44,7 @@ Array = NDArray[np.float64]
 class Drive:
     """Grey images (N, H, W), true camera poses (N, 4, 4), stamps (N,); the camera by the wheels where there are.
 
-    Depth images come at stamps of their own, by the camera's intrinsics and those of its neighbour.
+    Depth images have other stamps than the grey ones, by the camera's intrinsics and those of its neighbour.
     """
 
     image: NDArray[np.uint8]

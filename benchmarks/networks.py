@@ -34,7 +34,7 @@ from operators.training.simulated_worlds import FOCAL, HELD_OUT, TRAINING, VALID
 from operators.weights import read_facts, shipped
 
 VISIBLE, PIXELS = 0.6, 200
-"""What counts: objects of which at least this share is visible, and so many pixels at VGA."""
+"""Least visible share, and least number of pixels at VGA, of objects that count."""
 VGA = 640 * 480
 REPOSITORY = Path(__file__).resolve().parent.parent
 RECORDING, RECORDED = REPOSITORY / "recordings" / "demo.mcap", "recordings/demo.mcap"
@@ -74,8 +74,8 @@ def add(score: WorldScore, taken: WorldImage, detector: CustomDetector, segmente
     truth = taken.objects
     assert truth.visible is not None
     assert truth.pixel_counts is not None
-    assert found.class_names == THINGS, f"the detector knows {found.class_names}, the worlds have {THINGS}"
-    assert classes.class_names == CLASSES, f"the segmenter knows {classes.class_names}, the worlds have {CLASSES}"
+    assert found.class_names == THINGS, f"the detector has {found.class_names}, the worlds have {THINGS}"
+    assert classes.class_names == CLASSES, f"the segmenter has {classes.class_names}, the worlds have {CLASSES}"
     least = PIXELS * taken.image.width * taken.image.height / VGA
     ignored = (truth.visible < VISIBLE) | (truth.pixel_counts < least)
     boxes = Candidates(found.boxes, found.scores, found.class_ids)
@@ -203,13 +203,14 @@ def markdown(
     lines += [
         "Both operators as they run in a graph, with the files in `operators/weights/`, on simulated worlds that were "
         f"used neither for training (seeds from {TRAINING}) nor for choosing the best epoch (seeds from {VALIDATION}): "
-        f"their seeds count from {HELD_OUT}. How they were trained is told in "
+        f"their seeds count from {HELD_OUT}. Their training is described in "
         "[operators/weights/README.md](../operators/weights/README.md).",
         "",
         f"Detections count for objects of which at least {VISIBLE:.0%} and {PIXELS} pixels (at 640x480; less in "
-        "smaller images by the area) are visible; it is neither asked for nor wrong to find the others. AP50 is "
-        "pycocotools', mean over classes. Time is for the whole operator: resizing, network, decoding, suppression; "
-        f"each network on one thread, on {_processor()} ({os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}).",
+        "smaller images by the area) are visible; other objects are neither required nor wrong. Labels are the "
+        "simulator's. AP50 is pycocotools', mean over classes. Time is for the whole operator: resizing, network, "
+        f"decoding, suppression; each network on one thread, on {_processor()} "
+        f"({os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}).",
         "",
         "| file | kB | network | input | trained on | validation |",
         "|---|---|---|---|---|---|",
@@ -281,7 +282,7 @@ def _figures(title: str, figures: dict[str, Any]) -> list[str]:
 
 
 def _processor() -> str:
-    """The processor's name where Linux tells it."""
+    """Returns the processor's name by /proc/cpuinfo, or else the architecture."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     found = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

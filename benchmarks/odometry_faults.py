@@ -5,8 +5,8 @@
     python benchmarks/odometry_faults.py worlds office:823 corridor:824      gaps in drives through simulated worlds
 
 One fault at a time, from each of some frames on. ATE is that of the poses as emitted, over the frames whose image or
-depth is valid and changes, after SE(3) alignment; and that of those among them at which the odometry says that it
-tracks. *Tracked* is the share of these; *found again* after how many frames that follow the fault it does so first,
+depth is valid and changes, after SE(3) alignment; and that of those among them at which the odometry reports
+tracking. *Tracked* is the share of these; *found again* after how many frames that follow the fault it does so first,
 within 10 cm of the truth by the first pose: so in the map from before.
 
 In simulated worlds, frames are missing. *Seen before* is how many frames that follow within 1 s show, by the truth,

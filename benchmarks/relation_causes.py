@@ -1,4 +1,4 @@
-"""What the relations that a scene graph lacks or has too many of, over all, are made of.
+"""Causes of the missing and the false relations of a scene graph, over all.
 
     python benchmarks/relation_causes.py CACHE --seeds 506 509
 

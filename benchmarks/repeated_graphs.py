@@ -6,7 +6,7 @@
 A digest is over all messages of an operator's streams, or over its figures where it has none. Four processes share the
 runs. A simulated drive is recorded once and replayed, but for two graphs whose sources run as often. With `--data`,
 the folder that graphs/stereo.yaml and its like take, those graphs run too. Graphs named alone may need `--set`. What
-no graph of graphs/ runs alone has weights, a video, a bag or a small graph of its own, made by repeated_made.py.
+no graph of graphs/ runs alone has weights, a video, a bag or a small graph made by repeated_made.py.
 Several runs of some graphs each may share a --json file, of which `--table FILE` prints the whole.
 """
 

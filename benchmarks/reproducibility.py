@@ -231,7 +231,7 @@ MODES = (
 
 
 def digest_in_a_process(mode: Mode) -> str:
-    """The digest of one run in a process of its own, with the environment that processes have."""
+    """The digest of one run in a new process, with the environment that processes have."""
     here = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     variables = environment(mode.threads)
     variables["PYTHONPATH"] = os.pathsep.join([here, variables["PYTHONPATH"]])

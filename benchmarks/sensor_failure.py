@@ -89,7 +89,7 @@ def misscaled(name: str, message: Any) -> Any:
 
 
 def turned(extrinsics: Transforms, frame: str, axis: str) -> Transforms:
-    """The extrinsics with one frame turned about an axis of its own."""
+    """The extrinsics with one frame turned about one of its axes."""
     at = extrinsics.child_frames.index(frame)
     rotations = extrinsics.rotations.copy()
     rotations[at] = (Rotation.from_quat(rotations[at]) * Rotation.from_euler(axis, TURN)).as_quat()
@@ -206,7 +206,7 @@ def drive(measured: Steps, true: Steps, statics: Mapping[str, Any], first: int, 
 
 def table(rows: Mapping[str, dict[str, Any]]) -> str:
     lines = [
-        "| fault | pose rms / max (m) | AP50 (images) | map recall / precision | relations F1 | who says so |",
+        "| fault | pose rms / max (m) | AP50 (images) | map recall / precision | relations F1 | reported by |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     usual = rows.get("none", {"warnings": {}})["warnings"]

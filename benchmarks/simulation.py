@@ -1,4 +1,4 @@
-"""The engine on a simulated machine: as many seeds as asked, each a scenario of its own.
+"""The engine on a simulated machine: one scenario for each of the requested seeds.
 
 usage: python benchmarks/simulation.py [--seeds 1000] [--from 0] [--jobs 2] [--json]
        python benchmarks/simulation.py --mutants [--seeds 2000]

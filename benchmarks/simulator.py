@@ -93,7 +93,7 @@ def timed(params: dict[str, Any], seconds: float, repeats: int) -> tuple[float, 
 
 
 def against(other: Path, seconds: float, repeats: int) -> None:
-    """CPU of this checkout over that of another, each in processes of their own, in turns; the least of each counts."""
+    """CPU of this checkout over that of another, each in new processes, in turns; the least of each counts."""
     print("| what | world | other, ms of CPU a second | this | ratio |\n| --- | --- | --- | --- | --- |")
     for name in SETUPS:
         for world in WORLDS:

@@ -1,4 +1,4 @@
-"""Seconds until something is seen: a graph started, a tool attached, a recording replayed or verified.
+"""Seconds to the first message or table: a graph started, a tool attached, a recording replayed or verified.
 
     python benchmarks/start.py
     python benchmarks/start.py --against OTHER_TREE     # another checkout in turns with this one: ratios
@@ -55,7 +55,7 @@ def light_graph(folder: Path, count: int) -> Path:
 
 
 class Tree:
-    """A checkout whose command is measured, with a folder of running graphs of its own."""
+    """A checkout whose command is measured, with a separate folder of running graphs."""
 
     def __init__(self, root: Path, folder: Path) -> None:
         self.root, self.folder = root, folder
@@ -190,7 +190,7 @@ def verify(tree: Tree) -> Figures:
 
 
 def recorded(tree: Tree, name: str, snapshots: str) -> Path:
-    """Replays the demo and records everything; `snapshots` is added to what the graph says of its recordings."""
+    """Replays the demo and records everything; `snapshots` is added to the graph's `record` section."""
     file = tree.folder / f"{name}.mcap"
     if not file.exists():
         text = (tree.root / GRAPH).read_text()

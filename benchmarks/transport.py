@@ -72,7 +72,7 @@ def consume(mode: str, endpoint: str) -> None:
 
 
 def make_images(shape: tuple[int, int]) -> list[Image]:
-    """Images whose last pixel tells them apart."""
+    """Images that differ in their last pixel."""
     images = []
     for i in range(IMAGES):
         data = np.zeros((*shape, 3), np.uint8)

@@ -241,7 +241,7 @@ def part(drive: Drive, first: int, last: int) -> Drive:
 
 
 def halves(drive: Drive, cache: Path, every: int) -> None:
-    """Looks for the frames of each half in the map of the other; tells how far from the map's nearest view they are."""
+    """Looks for the frames of each half in the map of the other; prints their distance from the map's nearest view."""
     middle = len(drive.stamps) // 2
     parts = {"first": part(drive, 0, middle), "second": part(drive, middle, len(drive.stamps))}
     for mapped, tried in (("first", "second"), ("second", "first")):

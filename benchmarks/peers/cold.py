@@ -1,4 +1,4 @@
-"""What a message costs where the caches are cold: the round trip of `roundtrip.yaml` in one Python process, by stage.
+"""Costs of a message with cold caches: the round trip of `roundtrip.yaml` in one Python process, by stage.
 
     python benchmarks/peers/cold.py                      # this checkout
     python benchmarks/peers/cold.py --against OTHER      # another checkout in turns with this one, in one run
@@ -160,7 +160,7 @@ class Pair:
         taken_from = time.monotonic_ns()
         self.loops["near"].switch()
         taken = time.monotonic_ns()
-        for window in (self.near.window, self.near.backlog):  # nobody is here who tells the source how far all are
+        for window in (self.near.window, self.near.backlog):  # no supervisor here reports progress to the source
             window.clear()
         spans = {
             "emit": sent - begun,

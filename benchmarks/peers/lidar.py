@@ -1,4 +1,4 @@
-"""Runs LiDAR odometries of others on stored scans; in an environment of their own, started by lidar_odometry.py.
+"""Runs LiDAR odometries of others on stored scans; in a separate environment, started by lidar_odometry.py.
 
 python benchmarks/peers/lidar.py SCANS.npz POSES.npz PEER
 

@@ -30,7 +30,7 @@ WARM_UP = 20
 
 
 class Failed(RuntimeError):
-    """A contestant that gave no result: says why."""
+    """A contestant that gave no result, with the cause."""
 
 
 def script(name: str, peers: Path | None) -> Callable[[int, int], list[float]]:
@@ -59,7 +59,7 @@ def dora(peers: Path) -> Callable[[int, int], list[float]]:
 
 
 def ours(tree: Path, record: Path | None = None) -> Callable[[int, int], list[float]]:
-    """A live run of `roundtrip.yaml` with the code of a checkout, in a Python of its own; recorded, if asked."""
+    """A live run of `roundtrip.yaml` with the code of a checkout, in a separate interpreter; recorded, if asked."""
 
     def run(size: int, count: int) -> list[float]:
         command = [sys.executable, "-P", "-m", "dataflow.cli.main", "run", str(HERE / "roundtrip.yaml"), "--live"]
