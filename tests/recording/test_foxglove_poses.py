@@ -30,7 +30,7 @@ def decoded(proto: object) -> object:
 
 
 def cloud() -> PointCloud:
-    proto = PointCloud(frame_id="lidar", point_stride=12, data=np.float32([[1, 0, 0], [0, 0, 1]]).tobytes())
+    proto = PointCloud(frame_id="lidar", point_stride=12, data=np.array([[1, 0, 0], [0, 0, 1]], np.float32).tobytes())
     for k, axis in enumerate("xyz"):
         proto.fields.add(name=axis, offset=4 * k, type=PackedElementField.FLOAT32)
     return proto

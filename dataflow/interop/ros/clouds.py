@@ -172,10 +172,11 @@ def point_times(
 def _since_epoch(values: npt.NDArray[Any], unit: str, stamp: int) -> npt.NDArray[np.float64]:
     """Seconds since the stamp. Seconds, milliseconds and microseconds are split so that no digit is lost."""
     if values.dtype.kind in "iu" and unit == "ns":
-        return (values.astype(np.int64) - stamp) * 1e-9
+        return np.asarray((values.astype(np.int64) - stamp) * 1e-9, np.float64)
     each = round(1e9 * _UNITS[unit])
     base = stamp // each
-    return np.asarray(((values.astype(np.float64) - base) - (stamp - base * each) / each) * _UNITS[unit])
+    offsets: npt.NDArray[np.float64] = (values.astype(np.float64) - base) - (stamp - base * each) / each
+    return offsets * np.float64(_UNITS[unit])
 
 
 def _likeliest(span: float, farthest: float, whole: bool, period: float) -> str | None:
