@@ -235,6 +235,16 @@ def test_a_depth_topic_that_is_none_is_refused_with_what_it_is(tmp_path: Path) -
     opened.close()
 
 
+def test_a_topic_of_a_known_type_that_cannot_be_read_is_kept_and_named(tmp_path: Path) -> None:
+    rows = [("/odd", s, image(s, "nv12", bytes(24), 4, 4, 6)) for s in STAMPS]
+
+    account = converted(write_ros2(tmp_path / "bag", rows), tmp_path / "o.mcap").account
+
+    assert "topic /odd stays as it is, since it cannot be read: image encoding 'nv12'" in account.notes[0]
+    with Recording(tmp_path / "o.mcap") as recording:
+        assert recording.streams["/odd"].count == 6
+
+
 def test_numbers_beyond_a_double_are_counted(tmp_path: Path) -> None:
     rows = [("/n", s, ros("std_msgs/Int64", data=2**62 + 1)) for s in STAMPS]
 
