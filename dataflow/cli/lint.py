@@ -11,7 +11,7 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, AnyRecording, Json, Overwrite, existing, existing_recording, output_file
-from dataflow.cli.output import DIFFERENT, count, fail, friendly_errors, out, plural, print_json, table
+from dataflow.cli.output import DIFFERENT, count, fail, friendly_errors, out, plural, print_json, shown, table
 
 if TYPE_CHECKING:
     from dataflow.lint.look import Report
@@ -68,6 +68,7 @@ def lint(
             raise fail(str(error)) from None
         with _material(existing_recording(recording)) as material:
             report = look(material, terms, clocks=not quick)
+            shown(finding.text for finding in report.findings)
             if write is not None:
                 name, namespace = recording.stem, material.namespace
                 text = proposed(name, namespace, material.streams, report.timings, report.root)
