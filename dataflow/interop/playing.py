@@ -13,7 +13,7 @@ from dataflow.interop.conversions import offers, proposed
 from dataflow.interop.mapping import MappingError, Offered, Proposal, Wanted, parse_map, propose
 from dataflow.interop.opening import open_bag
 from dataflow.interop.streams import BagStreams, Played
-from dataflow.interop.topics import Reading
+from dataflow.interop.topics import Reading, is_known
 from dataflow.messages import CompressedDepth, DepthImage, Image, Image16, Message, Transforms
 
 
@@ -126,7 +126,8 @@ def readable(
     for name in wishes.depth:
         if name not in bag.topics:
             raise BagError(f"{path} has no topic {name!r}; it has {', '.join(bag.topics) or 'none'}")
-    found = [r for r in readings_of(bag, topics) if r.playable and r.topic.count]
+    readings = readings_of(bag, topics)
+    found = [r for r in readings if r.playable and r.topic.count]
     played = {
         r.topic.name: Played(
             r.topic.name, _wished(r, wishes).SCHEMA, r.read_as is Transforms and is_static(r.topic.name)
@@ -134,7 +135,10 @@ def readable(
         for r in found
         if r.read_as is not None
     }
-    return BagStreams(path, played, clock, strict=wishes.strict, accounting=accounting)
+    streams = BagStreams(path, played, clock, strict=wishes.strict, accounting=accounting)
+    kept = [r for r in readings if r.topic.count and not r.playable and is_known(r.topic)]
+    streams.account.notes += [f"topic {r.topic.name} stays as it is, since it cannot be read: {r.reason}" for r in kept]
+    return streams
 
 
 def _wished(reading: Reading, wishes: Wishes) -> type[Message]:

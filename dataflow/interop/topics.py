@@ -19,7 +19,7 @@ from dataflow.interop.seen import Seen
 from dataflow.interop.typestores import RosType, ros_type
 from dataflow.messages import Message, MessageError, Transforms
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.streams.foreign import foreign_decoder
+from dataflow.recording.streams.foreign import foreign_decoder, foreign_losses
 
 Data = bytes | memoryview
 
@@ -129,8 +129,8 @@ def _converted(convert: Convert, kind: RosType, data: Data, stamp: int, losses: 
 class ForeignReader:
     """Reads what has a decoder among those of recordings: the Foxglove schemas, as protobuf or JSON."""
 
-    def __init__(self, decode: Callable[[bytes, int], Message]) -> None:
-        self._decode = decode
+    def __init__(self, topic: Topic, decode: Callable[[bytes, int], Message]) -> None:
+        self._topic, self._decode = topic, decode
 
     def stamps(self, data: Data) -> tuple[int, ...]:
         """The time that it carries."""
@@ -139,7 +139,10 @@ class ForeignReader:
 
     def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
         """The message."""
-        return self._decode(bytes(data), stamp).replace(stamp=stamp)
+        made = self._decode(bytes(data), stamp).replace(stamp=stamp)
+        if losses is not None:
+            losses += foreign_losses(self._topic.encoding, self._topic.schema, bytes(data))
+        return made
 
 
 def reader_of(topic: Topic) -> TopicReader:
@@ -150,7 +153,7 @@ def reader_of(topic: Topic) -> TopicReader:
     if decode is None:
         kind = topic.schema.name or "no schema"
         raise RecordingError(f"{topic.encoding or 'unnamed'} messages of {kind} have no counterpart here")
-    return ForeignReader(decode)
+    return ForeignReader(topic, decode)
 
 
 def _ros_reader(topic: Topic) -> TopicReader:

@@ -40,6 +40,7 @@ class TrajectoryMetrics(Operator):
     alignment: Literal["se3", "sim3", "none"] = Param(
         "se3", doc="moves the whole estimate onto the truth (Umeyama): rigidly, with scale, or not at all"
     )
+    one_place: tuple[str, ...] = Param((), doc="child frames that count as one, such as base_footprint and base_link")
     tolerance: Duration = Param("1ms", doc="farthest in time that an estimate's truth may be")
     rpe_seconds: float = Param(1.0, gt=0, doc="span of the relative error over time", unit="s")
     rpe_metres: float = Param(1.0, gt=0, doc="span of the relative error over the true path", unit="m")
@@ -57,10 +58,11 @@ class TrajectoryMetrics(Operator):
     def process(self, estimate: Pose | Odometry, ground_truth: tuple[Pose | Odometry, ...]) -> None:
         """Raises ValueError where estimate and truth pose different child frames."""
         for truth in ground_truth:
-            if truth.child_frame and estimate.child_frame and truth.child_frame != estimate.child_frame:
+            names = {truth.child_frame, estimate.child_frame} - {""}
+            if len(names) > 1 and not names <= set(self.one_place):
                 raise ValueError(
                     f"the ground truth poses {truth.child_frame!r} but the estimate {estimate.child_frame!r}: "
-                    f"both must pose the same frame"
+                    f"both must pose the same frame, or `one_place` names both"
                 )
             if np.isfinite(truth.position).all():
                 self._truth.append(truth.stamp, truth.position, truth.orientation)

@@ -247,3 +247,38 @@ def test_the_types_of_messages_are_listed_and_described(dataflow) -> None:
     assert {"name": "angular_velocity", "unit": "rad/s"}.items() <= {k: described["fields"][3][k] for k in ("name", "unit")}.items()  # fmt: skip  # noqa: E501
     assert described["ros"] == ["sensor_msgs/Imu"]
     assert "there is no message type 'Odo'; there are Odometry" in dataflow("messages", "Odo", code=2).stderr
+
+
+TRIED: dict[str, list[tuple[str, ...]]] = {
+    "lint": [
+        ("REC", "--quick"),
+        ("REC", "--write-contract", "OUT.yaml", "--overwrite"),
+        ("REC", "--contract", "OUT.yaml"),
+        ("REC", "--json"),
+    ],
+    "info": [("REC", "--digests"), ("REC", "--metadata"), ("REC", "--json")],
+    "recover": [
+        ("REC", "--out", "OUT.mcap", "--compression", "lz4"),
+        ("REC", "--out", "OUT.mcap", "--overwrite", "--quiet"),
+        ("REC", "--out", "OTHER.mcap", "--json"),
+    ],
+    "messages": [("Imu", "--json"), ("--path", "FOLDER")],
+}
+"""Command lines of the other commands that look at material, by command: each option once."""
+
+
+@pytest.mark.parametrize("name", TRIED)
+def test_every_option_of_commands_that_look_at_material_is_run(
+    dataflow, drive: Path, tmp_path: Path, name: str
+) -> None:
+    dataflow("convert", drive, tmp_path / "rec.mcap", "--to", "mcap")
+    places = {"REC": "rec.mcap", "OUT.yaml": "out.yaml", "OUT.mcap": "out.mcap", "OTHER.mcap": "o.mcap", "FOLDER": ""}
+
+    code = 1 if name == "lint" else 0  # frames of the drive hang on nothing
+    for words in TRIED[name]:
+        dataflow(name, *(tmp_path / places[word] if word in places else word for word in words), code=code)
+
+    group = get_command(app)
+    command = group.get_command(Context(group), name)  # type: ignore[attr-defined]
+    offered = {option for p in command.params for option in p.opts if option.startswith("--") and option != "--help"}
+    assert offered == {word for words in TRIED[name] for word in words if word.startswith("--")}

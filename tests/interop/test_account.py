@@ -235,6 +235,35 @@ def test_a_depth_topic_that_is_none_is_refused_with_what_it_is(tmp_path: Path) -
     opened.close()
 
 
+def test_a_topic_of_two_types_keeps_both_there_and_back(tmp_path: Path) -> None:
+    with Writer2(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for kind, value in (("String", "a"), ("Float64", 2.0)):
+            name = f"std_msgs/msg/{kind}"
+            connection = writer.add_connection("/x", name, typestore=ROS2)
+            for stamp in STAMPS[: 4 if kind == "String" else 2]:
+                writer.write(connection, stamp, ROS2.serialize_cdr(ROS2.types[name](data=value), name))
+
+    converted(tmp_path / "bag", tmp_path / "o.mcap")
+    for source in ("bag", "o.mcap"):
+        with Material(tmp_path / source) as material:
+            export_ros2(material, tmp_path / f"of_{source}", Exported())
+
+        back = open_bag(tmp_path / f"of_{source}")
+        held = {(topic.name, topic.schema.name): topic.count for topic in back.topics.values()}
+        back.close()
+        assert held == {("/x", "std_msgs/msg/String"): 4, ("/x (std_msgs/msg/Float64)", "std_msgs/msg/Float64"): 2}
+
+
+def test_a_topic_of_a_known_type_that_cannot_be_read_is_kept_and_named(tmp_path: Path) -> None:
+    rows = [("/odd", s, image(s, "nv12", bytes(24), 4, 4, 6)) for s in STAMPS]
+
+    account = converted(write_ros2(tmp_path / "bag", rows), tmp_path / "o.mcap").account
+
+    assert "topic /odd stays as it is, since it cannot be read: image encoding 'nv12'" in account.notes[0]
+    with Recording(tmp_path / "o.mcap") as recording:
+        assert recording.streams["/odd"].count == 6
+
+
 def test_numbers_beyond_a_double_are_counted(tmp_path: Path) -> None:
     rows = [("/n", s, ros("std_msgs/Int64", data=2**62 + 1)) for s in STAMPS]
 

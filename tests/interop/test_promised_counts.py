@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 import zstandard
-from made_bags import ROS1, SECOND, imus, ros, transform, write_ros2
+from made_bags import ROS1, ROS2, SECOND, imus, ros, transform, write_ros2
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 
 from dataflow.interop.bag import BagError, shortfalls
 from dataflow.interop.opening import open_bag
@@ -97,6 +99,23 @@ def test_files_compressed_as_a_whole_are_read(tmp_path: Path, storage: str, meta
         (folder / "metadata.yaml").unlink()
 
     assert counted(folder) == {"/imu": 20}
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_messages_compressed_one_by_one_are_read(tmp_path: Path, storage: StoragePlugin) -> None:
+    rows = imus(STAMPS)
+    kind = "sensor_msgs/msg/Imu"
+    writer = Writer2(tmp_path / "bag", version=9, storage_plugin=storage)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/imu", kind, typestore=ROS2)
+        for _, time, message in rows:
+            writer.write(connection, time, ROS2.serialize_cdr(message, kind))
+
+    bag = open_bag(tmp_path / "bag")
+
+    assert [bytes(s.data) for s in bag.messages(["/imu"])] == [bytes(ROS2.serialize_cdr(m, kind)) for _, _, m in rows]
+    bag.close()
 
 
 def test_split_databases_are_one_bag_in_the_order_of_log_times(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from dataflow.messages import LaserScan as ScanMessage
 from dataflow.messages import PointCloud as CloudMessage
 from dataflow.recording import RecordingError
 from dataflow.recording.streams.codecs import SchemaText
-from dataflow.recording.streams.foreign import foreign_decoder
+from dataflow.recording.streams.foreign import foreign_decoder, foreign_losses
 
 HALF = float(np.sqrt(0.5))
 
@@ -30,7 +30,7 @@ def decoded(proto: object) -> object:
 
 
 def cloud() -> PointCloud:
-    proto = PointCloud(frame_id="lidar", point_stride=12, data=np.float32([[1, 0, 0], [0, 0, 1]]).tobytes())
+    proto = PointCloud(frame_id="lidar", point_stride=12, data=np.array([[1, 0, 0], [0, 0, 1]], np.float32).tobytes())
     for k, axis in enumerate("xyz"):
         proto.fields.add(name=axis, offset=4 * k, type=PackedElementField.FLOAT32)
     return proto
@@ -97,6 +97,15 @@ def test_images_of_other_encodings_become_rgb() -> None:
 
     assert isinstance(found, Image)
     assert found.data.tolist() == [[[3, 2, 1]]]
+
+
+def test_fields_of_points_that_have_no_place_are_named() -> None:
+    proto = cloud()
+    proto.fields.add(name="ambient", offset=0, type=PackedElementField.FLOAT32)
+    schema = SchemaText("foxglove.PointCloud", "protobuf", b"")
+
+    assert foreign_losses("protobuf", schema, proto.SerializeToString()) == ["the field ambient of the points"]
+    assert foreign_losses("json", schema, b'{"frame_id": "a", "extra": 1}') == ["extra"]
 
 
 def test_16_bit_images_keep_their_bits() -> None:

@@ -19,7 +19,7 @@ from dataflow.cli.support.arguments import (
     existing_recording,
     output_file,
 )
-from dataflow.cli.support.output import DIFFERENT, count, fail, friendly_errors, out, plural, print_json, table
+from dataflow.cli.support.output import DIFFERENT, count, fail, friendly_errors, out, plural, print_json, shown, table
 
 if TYPE_CHECKING:
     from dataflow.lint.look import Report
@@ -76,6 +76,7 @@ def lint(
             raise fail(str(error)) from None
         with _material(existing_recording(recording)) as material:
             report = look(material, terms, clocks=not quick)
+            shown(finding.text for finding in report.findings)
             if write is not None:
                 name, namespace = recording.stem, material.namespace
                 text = proposed(name, namespace, material.streams, report.timings, report.root)

@@ -93,7 +93,7 @@ def _prefixes(words: Sequence[str], recordings: Sequence[Path]) -> list[str]:
 
 
 def recover(
-    recording: Annotated[Path, typer.Argument(metavar="BROKEN.mcap", help="A torn or damaged MCAP file.")],
+    recording: Annotated[Path, typer.Argument(metavar="BROKEN", help="A torn or damaged MCAP file, .db3 or .bag.")],
     output: Out,
     compression: Compression = "zstd",
     overwrite: Overwrite = False,
@@ -104,18 +104,20 @@ def recover(
 
     The new file has a proper end and an index. What is lost is counted: by the numbers of messages, which have no gaps,
     and by firing records, which are stored before the messages that they tell of. `dataflow verify` of what was saved
-    is never "identical" for more than what is there.
+    is never "identical" for more than what is there. Of a ROS 2 bag in sqlite3 that was cut off, and of a ROS 1 bag
+    without its index, whole messages are saved wherever they lie.
 
     Exit codes:
 
       0    written, and nothing is known to be lost
       1    written, and something is lost
-      2    could not recover: no MCAP file
+      2    could not recover: neither an MCAP file nor a ROS bag, or no whole message
 
     Examples:
 
       dataflow recover broken.mcap -o saved.mcap
       dataflow recover broken.mcap -o saved.mcap --json
+      dataflow recover cut.db3 -o saved.mcap
     """
     from dataflow.cli.support.output import DIFFERENT
     from dataflow.editing.recover import recover as save

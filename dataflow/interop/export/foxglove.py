@@ -34,7 +34,9 @@ def export_foxglove(material: Material, file: Path, done: Exported) -> None:
                 channels[place] = _open(writer, f"/{material.names[recorded.stream].lstrip('/')}", message)
             known = FOXGLOVE_SCHEMAS.get(type(message))
             for field in () if known is None else known.encode(message)[1]:
-                if getattr(message, field) not in (None, ""):
+                if field == "precise":
+                    done.narrow(material.names[recorded.stream], "points of 64 bits, of which 32 are written")
+                elif not isinstance(value := getattr(message, field), str | None) or value:
                     done.lose(material.names[recorded.stream], field)
             if (drawn := drawing_of(message)) is not None:
                 what = drawn.proto.DESCRIPTOR.full_name

@@ -70,20 +70,19 @@ class Ros2Writer:
         self.mcap = Writer(self._stream, compression=CompressionType.ZSTD)
         self.mcap.start(profile="ros2", library="dataflow convert")
         self._schemas: dict[SchemaText, int] = {}
-        self._channels: dict[str, _Channel] = {}
+        self._channels: dict[tuple[str, str], _Channel] = {}
         self._first: int | None = None
         self._last = 0
 
     def write(
         self, topic: str, schema: SchemaText, data: bytes, stamp: int, *, latched: bool = False, unit: str = ""
     ) -> None:
-        """Adds a message; raises `RecordingError` for another type than the topic has. `unit`: of its numbers, for the
-        channel's metadata, since ROS has no place for it."""
-        channel = self._channels.get(topic)
+        """Adds a message; a topic of two types has two channels. `unit`: of its numbers, for the channel's metadata,
+        since ROS has no place for it."""
+        topic = topic.removesuffix(f" ({schema.name})")  # as the rarer type of a topic is called here
+        channel = self._channels.get((topic, schema.name))
         if channel is None:
-            channel = self._channels[topic] = self._open(topic, schema, latched, unit)
-        if channel.type != schema.name:
-            raise RecordingError(f"topic {topic} is {channel.type} already, and cannot hold {schema.name}")
+            channel = self._channels[topic, schema.name] = self._open(topic, schema, latched, unit)
         self.mcap.add_message(channel.id, log_time=stamp, publish_time=stamp, data=data, sequence=channel.count)
         channel.count += 1
         self._first = stamp if self._first is None else min(self._first, stamp)
@@ -118,7 +117,7 @@ class Ros2Writer:
             f"  message_count: {total}",
             "  topics_with_message_count:" if self._channels else "  topics_with_message_count: []",
         ]
-        for topic, channel in self._channels.items():
+        for (topic, _), channel in self._channels.items():
             lines += [
                 "    - topic_metadata:",
                 f"        name: {topic}",
@@ -230,7 +229,7 @@ def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exp
 
 def _topic_of(material: Material, name: str) -> str:
     if name in material.topics:
-        return _ros_name(material.topics[name].partition(" (")[0])
+        return _ros_name(material.topics[name])
     if material.streams[name].message_type is Transforms:
         return "/tf_static" if material.streams[name].static else "/tf"
     return _ros_name(material.names[name])

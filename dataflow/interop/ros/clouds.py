@@ -175,7 +175,8 @@ def _since_epoch(values: npt.NDArray[Any], unit: str, stamp: int) -> npt.NDArray
         return np.asarray((values.astype(np.int64) - stamp) * 1e-9, np.float64)
     each = round(1e9 * _UNITS[unit])
     base = stamp // each
-    return np.asarray(((values.astype(np.float64) - base) - (stamp - base * each) / each) * _UNITS[unit])
+    offsets: npt.NDArray[np.float64] = (values.astype(np.float64) - base) - (stamp - base * each) / each
+    return offsets * np.float64(_UNITS[unit])
 
 
 def _likeliest(span: float, farthest: float, whole: bool, period: float) -> str | None:

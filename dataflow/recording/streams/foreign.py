@@ -8,6 +8,7 @@ from typing import Any
 
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.json_format import ParseDict, ParseError
 from google.protobuf.message import DecodeError
@@ -18,6 +19,7 @@ from dataflow.messages.base import Message
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.codecs import SchemaText, build
 from dataflow.recording.streams.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, stamp_of
+from dataflow.recording.streams.foxglove.clouds import CLOUD_FIELDS
 from dataflow.recording.streams.json_codec import decode_object
 from dataflow.recording.streams.pixels import is_16_bit
 
@@ -57,6 +59,28 @@ def foreign_decoder(message_encoding: str, schema: SchemaText) -> Callable[[byte
 def _one_transform(proto: FrameTransform, log_time: int) -> Message:
     """foxglove.FrameTransform: a set of one."""
     return _message(FOXGLOVE_SCHEMAS[Transforms], FrameTransforms(transforms=[proto]), log_time)
+
+
+_UNREAD: dict[str, tuple[str, ...]] = {
+    "foxglove.Log": ("file", "line"),
+    "foxglove.LocationFix": ("color",),
+}
+"""By schema, the fields that have no place here."""
+
+
+def foreign_losses(message_encoding: str, schema: SchemaText, data: bytes) -> list[str]:
+    """Names what a message of a Foxglove schema holds that has no place here. Raises `RecordingError`."""
+    found = next((s for s in FOXGLOVE_SCHEMAS.values() if s.name == schema.name), None)
+    if found is None or message_encoding not in ("protobuf", "json"):
+        return []
+    proto = found.parse(data) if message_encoding == "protobuf" else _from_json(found, data)
+    lost = [field.name for field, _ in proto.ListFields() if field.name in _UNREAD.get(schema.name, ())]
+    if isinstance(proto, PointCloud):
+        lost += [f"the field {field.name} of the points" for field in proto.fields if field.name not in CLOUD_FIELDS]
+    if message_encoding == "json":
+        known = {name for field in proto.DESCRIPTOR.fields for name in (field.name, field.json_name)}
+        lost += sorted(decode_object(data).keys() - known)
+    return lost
 
 
 def _stamp(proto: Any, log_time: int) -> int:

@@ -236,3 +236,16 @@ def test_a_truth_of_another_clock_is_named_with_both_spans(apart: int, named: bo
     told = str(metrics.summary().get("matching", ""))
     assert ("only 0 of 20 poses" in told) == named
     assert ("1500000000.000 to" in told) == named
+
+
+def test_frames_that_are_one_place_are_scored_together() -> None:
+    place = {"frame": "world", "position": [0.0, 0, 0], "orientation": [0.0, 0.0, 0.0, 1.0]}
+    estimate = Pose(stamp=1, child_frame="base_link", **place)
+    truth = (Pose(stamp=1, child_frame="base_footprint", **place),)
+    strict, told = TrajectoryMetrics(), TrajectoryMetrics(one_place=("base_link", "base_footprint"))
+    for metrics in (strict, told):
+        metrics.setup()
+
+    told.process(estimate=estimate, ground_truth=truth)
+    with pytest.raises(ValueError, match="or `one_place` names both"):
+        strict.process(estimate=estimate, ground_truth=truth)

@@ -43,6 +43,8 @@ _CLOUD_COLUMNS: tuple[tuple[str, tuple[str, ...], str, int], ...] = (
     ("rings", ("ring",), "<u2", NUMERIC.UINT16),
 )
 """Field of `PointCloud`, its packed columns in the order written, their dtype."""
+CLOUD_FIELDS = {column for _, columns, _, _ in _CLOUD_COLUMNS for column in columns} | {"alpha"}
+"""Names of packed columns that are read."""
 OPAQUE = 255
 CLOUD_EXTRAS = ("precise", "columns")
 
