@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from dataflow.graph import load_graph
+from dataflow.recording.parts import Storage
 from dataflow.sinks import freed_memory
 from dataflow.sinks.sink import SinkConfig
 from dataflow.supervision import process_main as main
@@ -53,6 +54,7 @@ def test_a_recorder_keeps_freed_memory(monkeypatch: pytest.MonkeyPatch, tmp_path
     monkeypatch.setattr(freed_memory, "keep_freed_memory", lambda: asked.append(True))
     graph = load_graph(GRAPH)
     options = {"path": str(tmp_path / "run.mcap"), "metadata": {}, "compression": "zstd", "overwrite": False}
+    options["storage"] = Storage().to_json()
 
     main._recorder(SinkConfig("@recorder", "record", graph.to_json(), [], [], options), graph).close("complete")
 
