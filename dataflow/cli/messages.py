@@ -76,13 +76,12 @@ def _described(kind: type[Message]) -> dict[str, Any]:
     stamp = {"name": "stamp", "type": "int", "unit": "ns", "optional": False, "doc": "event time since the epoch"}
     fields = [stamp]
     for field in kind.FIELDS:
-        array = isinstance(field, ArrayField)
         form = f"{field.dtype_text()} {field.shape_text()}" if isinstance(field, ArrayField) else field.kind
         fields.append(
             {
                 "name": field.name,
                 "type": form + (" | None" if field.optional else ""),
-                "unit": field.unit if array else "",
+                "unit": field.unit if isinstance(field, ArrayField) else "",
                 "optional": field.optional,
                 "doc": field.doc,
             }
