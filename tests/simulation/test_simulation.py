@@ -234,7 +234,7 @@ FOUND_BY = {
         live=True,
         count=6,
         period=20_000_000,
-        machine=Machine(4),
+        machine=Machine(7),
         happenings=(Happening(0.01, "freeze", "loop", {"span": 0.05}),),
         parts=(
             "left: {SOURCE}",
