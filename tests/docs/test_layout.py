@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
+MOST_ON_A_FLOOR = 25
+MOST_ARROWS_IN_ODOMETRY = 40
 MOST_LINES = 60
 LONG = {
     "dataflow.cli.commands.convert:convert": 124,
@@ -133,6 +135,35 @@ def test_folders_of_operators_do_not_import_each_other_in_a_circle(repository: P
             del left[room]
     circle = {room: sorted(others & left.keys()) for room, others in left.items()}
     assert not circle, f"these import each other, or what does: {circle}"
+
+
+def inside_of(room: str, between: Mapping[str, set[str]]) -> dict[str, set[str]]:
+    """Module or folder of a room → those beside it that it imports."""
+
+    def part(module: str) -> str:
+        return module.removeprefix(f"{room}.").partition(".")[0]
+
+    parts: dict[str, set[str]] = {}
+    for module, others in between.items():
+        if module.startswith(f"{room}."):
+            beside = {part(other) for other in others if other.startswith(f"{room}.")}
+            parts.setdefault(part(module), set()).update(beside - {part(module)})
+    return parts
+
+
+def test_no_room_is_a_warehouse(repository: Path) -> None:
+    between = arrows(repository)
+    rooms = {".".join(module.split(".")[:depth]) for module in between for depth in range(1, module.count(".") + 1)}
+    for room in sorted(rooms):
+        left = inside_of(room, between)
+        while left:
+            floor = {name for name, others in left.items() if not others & left.keys()}
+            assert len(floor) <= MOST_ON_A_FLOOR, f"{room}: {len(floor)} on one floor: {sorted(floor)}"
+            if not floor:  # folders that import each other, by modules that do not
+                break
+            left = {name: others for name, others in left.items() if name not in floor}
+    odometry = sum(len(others) for others in inside_of("operators.odometry", between).values())
+    assert odometry <= MOST_ARROWS_IN_ODOMETRY
 
 
 def lines_of_functions(tree: ast.AST, name: str) -> Iterator[tuple[str, int]]:
