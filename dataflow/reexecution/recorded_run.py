@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dataflow.execution.feeds.playable import PlayableStreams
 from dataflow.execution.generators.seeding import version_of
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Graph, Node
 from dataflow.graph.sections import Network
 from dataflow.messages.base import message_type
 from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import ENDS, GRAPH, RUN
+
+if TYPE_CHECKING:
+    from dataflow.graph.lookup import NotFound
+    from dataflow.operator import Operator
 
 _PROCESS = "process of "
 
@@ -41,7 +45,8 @@ def recorded_graph(recording: PlayableStreams) -> Graph:
 
 def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
     """Returns the graph that made a recording, and why operators of it are not here, by operator: their modules or
-    classes are gone. These are external in it, so that what they made is taken from the recording.
+    classes are gone, or lack a parameter or a port of then. These are external in it, so that what they made is taken
+    from the recording.
 
     Raises as `recorded_graph`.
     """
@@ -53,8 +58,10 @@ def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
     except GraphError:
         graph = resolved_graph(recording)
         found = {} if graph is None else {name: find_operator(node.use) for name, node in graph.nodes.items()}
-        absent = {name: cls.message for name, cls in found.items() if isinstance(cls, NotFound) and cls.deleted}
-        if graph is None or not absent:
+        if graph is None:
+            raise
+        absent = {name: why for name, node in graph.nodes.items() if (why := _missing(node, found[name]))}
+        if not absent:
             raise
     nodes = {
         name: replace(node, external=True)
@@ -64,6 +71,16 @@ def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
         for cls in (found[name],)
     }
     return isolated(replace(graph, nodes=nodes)), absent
+
+
+def _missing(node: Node, found: type[Operator] | NotFound) -> str:
+    """Returns why the class of a node is gone, or which parameters and ports of then it lacks; "" where it is here."""
+    if not isinstance(found, type):
+        return found.message if found.deleted else ""
+    spec = found.spec
+    gone = [f"parameter {name!r}" for name in sorted(node.params.keys() - spec.parameters.model_fields.keys())]
+    gone += [f"input {name!r}" for name in sorted(node.inputs.keys() - spec.inputs.keys())]
+    return f"{node.use} has no {', no '.join(gone)} any more" if gone else ""
 
 
 def isolated(graph: Graph) -> Graph:

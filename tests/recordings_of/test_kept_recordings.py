@@ -107,7 +107,7 @@ def test_the_kept_run_verifies_with_operators_that_have_moved(tmp_path: Path, mo
 
 
 DELETED = {"perception/focus", "perception/names"}
-"""Operators that `perception.mcap` may name in vain."""
+"""Operators of `perception.mcap` that were deleted since. Others lack parameters of then."""
 UNCHANGED = {"perception/image_watch", "perception/depth_watch", "perception/scan_watch"}
 """Operators that only count and compare. Others round as the kernels for a CPU do, or have changed since."""
 
@@ -115,6 +115,9 @@ UNCHANGED = {"perception/image_watch", "perception/depth_watch", "perception/sca
 def test_the_kept_perception_verifies_but_for_operators_that_were_deleted() -> None:
     report = verify(HERE / "perception.mcap")
 
-    assert report.absent.keys() <= DELETED
+    assert report.absent.keys() >= DELETED
+    assert all("has no parameter" in report.absent[name] for name in report.absent.keys() - DELETED), report.absent
     assert {v.operator for v in report.operators if v.verdict == "identical"} >= UNCHANGED
-    assert all(v.verified == v.firings for v in report.operators)
+    unverifiable = {v.operator for v in report.operators if v.verdict == "unverifiable"}
+    assert unverifiable <= {"perception/postures"}  # whose input was not recorded, and is made by one that is gone
+    assert all(v.verified == v.firings for v in report.operators if v.operator not in unverifiable)

@@ -124,3 +124,30 @@ def test_a_module_that_is_here_and_fails_to_import_is_an_error(folder: Path) -> 
 
     with pytest.raises(GraphError, match="half written"):
         verify(path)
+
+
+def test_an_operator_that_lacks_a_parameter_of_then_is_named_and_the_rest_verified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, more in (("stays_here", ""), ("changes", '\n    gain: float = Param(1.0, doc="gain")\n')):
+        text = MODULE.replace("Out, Source", "Out, Param, Source").replace("    x: In", f"{more}    x: In")
+        (tmp_path / f"{name}.py").write_text(text)
+        sys.modules.pop(name, None)
+    importlib.invalidate_caches()
+    graph = load_text("""
+graph: test
+operators:
+  src: {use: "stays_here:Numbers"}
+  less: {use: "changes:Same", params: {gain: 2.0}, inputs: {x: src/out}}
+  after: {use: "stays_here:Same", inputs: {x: less/out}}
+""")
+    run(graph, placement="one_process", record=tmp_path / "run.mcap")
+    (tmp_path / "changes.py").write_text(MODULE)
+    sys.modules.pop("changes")
+    importlib.invalidate_caches()
+
+    report = verify(tmp_path / "run.mcap")
+
+    assert report.absent == {"less": "changes:Same has no parameter 'gain' any more"}
+    assert verdicts(report) == {"after": "identical"}
