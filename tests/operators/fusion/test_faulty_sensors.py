@@ -56,9 +56,8 @@ class Drive:
         jump: tuple[float, float] = (0, 0),
         out: tuple[float, float] = (0, 0),
         late: float = 0.0,
-        stamped: float = 0.0,
     ) -> list[Event]:
-        """Positions, all of them `off` (m), 5 m more within `jump` (s), none within `out`; `late`, `stamped` in s."""
+        """Positions, all of them `off` (m), 5 m more within `jump` (s), none within `out`; they come `late` (s)."""
         made: list[Event] = []
         for k in range(0, len(self.t), RATE // 5):
             x, sigma = self.t[k], np.array([0.05, 0.05, 0.1])
@@ -66,7 +65,7 @@ class Drive:
             if jump[0] <= x < jump[1]:
                 place = place + np.array([5.0, 0, 0])
             fix = Pose(
-                stamp=stamp_of(x + stamped),
+                stamp=stamp_of(x),
                 frame="world",
                 child_frame="base_link",
                 position=place,
@@ -246,3 +245,17 @@ def test_alarms_and_doubts_come_back_from_a_snapshot() -> None:
     assert other._filter.health["robot/fix"].leap
     assert other.snapshot()["alarms"] == one.snapshot()["alarms"]
     assert other.summary() == one.summary()
+
+
+def test_snapshots_from_before_there_were_alarms_restore() -> None:
+    drive = Drive(7.0)
+    operator = Run(drive, drive.fixes(jump=(6.0, 9.0))).operator
+    old = dict(operator.snapshot())
+    old["reported"] = old.pop("alarms")["reported"]
+    for row in old["filter"]["base"]["health"].values():
+        row[6] = [doubt[:3] for doubt in row[6]]
+        del row[9:]
+    other = EkfFusion(patience=0.5, heading=drive.heading, sensors=operator.sensors)
+    other.setup()
+    other.restore(old)
+    assert other.summary() == operator.summary()
