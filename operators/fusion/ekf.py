@@ -23,6 +23,7 @@ from dataflow.messages import (
     Twist,
 )
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
+from operators.fusion.alarms import Alarms
 from operators.fusion.constraints import Constraints
 from operators.fusion.control import Command
 from operators.fusion.covariances import Unusable
@@ -52,9 +53,10 @@ class EkfFusion(Operator):
 
     Settings of a stream stand under the end of its name (`robot/fix`); the status names those of no stream. A
     chi-square gate refuses what does not fit; measurements that fit only because the filter knows little wait for a
-    second one that agrees, and refused ones that agree with each other show the filter to be wrong, which makes room
-    for them. Detections of a radar and ranges may be of something else, so the filter never yields to those. A radar
-    counts by its Doppler velocities, or, as `range`, by its distances from landmarks that its `ids` name.
+    second one that agrees, and refused ones that agree for a second show the filter to be wrong, which makes room for
+    them, unless they leapt and the inertial sensor felt nothing; the status warns at once. Detections of a radar and
+    ranges may be of something else, so the filter never yields to those. A radar counts by its Doppler velocities, or,
+    as `range`, by its distances from landmarks that its `ids` name.
 
     A sensor's time offset is a setting, `offset`; with `offset_sigma` it is a state of the filter and estimated, as far
     as the motion tells of it. So are a position's error that changes slowly, as satellites have (`drift`), and the
@@ -63,9 +65,8 @@ class EkfFusion(Operator):
     `standstill` and `slip` say what is known of the motion without a sensor of it (wheels say both by themselves).
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
     rest the gyroscope's bias. With `start: unknown` position and heading come from the measurements; headings all
-    around are tried side by side until one is left, and the covariance holds them all. Odometry begins when the
-    position's standard deviation is below `sure` for the first time. With `start: origin` the first pose is the world
-    frame.
+    around are tried side by side until one is left, and the covariance holds them all. With `start: origin` the first
+    pose is the world frame. Odometry begins when the position is known (`sure`).
 
     Methods: Solà, "Quaternion kinematics for the error-state Kalman filter", 2017; Li and Mourikis, "Online temporal
     calibration for camera-IMU systems", 2014.
@@ -125,7 +126,7 @@ class EkfFusion(Operator):
             InertialConfig(self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rest, self.patience)
         )
         self._dropout = ImuDropout(self.max_gap, self.gravity, self._unknown())
-        self._reported = -1
+        self._alarms = Alarms()
         self._origin, self._sure = self.origin, False
         self._ignored: Counter[str] = Counter()
         self._last = LastMeasurements()
@@ -172,7 +173,7 @@ class EkfFusion(Operator):
             "inertial": self._inertial.snapshot(),
             "silence": self._dropout.snapshot(),
             "constraints": self._constraints.snapshot(),
-            "reported": self._reported,
+            "alarms": self._alarms.snapshot(),
             "stamps": dict(self._last.stamps),
             "before": self._last.odometry_state(),
             "origin": None if self._origin is None else list(self._origin),
@@ -191,14 +192,13 @@ class EkfFusion(Operator):
             self._filter = LateFilter.restored(self._config(), state["filter"])
         if "inertial" in state:
             self._inertial.restore(state["inertial"])
-            self._reported = int(state["reported"])
+            self._alarms.restore(state.get("alarms", state))
         else:  # as snapshots were before the sensor kept its own part
-            *stamps, self._reported = (int(stamp) for stamp in state["stamps"])
-            self._inertial.restore({"samples": state["samples"], "stamps": stamps})
-        if "silence" in state:
-            self._dropout.restore(state["silence"])
-        if "constraints" in state:
-            self._constraints.restore(state["constraints"])
+            self._alarms.restore({"reported": state["stamps"][-1]})
+            self._inertial.restore({"samples": state["samples"], "stamps": state["stamps"][:-1]})
+        for name, part in (("silence", self._dropout), ("constraints", self._constraints)):
+            if name in state:
+                part.restore(state[name])
         last = state["stamps"] if "inertial" in state else {}
         self._last.restore(state.get("heard", ()), last, state["before"])
         self._origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1], state["origin"][2])
@@ -235,6 +235,7 @@ class EkfFusion(Operator):
             unknown=self._unknown(),
             gates=self._gates,
             errors=errors_of(self.sensors),
+            unfelt=self._prior().unfelt(self.gravity) if inertial else None,
         )
 
     def _unknown(self) -> Noise:
@@ -336,15 +337,14 @@ class EkfFusion(Operator):
 
     def _status(self, stamp: int) -> Diagnostics | None:
         assert self._filter is not None
-        if self._reported >= 0 and stamp - self._reported < 10**9:
+        health, ignored = self._filter.health, self._ignored + self._filter.ignored
+        if (unused := self._alarms.due(stamp, health, self._filter.ignored, self._gates)) is None:
             return None
-        self._reported = stamp
-        ignored = self._ignored + self._filter.ignored
-        unused = {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
+        unused |= {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
         unused |= unmeasured(self._filter.estimate(stamp)[0].covariance)
         if self._dropout.lasts(stamp):
             unused["inertial sensor"] = "silent: the motion is bridged by what others see"
-        return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, self._offsets(), unused)
+        return diagnostics(stamp, health, self._filter.hypotheses, ignored, self._offsets(), unused)
 
     def _unheard(self) -> list[tuple[str, str]]:
         return list(unheard(tuple(self.sensors), sorted(self._last.streams)).items())

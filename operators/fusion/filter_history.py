@@ -76,8 +76,8 @@ def plain_node(node: Node) -> dict[str, Any]:
         "health": {
             name: [
                 *(h.used, h.widened, h.refused, h.unconfirmed, h.last_used, h.nis),
-                [[d.time, d.residual, d.noise] for d in h.doubts],
-                *(h.nis_sum, h.freedom),
+                [[d.time, d.residual, d.noise, d.kind] for d in h.doubts],
+                *(h.nis_sum, h.freedom, h.streak, h.leap, h.room),
             ]
             for name, h in node.health.items()
         },
@@ -89,7 +89,7 @@ def node_of(content: Mapping[str, Any]) -> Node:
     hypotheses = tuple(Hypothesis(float(weight), State(*arrays)) for weight, *arrays in content["hypotheses"])
     health = {}
     for name, (used, widened, refused, unconfirmed, last, nis, doubts, *sums) in content["health"].items():
-        kept = tuple(Doubt(int(time), residual, noise) for time, residual, noise in doubts)
+        kept = tuple(Doubt(int(time), *rest) for time, *rest in doubts)
         health[name] = Health(used, widened, refused, unconfirmed, last, nis, kept, *sums)
     gyro, accel = content["readings"]
     told = content.get("command")

@@ -25,6 +25,8 @@ from operators.fusion.measurements import AngularRate, RestingForce
 from operators.geometry.se3 import skew
 
 Array = NDArray[np.float64]
+TILT = 0.1
+"""Standard deviation of the first level, rad."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,10 @@ class Prior:
     moving_velocity: float = 1.0
     moving_accel: float = 0.5
     headings: int = 12
+
+    def unfelt(self, gravity: float) -> float:
+        """Returns the standard deviation (m/s²) of what an inertial sensor known so little may fail to feel."""
+        return math.hypot(self.accel_bias, gravity * TILT)
 
 
 def prior_of(
@@ -96,7 +102,7 @@ def first_node(
         P[POSITION, POSITION] = np.eye(3) * prior.position_sigma**2
         P[VELOCITY, VELOCITY] = np.eye(3) * (0.01 if at_rest else prior.moving_velocity) ** 2
         tilt = np.eye(3) - np.outer(R[2], R[2])  # in the body: what gravity tells, and the heading about it
-        P[ROTATION, ROTATION] = tilt * 0.1**2 + np.outer(R[2], R[2]) * spread**2
+        P[ROTATION, ROTATION] = tilt * TILT**2 + np.outer(R[2], R[2]) * spread**2
         P[GYRO_BIAS, GYRO_BIAS] = np.eye(3) * prior.gyro_bias**2
         P[ACCEL_BIAS, ACCEL_BIAS] = np.eye(3) * prior.accel_bias**2
         state = State(np.array(prior.position) - R @ base[:3, 3], np.zeros(3), R, np.zeros(3), np.zeros(3), P)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,6 +26,7 @@ from operators.fusion.error_state import (
     shifted,
     updated,
 )
+from operators.fusion.far import bounded, brought, unplaced
 from operators.fusion.filter_history import (
     Entry,
     Hypothesis,
@@ -37,12 +38,14 @@ from operators.fusion.filter_history import (
     plain_sample,
     sample_of,
 )
-from operators.fusion.gate import Doubt, GateConfig, Health, judge
+from operators.fusion.gate import Doubt, GateConfig, Health, judge, leap, threshold
 from operators.fusion.hypotheses import combined, reduced, with_errors
 from operators.fusion.measurements import from_plain, to_plain
 from operators.fusion.sensor_errors import SensorErrors
 
 Array = NDArray[np.float64]
+TOO_LATE = ": too late"
+"""Suffix of a sensor's name in the counts of measurements that came after the window."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
 
@@ -54,7 +57,9 @@ class FilterConfig:
     `window`: seconds for which late measurements are taken; `gravity` in m/s²; `max_gap`: seconds without an inertial
     sample after which the motion in between is unknown, with the noise `unknown`; `inertial`: there are samples at all.
     Without them velocity and angular velocity stay but for the noise `unknown`. `gates`: those of single sensors, by
-    the first word of their name. `errors`: those of sensors that are estimated.
+    the first word of their name. `errors`: those of sensors that are estimated. `unfelt`: standard deviation (m/s²) of
+    what an inertial sensor as little known as at first may fail to feel, which is what the gates grant it; None where
+    there is none.
     """
 
     window: float = 1.0
@@ -65,6 +70,7 @@ class FilterConfig:
     gate: GateConfig = field(default_factory=GateConfig)
     gates: Mapping[str, GateConfig] = field(default_factory=dict)
     errors: SensorErrors = field(default_factory=SensorErrors)
+    unfelt: float | None = None
 
 
 class LateFilter:
@@ -108,8 +114,11 @@ class LateFilter:
 
     def measure(self, measurement: Measurement) -> bool:
         """Takes a measurement; False where it is too late."""
-        if measurement.time < max(self.time - round(self._config.window * 1e9), self._nodes[0].time):
-            self.ignored[f"{measurement.sensor}: too late"] += 1
+        if measurement.time < self.time - round(self._config.window * 1e9):
+            self.ignored[measurement.sensor + TOO_LATE] += 1
+            return False
+        if measurement.time < self._nodes[0].time:
+            self.ignored[f"{measurement.sensor}: before the beginning"] += 1
             return False
         self._count += 1
         self._insert(measurement, (measurement.time, 1, measurement.sensor, self._count))
@@ -266,22 +275,34 @@ class LateFilter:
     def _measured(self, node: Node, entry: Measurement) -> Node:
         config = self._config.gates.get(entry.sensor.partition(" ")[0], self._config.gate)
         health = node.health.get(entry.sensor, Health())
-        found = [self._innovation(entry, h.state, node) for h in node.hypotheses]
-        scores = [mahalanobis(h.state, r, H, entry.noise) for h, (r, H) in zip(node.hypotheses, found, strict=True)]
-        best = min(range(len(scores)), key=lambda k: scores[k][0])
-        residual, H = found[best]
-        doubt = Doubt(entry.time, residual, entry.noise)
-        verdict = judge(config, health.doubts, doubt, node.hypotheses[best].state, H, scores[best][0])
-        after = health.after(verdict, entry.time, scores[best][0], doubt, config)
+        kind = type(entry.model).__name__
         hypotheses = node.hypotheses
+        found, scores, best = self._found(entry, hypotheses, node)
+        state, (residual, H) = hypotheses[best].state, found[best]
+        fits = scores[best][0] <= threshold(config.share, len(residual))
+        if not fits and unplaced(state, kind):
+            hypotheses = _brought(hypotheses, found)
+            found, scores, best = self._found(entry, hypotheses, node)
+        doubt = Doubt(entry.time, residual, entry.noise, kind)
+        unfelt = self._config.unfelt
+        nis = scores[best][0]
+        leapt = 0.0 if unfelt is None else leap(config, entry.sensor, doubt, node.health, state, H, nis, unfelt)
+        verdict = judge(config, health.doubts, doubt, state, H, nis, leapt > 0)
+        after = health.after(verdict, entry.time, nis, doubt, config, leapt)
         if verdict == "widened":
             since = (entry.time - (health.last_used or self._nodes[0].time)) * 1e-9
-            room = np.zeros_like(hypotheses[best].state.covariance)
+            room = np.zeros_like(state.covariance)
+            residual, beyond = bounded(residual, H)
             room[:SIZE, :SIZE] = np.diag(entry.model.widening(residual, since))
+            if beyond:
+                hypotheses = _brought(hypotheses, found)
+                found, _, _ = self._found(entry, hypotheses, node)
             hypotheses = tuple(
                 replace(h, state=replace(h.state, covariance=h.state.covariance + room)) for h in hypotheses
             )
-        if verdict in ("used", "widened"):
+        if verdict not in ("used", "widened"):
+            hypotheses = node.hypotheses
+        else:
             hypotheses = reduced(
                 [
                     Hypothesis(h.weight - 0.5 * (nis + spread), updated(h.state, r, J, entry.noise))
@@ -289,6 +310,14 @@ class LateFilter:
                 ]
             )
         return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after}, node.command)
+
+    def _found(
+        self, entry: Measurement, hypotheses: Sequence[Hypothesis], node: Node
+    ) -> tuple[list[tuple[Array, Array]], list[tuple[float, float]], int]:
+        """Returns residual and Jacobian by each hypothesis, its score, and which hypothesis fits best."""
+        found = [self._innovation(entry, h.state, node) for h in hypotheses]
+        scores = [mahalanobis(h.state, r, H, entry.noise) for h, (r, H) in zip(hypotheses, found, strict=True)]
+        return found, scores, min(range(len(scores)), key=lambda k: scores[k][0])
 
     def _innovation(self, entry: Measurement, state: State, node: Node) -> tuple[Array, Array]:
         """Residual and Jacobian (M, 15 + K), without the errors that the sensor is believed to have."""
@@ -311,3 +340,8 @@ class LateFilter:
         around = [shifted(state, node.gyro - state.gyro_bias, acceleration, s * _MOMENT) for s in (-0.5, 0.5)]
         before, after = (entry.model.innovation(at, node.gyro)[0] for at in around)
         return np.asarray((before - after) / _MOMENT)
+
+
+def _brought(hypotheses: Sequence[Hypothesis], found: Sequence[tuple[Array, Array]]) -> tuple[Hypothesis, ...]:
+    """Returns the hypotheses, each moved to the place that was measured."""
+    return tuple(replace(h, state=brought(h.state, r, H)) for h, (r, H) in zip(hypotheses, found, strict=True))

@@ -10,16 +10,13 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Odometry
 from dataflow.messages.diagnostics import Level
 from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, cross
+from operators.fusion.far import UNMEASURED
 from operators.fusion.gate import Health
 from operators.geometry.se3 import skew
 from operators.status import Row, status_of_rows
 
 Array = NDArray[np.float64]
 _I3 = np.eye(3)
-
-
-UNMEASURED = 500.0
-"""Standard deviation of a coordinate (m) that nothing has measured yet: half of what it begins with."""
 
 
 def well_known(covariance: Array, sigma: float) -> bool:
@@ -73,6 +70,8 @@ def diagnostics(
 ) -> Diagnostics:
     """Returns a status for the filter, one for every sensor, and one for every warning, a text by what it is about.
 
+    A warning with the name of a sensor stands in the sensor's row.
+
     `offsets`: the estimated time offset of a sensor and its standard deviation, s. `nis` is the sum of the normalised
     innovations squared of all that was used, and `freedom` what it would be on average if the sensor were as good as
     it says.
@@ -83,6 +82,8 @@ def diagnostics(
         silent = h.last_used is None or stamp - h.last_used > 2e9
         if h.doubts and silent:
             level, text = Level.ERROR, "refused"
+        elif name in warnings:
+            level, text = Level.WARN, warnings[name]
         elif silent:
             level, text = Level.STALE, "silent"
         elif h.nis > 3:
@@ -94,7 +95,7 @@ def diagnostics(
         if (found := offsets.get(name.partition(" ")[0])) is not None:
             values |= {"offset, s": f"{found[0]:.4f}", "offset sigma, s": f"{found[1]:.4f}"}
         rows.append((name, text, level, values))
-    rows += [(name, text, Level.WARN, {}) for name, text in sorted(warnings.items())]
+    rows += [(name, text, Level.WARN, {}) for name, text in sorted(warnings.items()) if name not in health]
     return status_of_rows(stamp, rows)
 
 

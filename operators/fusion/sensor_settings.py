@@ -20,7 +20,7 @@ from dataflow.messages import (
     RadarScan,
     Twist,
 )
-from operators.fusion.gate import GateConfig
+from operators.fusion.gate import NEVER_AGREE, GateConfig
 from operators.fusion.sensor_errors import SensorErrors
 
 Use = Literal[
@@ -36,7 +36,6 @@ Use = Literal[
     "doppler",
     "range",
 ]
-_NEVER_AGREE = 1_000_000
 _WITHOUT_PATIENCE = ("doppler", "range")
 
 
@@ -66,7 +65,9 @@ class SensorSettings(BaseModel):
         None, gt=0, description="standard deviation of what turns (rad, rad/s); the message's covariance if none"
     )
     share: float = Field(0.999, gt=0, lt=1, description="share of true measurements that the gate lets through")
-    agreeing: int = Field(3, ge=2, description="refused measurements that must agree until the filter yields to them")
+    agreeing: int = Field(
+        3, ge=2, description="refused measurements that must agree, over a second, until the filter yields"
+    )
     lag: float = Field(0.2, gt=0, description="seconds in which velocities follow a control input")
     still: float = Field(0.002, ge=0, description="wheels slower than this (m/s at the rim) stand still")
     azimuth: float = Field(
@@ -75,7 +76,7 @@ class SensorSettings(BaseModel):
 
     def gate(self, use: str) -> GateConfig:
         """Returns its gate for this use. What may be of something else than it seems never makes the filter yield."""
-        return GateConfig(share=self.share, agreeing=_NEVER_AGREE if use in _WITHOUT_PATIENCE else self.agreeing)
+        return GateConfig(share=self.share, agreeing=NEVER_AGREE if use in _WITHOUT_PATIENCE else self.agreeing)
 
 
 DEFAULT_USE: dict[type[Message], Use] = {
@@ -135,7 +136,7 @@ def unheard(names: Sequence[str], streams: Sequence[str]) -> dict[str, str]:
 
 def never_yields(gate: GateConfig) -> bool:
     """Tells whether refused measurements that agree with each other are refused all the same."""
-    return gate.agreeing == _NEVER_AGREE
+    return gate.agreeing == NEVER_AGREE
 
 
 def name_of(stream: str, sensors: Mapping[str, SensorSettings]) -> str:

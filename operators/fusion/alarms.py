@@ -1,0 +1,72 @@
+"""Alarms of a fusion: which sensors contradict the rest, made it yield, or come too late."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from operators.fusion.gate import GateConfig, Health
+from operators.fusion.late_filter import TOO_LATE
+from operators.fusion.sensor_settings import never_yields
+
+_ANY = GateConfig()
+_RECENT = 2_000_000_000
+"""Nanoseconds for which an alarm stands after its cause."""
+
+
+class Alarms:
+    """Decides when a status is due: every second, and at once where a sensor gives a new alarm."""
+
+    def __init__(self) -> None:
+        self._reported = -1
+        self._raised: set[str] = set()
+        self._late: dict[str, tuple[int, int]] = {}
+
+    def due(
+        self, stamp: int, health: Mapping[str, Health], ignored: Mapping[str, int], gates: Mapping[str, GateConfig]
+    ) -> dict[str, str] | None:
+        """Returns the text of each sensor's alarm at a time (ns) if a status is due, which counts as given then.
+
+        `ignored` counts what was passed over; sensors whose gate never yields may be refused.
+        """
+        standing = self._standing(stamp, health, ignored, gates)
+        fresh = not self._raised.issuperset(standing)
+        self._raised = set(standing)
+        if self._reported >= 0 and stamp - self._reported < 10**9 and not fresh:
+            return None
+        self._reported = stamp
+        return standing
+
+    def _standing(
+        self, stamp: int, health: Mapping[str, Health], ignored: Mapping[str, int], gates: Mapping[str, GateConfig]
+    ) -> dict[str, str]:
+        found = {}
+        for name, h in health.items():
+            if h.room is not None and stamp - h.room <= _RECENT:
+                found[name] = "the filter made room for it: one of them was wrong"
+            elif h.contradicts and h.doubts and not never_yields(gates.get(name.partition(" ")[0], _ANY)):
+                recent = stamp - h.doubts[-1].time <= _RECENT
+                text = "contradicts the others"
+                if h.leap:
+                    text += ": it leapt, and the inertial sensor felt nothing"
+                found |= {name: text} if recent else {}
+        for key, count in ignored.items():
+            if key.endswith(TOO_LATE):
+                before, since = self._late.get(key, (0, stamp))
+                if count > before:
+                    self._late[key] = count, (since := stamp)
+                if stamp - since <= _RECENT:
+                    found[key.removesuffix(TOO_LATE)] = f"too late: {count} came after the window"
+        return found
+
+    def snapshot(self) -> dict[str, Any]:
+        return {
+            "reported": self._reported,
+            "raised": sorted(self._raised),
+            "late": {key: list(row) for key, row in self._late.items()},
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Goes on where a snapshot was taken."""
+        self._reported, self._raised = int(state["reported"]), set(state.get("raised", ()))
+        self._late = {key: (int(n), int(at)) for key, (n, at) in state.get("late", {}).items()}
