@@ -38,7 +38,7 @@ class Failure:
     module: str
     reason: str
     mend: str = ""
-    """How to install what is missing; "" where no extra brings it."""
+    """The command that installs a missing package; "" where no extra brings it."""
 
     def __str__(self) -> str:
         return "; ".join(filter(None, (f"{self.module}: {self.reason}", self.mend)))

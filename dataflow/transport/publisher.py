@@ -42,7 +42,7 @@ class StreamPublisher:
         self._counted = counted
         self._blocked = blocked
         self.matched = False
-        """Whether the key has a subscriber."""
+        """True while the key has a subscriber."""
         self._matching = publisher.declare_matching_listener(zenoh.handlers.Callback(self._on_matching, indirect=False))
         status: Any = publisher.matching_status  # Zenoh's stubs call it a bool
         self.matched = bool(status.matching)

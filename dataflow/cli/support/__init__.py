@@ -1,1 +1,1 @@
-"""What commands share: options, reports, tables, progress."""
+"""Options, reports, tables and progress, shared by commands."""
