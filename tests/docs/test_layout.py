@@ -17,7 +17,6 @@ LONG = {
     "dataflow.cli.commands.demo:demo": 66,
     "dataflow.cli.commands.live:hz": 63,
     "dataflow.cli.commands.logs:logs": 69,
-    "dataflow.cli.commands.merging:recover": 61,
     "dataflow.cli.commands.recording:record": 71,
     "dataflow.cli.commands.replay:replay": 181,
     "dataflow.cli.commands.run:run": 106,

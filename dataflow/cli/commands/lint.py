@@ -84,9 +84,7 @@ def lint(
     if json:
         print_json(report.to_json())
     else:
-        _print(report, f"{material.namespace}/" if material.namespace else "")
-        if write is not None:
-            out.print(Text(f"wrote {write}: look it over, and keep it with your code"), soft_wrap=True)
+        _print(report, f"{material.namespace}/" if material.namespace else "", write)
     if not report.sound:
         raise typer.Exit(DIFFERENT)
 
@@ -107,7 +105,7 @@ def _material(path: Path) -> Iterator[Material]:
             yield RecordedMaterial(opened)
 
 
-def _print(report: Report, prefix: str) -> None:
+def _print(report: Report, prefix: str, written: Path | None) -> None:
     numbers = ("messages", "Hz", "longest ms", "clock ms", "drift ms/s")
     shown = table("stream", *numbers, right=numbers)
     for name, timing in report.timings.items():
@@ -138,6 +136,8 @@ def _print(report: Report, prefix: str) -> None:
         out.print(Text("nothing was found", style="green"))
     else:
         out.print(Text("there is no stream that could be looked at", style="yellow"))
+    if written is not None:
+        out.print(Text(f"wrote {written}: look it over, and keep it with your code"), soft_wrap=True)
 
 
 def _deviating(value: float, deviation: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -21,6 +21,9 @@ from dataflow.cli.support.material import (
     refuse_itself,
 )
 from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, say, shown, size, table
+
+if TYPE_CHECKING:
+    from dataflow.editing.recover import Recovered
 
 
 def merge(
@@ -137,21 +140,25 @@ def recover(
     if json:
         print_json(done.as_json())
     else:
-        lost = {loss.stream: loss.messages for loss in done.lost}
-        made = table("stream", "saved", "lost", right=("saved", "lost"))
-        for name in sorted(done.saved.streams.keys() | lost):
-            made.add_row(Text(name), count(done.saved.streams.get(name, 0)), count(lost[name]) if name in lost else "")
-        out.print(made)
-        if done.torn:
-            ending = (
-                f"; its last {plural(done.lost_bytes, 'byte')} are an unfinished record: whole messages of it are saved"
-            )
-            rest = ending if done.lost_bytes else ""
-            torn = "has no proper end: it is being written, or its writer died"
-            say(f"[yellow]torn:[/] {escape(str(recording))} {torn}{rest}")
-        for note in done.damage:
-            say(f"[yellow]damaged:[/] {escape(note)}")
-        what = f"{plural(done.saved.messages, 'message')}, {size(done.saved.bytes)}"
-        out.print(f"wrote {escape(str(output))} ({what})", soft_wrap=True)
+        _print_recovered(done, recording, output)
     if not done.whole:
         raise typer.Exit(DIFFERENT)
+
+
+def _print_recovered(done: Recovered, recording: Path, output: Path) -> None:
+    lost = {loss.stream: loss.messages for loss in done.lost}
+    made = table("stream", "saved", "lost", right=("saved", "lost"))
+    for name in sorted(done.saved.streams.keys() | lost):
+        made.add_row(Text(name), count(done.saved.streams.get(name, 0)), count(lost[name]) if name in lost else "")
+    out.print(made)
+    if done.torn:
+        ending = (
+            f"; its last {plural(done.lost_bytes, 'byte')} are an unfinished record: whole messages of it are saved"
+        )
+        rest = ending if done.lost_bytes else ""
+        torn = "has no proper end: it is being written, or its writer died"
+        say(f"[yellow]torn:[/] {escape(str(recording))} {torn}{rest}")
+    for note in done.damage:
+        say(f"[yellow]damaged:[/] {escape(note)}")
+    what = f"{plural(done.saved.messages, 'message')}, {size(done.saved.bytes)}"
+    out.print(f"wrote {escape(str(output))} ({what})", soft_wrap=True)
