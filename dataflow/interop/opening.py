@@ -32,7 +32,8 @@ def open_bag(path: Path) -> Bag:
 def bag_at(path: Path) -> Bag:
     """Opens a ROS 1 bag, a ROS 2 bag (folder, .db3 or .mcap) or any other MCAP file.
 
-    Raises `BagError` where there is none; the message names what is there instead. `RecordingError` for a damaged MCAP file.
+    Raises `BagError` where there is none; the message names what is there instead. Raises `RecordingError` for a
+    damaged MCAP file.
     """
     if path.is_dir():
         return _open_folder(path)
