@@ -75,7 +75,7 @@ def _occupy_standard_streams() -> None:
 
 
 def _end(code: int) -> None:
-    """Ends the process when everything that was printed is written, or says that it could not be."""
+    """Ends the process after flushing its output; reports output that could not be written, with a non-zero code."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:

@@ -23,7 +23,7 @@ class Topic:
     - `schema`: its message type as the file defines it; ROS types are named as in ROS 2 (`sensor_msgs/msg/Imu`).
     - `count`, `first`, `last`: messages, and the log times of the first and last one (ns).
     - `latched`: its messages were kept for late subscribers (ROS 1 latching, ROS 2 transient-local durability).
-    - `channel`: what else the file says of it (MCAP channel metadata, QoS profiles).
+    - `channel`: further facts of it in the file (MCAP channel metadata, QoS profiles).
     """
 
     name: str
@@ -55,7 +55,7 @@ class Bag(Protocol):
     notes: tuple[str, ...]
     """Damage and oddities of the file, for people."""
     promised: Mapping[str, int]
-    """Messages by topic that the file's metadata, statistics or index say there are; empty where nothing says so."""
+    """Messages by topic according to the file's metadata, statistics or index; empty where none of them counts."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -79,7 +79,7 @@ def shortfalls(bag: Bag) -> list[str]:
 
 
 def is_static(topic: str) -> bool:
-    """Tells whether a topic's transforms hold for always, which in ROS its name says."""
+    """Returns whether a topic's transforms are static, which ROS marks by its name."""
     return topic.rpartition("/")[2] == "tf_static"
 
 

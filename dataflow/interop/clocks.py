@@ -17,9 +17,9 @@ Choice = Literal["auto", "header", "log"]
 I64 = npt.NDArray[np.int64]
 
 BACK = 5_000_000_000
-"""A header that goes back by more (ns) tells of a clock that was set, or of a log that was played again."""
+"""A header that goes back by more (ns) means that the clock was set, or that a log was played again."""
 APART = 1_000_000_000
-"""Topics whose headers differ from log time by amounts farther apart (ns) have clocks of their own."""
+"""Topics whose headers differ from log time by amounts farther apart (ns) have separate clocks."""
 SOME = 10
 """A topic of which more than one in so many headers carries no time is stamped by the log, and all others with it."""
 NEAR = 1_000_000_000
@@ -44,8 +44,8 @@ class Times:
 class Clock:
     """The clock that was chosen: `header` or `log`, why, and what is added to log times of messages without a header.
 
-    A latched topic whose headers are not of this clock counts as one without: what it says is valid from when it was
-    heard, whenever it was made.
+    A latched topic whose headers are not of this clock counts as one without: its content is valid from when it
+    was received, whenever it was made.
     """
 
     kind: Literal["header", "log"]
@@ -87,7 +87,7 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     if wanted == "header":
         return Clock("header", "asked for", shift, notes)
     if not with_header:
-        return Clock("log", "no message carries a time of its own")
+        return Clock("log", "no message has a time in its header")
     for times in with_header:
         assert times.header is not None
         if times.latched:
@@ -146,8 +146,8 @@ class Repair:
 def repair(stamps: I64, digests: npt.NDArray[Any], *, merge: bool = False) -> Repair:
     """Puts entries, given in log order, in the order of their stamps, which then strictly increase.
 
-    Entries of one stamp with the same digest are one message, recorded twice. Different ones are merged where `merge`
-    says that their type can be; else each but the first comes 1 ns after the one before it.
+    Entries of one stamp with the same digest are one message, recorded twice. Different ones are merged where
+    `merge` allows it for their type; else each but the first comes 1 ns after the one before it.
     """
     peaks = np.maximum.accumulate(stamps) if len(stamps) else stamps
     reordered = int((stamps < peaks).sum())

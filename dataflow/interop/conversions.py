@@ -133,7 +133,7 @@ CONVERSIONS: dict[tuple[type[Message], type[Message]], Callable[[Any], Message]]
 
 
 TOLD = {(CompressedImage, Image16), (CompressedImage, DepthImage), (Image16, DepthImage)}
-"""Conversions that are right for what some devices send only: done where somebody asks for them by name."""
+"""Conversions that are right for the messages of some devices only: done where a mapping names them."""
 NARROWING = {(Image16, Image): "16 bits become 8", (Odometry, Pose): "velocities", (RangeReading, Number): "limits"}
 """By conversion, the content that it does not carry over."""
 

@@ -83,7 +83,7 @@ class Proposal:
 
 
 class MappingError(ValueError):
-    """A mapping that cannot be: says which word, and what would be right."""
+    """Raised when a mapping is invalid; the message names the word, and what would be right."""
 
 
 def propose(streams: Sequence[Wanted], topics: Sequence[Offered], given: Mapping[str, str]) -> Proposal:

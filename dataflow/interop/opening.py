@@ -32,7 +32,8 @@ def open_bag(path: Path) -> Bag:
 def bag_at(path: Path) -> Bag:
     """Opens a ROS 1 bag, a ROS 2 bag (folder, .db3 or .mcap) or any other MCAP file.
 
-    Raises `BagError` that says what else is there, `RecordingError` for a damaged MCAP file.
+    Raises `BagError` where there is none; the message names what is there instead. Raises `RecordingError` for a
+    damaged MCAP file.
     """
     if path.is_dir():
         return _open_folder(path)
@@ -109,7 +110,7 @@ def _open_folder(path: Path) -> Bag:
     if len(files[".bag"]) == 1:
         return _ros_bag(files[".bag"][0])
     if files[".bag"]:
-        raise BagError(f"{path} holds {len(files['.bag'])} .bag files, which are recordings of their own; name one")
+        raise BagError(f"{path} holds {len(files['.bag'])} .bag files, which are separate recordings; name one")
     if folder.named:
         raise BagError(
             f"{path}: {METADATA} names {', '.join(folder.named)}, and the folder holds no .mcap or .db3 file"

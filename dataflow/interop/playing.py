@@ -151,7 +151,7 @@ def _wished(reading: Reading, wishes: Wishes) -> type[Message]:
 
 
 def _types(reading: Reading, told: bool = False) -> tuple[str, ...]:
-    """The types that a topic can be played as; `told`: those too that somebody has to ask for."""
+    """Returns the types that a topic can be played as; `told`: including those that a mapping has to name."""
     if reading.read_as is None:
         return ()
     return tuple(t.SCHEMA for t in (offers if told else proposed)(reading.read_as))

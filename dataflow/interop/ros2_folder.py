@@ -38,7 +38,7 @@ def read_folder(path: Path) -> Folder:
         found.notes.append(f"{METADATA} cannot be read ({type(error).__name__}): the files count")
         return found
     if not isinstance(facts, Mapping):
-        found.notes.append(f"{METADATA} says nothing of a bag: the files count")
+        found.notes.append(f"{METADATA} does not describe a bag: the files count")
         return found
     for row in _rows(facts.get("topics_with_message_count")):
         topic, held = row.get("topic_metadata"), row.get("message_count")

@@ -55,7 +55,7 @@ class Seen:
 
 
 def lose(message: Any, what: str) -> None:
-    """Says that a conversion keeps less than a message holds, where somebody keeps account of it."""
+    """Notes that a conversion keeps less than a message holds, if the message is a `Seen`, which collects losses."""
     if isinstance(message, Seen):
         message.losses.append(what)
 

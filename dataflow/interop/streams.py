@@ -339,7 +339,7 @@ class _Pending:
 
 
 def recorded_streams(path: Path, opening: Mapping[str, Any] | None) -> Recording | BagStreams:
-    """Opens a recording, or the bag that `opening` (`PlayableStreams.opening`) says how to open."""
+    """Opens a recording, or the bag that `opening` (`PlayableStreams.opening`) describes."""
     if opening is None:
         return Recording(path)
     played = {stream: Played(*values) for stream, values in opening["played"].items()}

@@ -146,7 +146,7 @@ class ForeignReader:
 
 
 def reader_of(topic: Topic) -> TopicReader:
-    """The reader of a topic; raises `RecordingError` that says why there is none."""
+    """Returns the reader of a topic; raises `RecordingError` with the reason where there is none."""
     if topic.encoding in ("cdr", "ros1"):
         return _ros_reader(topic)
     decode = foreign_decoder(topic.encoding, topic.schema)
@@ -183,7 +183,7 @@ def is_known(topic: Topic) -> bool:
 class Reading:
     """A topic as it can be played: how its messages are read, and the type that the first one becomes.
 
-    `reason`: why it cannot be played; `read_as`: None then, and for a topic without messages of a kind that tells.
+    `reason`: why it cannot be played; `read_as`: None then, and for a topic without a message that decides it.
     `losses`: what a message of this type does not carry over, as far as the first one that can be read shows.
     """
 

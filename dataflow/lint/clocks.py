@@ -105,7 +105,7 @@ def _simplex(start: tuple[float, float], step: float, duration: float) -> F64:
 
 
 class _Seen:
-    """A stream's rates, and what the reference says they should be for a shift of the stream's timestamps."""
+    """A stream's rates, and those expected from the reference for a shift of the stream's timestamps."""
 
     def __init__(self, stream: Turning, reference: Turning) -> None:
         ends = np.concatenate([reference.begins[:1], reference.ends])
@@ -188,7 +188,7 @@ class _Seen:
 
 
 def agreed(differences: Mapping[str, ClockDifference], tolerance: float) -> str:
-    """The stream that tells best the clock that most have, by what all are late by against a common reference.
+    """Returns the stream that best represents the clock of the majority, by lateness against a common reference.
 
     A stream counts by how surely its lateness is known, so one that fits anything decides nothing. Of two that weigh
     the same, the one with the reference wins.

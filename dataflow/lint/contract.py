@@ -22,7 +22,7 @@ MARGIN = 0.1
 
 
 class ContractError(ValueError):
-    """A contract that cannot be read: says where, and what would be right."""
+    """Raised when a contract cannot be read; the message names the place, and what would be right."""
 
 
 class _Section(BaseModel):
@@ -61,7 +61,7 @@ class StreamTerms(_Section):
 class FrameTerms(_Section):
     """Terms for the tree of frames."""
 
-    root: str | None = Field(None, description="the frame that all others hang together with")
+    root: str | None = Field(None, description="the frame that all others are connected to")
     required: tuple[str, ...] = Field((), description="frames that must be there")
 
 

@@ -14,7 +14,7 @@ class FrameTree:
     """Keeps what streams say of frames. Only transforms make a tree; poses connect frames, each in its own estimate."""
 
     parents: dict[str, dict[str, str]] = field(default_factory=dict)
-    """child → parent → the first stream that says so."""
+    """child → parent → the first stream with that transform."""
     connected: dict[str, set[str]] = field(default_factory=dict)
     used: dict[str, str] = field(default_factory=dict)
     """frame → the first stream whose messages are given in it."""
@@ -37,7 +37,7 @@ class FrameTree:
         self.connected.setdefault(b, set()).add(a)
 
     def reached(self, root: str) -> set[str]:
-        """The frames that hang together with one."""
+        """Returns the frames connected to one."""
         found, waiting = {root}, [root]
         while waiting:
             fresh = self.connected.get(waiting.pop(), set()) - found
@@ -59,7 +59,7 @@ class FrameTree:
 def check_frames(tree: FrameTree, root: str | None = None, wanted: Iterable[str] = ()) -> Iterator[Finding]:
     """Frames with two parents, frames that are within themselves, and frames that hang on nothing.
 
-    `root`: the frame that everything must hang together with, by default the root of the largest part. `wanted`:
+    `root`: the frame that all others must be connected to, by default the root of the largest part. `wanted`:
     frames that must be there.
     """
     for child, parents in tree.parents.items():
@@ -75,7 +75,7 @@ def check_frames(tree: FrameTree, root: str | None = None, wanted: Iterable[str]
         if frame not in known:
             yield Finding("frames", "", "error", f"frame {frame!r} is in the contract and in no message")
     if not tree.parents and root is None:
-        return  # nobody says how frames hang together
+        return  # no stream relates frames to each other
     if root is None:
         root = tree.roots()[0]
     elif root not in known:
@@ -84,7 +84,7 @@ def check_frames(tree: FrameTree, root: str | None = None, wanted: Iterable[str]
     reached = tree.reached(root)
     for frame, stream in tree.used.items():
         if frame not in reached:
-            text = f"frame {frame!r} does not hang together with {root!r}: nothing says where it is"
+            text = f"frame {frame!r} is not connected to {root!r}: no transform or pose places it"
             yield Finding("frames", stream, "warning", text)
 
 

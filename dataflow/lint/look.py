@@ -23,7 +23,7 @@ DRIFTED = 0.005
 
 @dataclass(slots=True)
 class Report:
-    """Everything that was found. `clocks`: lateness of each stream against `reference`, as far as its turning tells."""
+    """All findings. `clocks`: lateness of each stream against `reference`, as far as its turning determines it."""
 
     findings: list[Finding] = field(default_factory=list)
     timings: dict[str, Timing] = field(default_factory=dict)

@@ -95,5 +95,5 @@ def test_what_to_write_is_named_once(dataflow, recorded: Recorded, tmp_path: Pat
     never = dataflow("convert", recorded[0], "--to", "csv", code=2).stderr
 
     assert "both name what to write" in " ".join(twice.split())
-    assert "nothing says where to write" in never
+    assert "no output given: name a file or folder" in never
     assert not list(tmp_path.iterdir())

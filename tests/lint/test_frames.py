@@ -38,9 +38,9 @@ def test_a_whole_tree_is_sound() -> None:
     assert texts(tree(tf=transforms(("base", "imu"), ("base", "lidar")), imu=imu("imu"), pose=pose), "map") == []
 
 
-def test_a_sensor_whose_place_nobody_says_is_named() -> None:
+def test_a_sensor_without_a_place_is_named() -> None:
     (text,) = texts(tree(tf=transforms(("base", "lidar")), imu=imu("imu_link"), points=imu("lidar")))
-    assert text.startswith("frame 'imu_link' does not hang together with 'base'")
+    assert text.startswith("frame 'imu_link' is not connected to 'base'")
 
 
 def test_two_parents_and_a_circle_are_errors() -> None:

@@ -12,7 +12,7 @@ from mcap.writer import Writer
 from dataflow.messages import CameraInfo, Imu, Message, Odometry
 from dataflow.messages.base import is_built_in, message_types
 from dataflow.recording import Recording, RecordingError, RecordingWriter
-from dataflow.recording.streams.streams import access
+from dataflow.recording.streams import access
 
 
 def imu(stamp: int, **fields: object) -> Imu:

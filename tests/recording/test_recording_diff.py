@@ -13,7 +13,7 @@ from mcap.writer import Writer
 
 from dataflow.messages import DepthImage, Image, LaserScan, Message, Pose, WheelTicks
 from dataflow.recording import DiffReport, Recording, RecordingError
-from dataflow.recording.streams.streams import diff
+from dataflow.recording.streams.diff import diff
 
 
 def compare(a: Path, b: Path, **options: Any) -> DiffReport:

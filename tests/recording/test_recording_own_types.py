@@ -15,7 +15,8 @@ from dataflow.messages import base as registry
 from dataflow.messages.declaration import Declaration, GenericMessage, generic_type
 from dataflow.recording import Recording, RecordingWriter, describe
 from dataflow.recording.layout import DIGESTS
-from dataflow.recording.streams.streams import diff, writer
+from dataflow.recording.streams import writer
+from dataflow.recording.streams.diff import diff
 
 
 class Beacon(Message, schema="tests.own.Beacon"):

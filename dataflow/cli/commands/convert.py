@@ -144,10 +144,10 @@ def convert(
         existing_recording(recording)
         output = named_once("OUTPUT", output, out_option)
         if output is None:
-            raise fail("nothing says where to write: name a file or folder behind the recording, or with --out")
+            raise fail("no output given: name a file or folder behind the recording, or with --out")
         if to is None:
             if output.suffix != ".rrd":
-                raise fail(f"nothing says the format of {output}: give one with --to: {', '.join(get_args(Format))}")
+                raise fail(f"the format of {output} is not known: give one with --to: {', '.join(get_args(Format))}")
             to = "rrd"
         _check_output(output, to, overwrite)
         if to == "rrd":

@@ -51,8 +51,8 @@ def cut(
 
     The part replays from there with the states that operators had, and verifies: every operator is taken up after its
     last recorded state at or before --from, and what its firings took since then goes along. For that, record with
-    `record: {snapshots: 10s}`. Operators that keep a state and gave none are named; of them `dataflow verify` says that
-    they cannot be verified, until their next recorded state.
+    `record: {snapshots: 10s}`. Operators that keep a state and gave none are named; `dataflow verify` reports that they
+    cannot be verified before their next recorded state.
 
     Exit codes:
 
@@ -97,7 +97,7 @@ def filter_(
     """Keep some streams of a recording and leave out the others.
 
     Firing records stay, so `dataflow verify` still compares what operators make with the digests of what they made,
-    where their inputs are there or can be made again; where they are not, it says so. With the sensors alone, the
+    where their inputs are there or can be made again, and reports where they are not. With the sensors alone, the
     recording becomes a thin one, from which `dataflow replay --complete` makes the whole again.
 
     Exit codes:

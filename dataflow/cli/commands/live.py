@@ -59,7 +59,7 @@ HISTORY = 2000
 
 
 def running_graph(name: str | None, wait: float) -> RunningGraph:
-    """The running graph of that name, or the only one; says so when it has to wait. Raises `NotRunning`."""
+    """Returns the running graph of that name, or the only one; prints a note if it has to wait. Raises `NotRunning`."""
     from dataflow.client.attach import NotRunning, find_running
 
     name = name or os.environ.get(GRAPH_VARIABLE) or None

@@ -105,8 +105,8 @@ def recover(
 ) -> None:
     """Save what can be read of a torn or damaged recording.
 
-    The new file has a proper end and an index. What is lost is counted: by the numbers of messages, which have no gaps,
-    and by firing records, which are stored before the messages that they tell of. `dataflow verify` of what was saved
+    The new file has a proper end and an index. Losses are counted by the numbers of messages, which have no gaps, and
+    by firing records, which are stored before the messages that they list. `dataflow verify` of what was saved
     is never "identical" for more than what is there. Of a ROS 2 bag in sqlite3 that was cut off, and of a ROS 1 bag
     without its index, whole messages are saved wherever they lie.
 

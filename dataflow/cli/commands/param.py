@@ -42,7 +42,7 @@ def set_(
     """Change a parameter of an operator that runs.
 
     It changes between two firings; the value that the operator took is printed. The change stands in the recording at
-    its place, and `verify` repeats it there. `dataflow param list` tells which parameters can change.
+    its place, and `verify` repeats it there. `dataflow param list` shows which parameters can change.
 
     Exit codes: 0 changed; 1 refused (no such parameter, a value that it cannot take), or no answer; 2 no such
     graph or operator.

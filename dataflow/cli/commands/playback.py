@@ -37,7 +37,7 @@ KEYS: dict[bytes, Pressed] = {
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """Some keys that do something in a run, and what its terminal says of them."""
+    """Keys that act on a run, and the help that its terminal shows for them."""
 
     help: str
     does: frozenset[Pressed]
@@ -85,7 +85,7 @@ def _in_foreground(terminal: int) -> bool:
 
 @contextmanager
 def _steered(offers: Sequence[Offer], supervisor: Supervisor) -> Iterator[None]:
-    """Reads keys on a thread of its own while a run lasts; the terminal is as before afterwards."""
+    """Reads keys on a separate thread while a run lasts; restores the terminal afterwards."""
     import termios
     import tty
 
@@ -133,7 +133,7 @@ def _do(key: Pressed, supervisor: Supervisor) -> None:
 
 def playback(
     action: Annotated[
-        str, typer.Argument(metavar="pause|resume|step|speed|status", help="What to do; status says how it stands.")
+        str, typer.Argument(metavar="pause|resume|step|speed|status", help="What to do; status prints the state.")
     ],
     value: Annotated[
         str | None,
@@ -152,12 +152,12 @@ def playback(
     That is a replay, or a run that is not live. In its own terminal, keys do the same: space pauses and goes on, the
     right arrow or n makes one step, + and - double and halve the speed, q ends it. Results do not depend on it: the
     same messages are made however it is paused. A step of a run whose sources are in several processes is one step in
-    each of them. A live run cannot be paused: devices and the clock wait for nobody.
+    each of them. A live run cannot be paused: devices and the clock do not wait.
 
     Exit codes:
 
       0    done
-      2    no graph runs, it is live, or nobody answers
+      2    no graph runs, it is live, or it does not answer
 
     Examples:
 

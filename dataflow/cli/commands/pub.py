@@ -49,9 +49,9 @@ def pub(
 ) -> None:
     """Give a message to a live graph, for a test or by hand.
 
-    The graph says that it takes messages from outside by a source that is made for it:
-    `use: dataflow.remote:Twist`, or any other message type. What it was given is recorded, and replays, as what any
-    other source gives. Lines that `dataflow echo --json` prints can be given again.
+    The graph takes messages from outside through a source declared for it:
+    `use: dataflow.remote:Twist`, or any other message type. These messages are recorded and replayed like those of any
+    other source. Lines that `dataflow echo --json` prints can be given again.
 
     Exit codes: 0 given; 1 refused, or no answer; 2 no such graph or source, or fields that do not fit.
 

@@ -55,8 +55,8 @@ def record(
     """Record streams of a graph that runs already.
 
     It is a plain subscriber: it comes and goes, and gets what is published meanwhile. So the recording holds no firing
-    records: it replays, and cannot be verified. For that, run the graph with --record. What it missed since its first
-    message of a stream is counted, by the numbers of messages. A live run is not slowed down by it; any other waits for
+    records: it replays, and cannot be verified. For that, run the graph with --record. Messages missed since
+    the first one of a stream are counted by their numbers. A live run is not slowed down by it; any other waits for
     it.
 
     It ends with the graph, after --seconds, or at Ctrl-C; the file is complete in each case.
@@ -109,7 +109,7 @@ def record(
 
 
 def _until_over(found: RunningGraph, duration: float | None, show: Callable[[], None]) -> Iterator[bool]:
-    """Says whether to go on, until the graph has ended, the time is up, or somebody asks for an end."""
+    """Yields whether to go on, until the graph has ended, the time is up, or an interrupt asks for the end."""
     from dataflow.client.attach import still_runs
     from dataflow.supervision.interrupts import interrupts
 

@@ -44,8 +44,8 @@ def info(
 ) -> None:
     """Describe a recording: streams, types, counts, rates, what made it.
 
-    Any MCAP file will do, a torn one too, and ROS 1 and ROS 2 bags (.bag, .db3, .mcap, folders): of those it tells
-    what each topic can be replayed as.
+    Any MCAP file will do, a torn one too, and ROS 1 and ROS 2 bags (.bag, .db3, .mcap, folders), for
+    which it lists the types that each topic can be replayed as.
 
     Examples:
 

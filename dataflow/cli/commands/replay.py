@@ -109,8 +109,8 @@ def replay(
     same operators: their last recorded snapshot, and what they did since, repeated.
 
     A ROS 1 or ROS 2 bag (file or folder) or any MCAP stands in for the sources of a graph, which --graph names: --map
-    says which topic feeds which stream. Without it, topics are matched by message type, and where that leaves a choice,
-    the error proposes what to say. Messages are stamped with the time in their headers, or where that cannot be trusted
+    assigns topics to streams. Without it, topics are matched by message type, and where that leaves a choice,
+    the error proposes a mapping. Messages are stamped with the time in their headers, or where that cannot be trusted
     with the time of their recording; which, and why, is printed.
 
     In a terminal, space pauses it and lets it go on, the right arrow or n makes one step (all messages of one

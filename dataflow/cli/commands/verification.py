@@ -259,7 +259,7 @@ def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | N
 
 
 def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, whole: bool) -> None:
-    """Says what the baseline names in vain; with `accept`, takes over what differs and says what that is."""
+    """Reports what the baseline names in vain; with `accept`, takes over the differences and lists them."""
     if not accept:
         if whole and (unused := known.unused(checked)):
             names = escape(", ".join(unused))

@@ -24,7 +24,7 @@ Network = Annotated[
     typer.Option(
         "--network",
         metavar=FLAG,
-        help="Obey the `network:` section of the graph inside the recording: open its ports, connect where it says.",
+        help="Obey the `network:` section of the graph inside the recording: open its ports, connect to its endpoints.",
     ),
 ]
 Settings = Annotated[
@@ -108,7 +108,7 @@ Every = Annotated[
         metavar="TIME",
         parser=offset,
         help="Of a viewer file: draw one image, overlay and cloud of each stream in so much event time; 0: every one. "
-        "Default: what the graph says (`view: every`), else 200ms.",
+        "Default: that of the graph (`view: every`), else 200ms.",
     ),
 ]
 Streams = Annotated[

@@ -40,7 +40,7 @@ def replay_bag(
     quiet: bool,
     verbose: bool,
 ) -> None:
-    """Replays a bag through a graph, and says what of it is played, by which clock, and what was repaired."""
+    """Replays a bag through a graph; prints which topics are played, by which clock, and what was repaired."""
     from dataflow.editing.untouched import keep_untouched
     from dataflow.interop.playing import match
     from dataflow.interop.streams import BagStreams

@@ -1,4 +1,4 @@
-"""Draws a recording or a bag in a viewer, and says what was drawn."""
+"""Draws a recording or a bag in a viewer, and prints what was drawn."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def draw_recording(
 
 
 def opened_streams(path: Path, clock: Choice) -> Recording | BagStreams:
-    """Opens a recording, or a bag with every topic that a message type fits; says which clock its stamps are of."""
+    """Opens a recording, or a bag with every topic that a message type fits; prints which clock its stamps are of."""
     from dataflow.interop.opening import is_foreign, open_bag
     from dataflow.recording import Recording
 
@@ -159,7 +159,7 @@ def report(sink: ViewerSink, complete: bool, file: Path | None = None) -> None:
     if drawn.dropped:
         parts.append(f"{drawn.dropped:,} skipped because the viewer was too slow")
     if drawn.passed:
-        parts.append(f"{drawn.passed:,} passed over: of images, as many a second as --every of `dataflow view` says")
+        parts.append(f"{drawn.passed:,} passed over: images beyond the rate that --every of `dataflow view` sets")
     if drawn.failed:
         parts.append(f"{drawn.failed:,} could not be drawn")
     if isinstance(sink.target, Save):

@@ -123,5 +123,5 @@ def print_unknown(operators: Collection[str]) -> None:
         say(
             f"[yellow]no recorded state at or before the cut:[/] {escape(', '.join(sorted(operators)))}: they begin "
             "afresh, and are not verified before their next recorded state (`record: {snapshots: 10s}` records what "
-            "`snapshot()` gives; an operator without a state says `stateless = True`)"
+            "`snapshot()` gives; an operator without a state sets `stateless = True`)"
         )

@@ -35,15 +35,15 @@ TRACEBACK = "DATAFLOW_TRACEBACK"
 """Environment variable: any value but 0 and none shows the tracebacks of errors."""
 
 PIPE_WIDTH = 120
-"""Columns of tables that go into a file or a pipe, unless COLUMNS says otherwise."""
+"""Columns of tables that go into a file or a pipe, unless COLUMNS is set."""
 
 LONGEST = 10_000
-"""Characters of one wrapped text, such as a cell of a table; of a longer one the rest is counted. A name in somebody's
-recording may have millions, and breaking those into lines takes minutes."""
+"""Characters of one wrapped text, such as a cell of a table; of a longer one the rest is counted. A name in a
+foreign recording may have millions, and breaking those into lines takes minutes."""
 
 
 class _VisibleConsole(Console):
-    """Passes everything that is printed through `visible_lines`; styles and cursor movements of its own stay."""
+    """Passes everything that is printed through `visible_lines`; the console's styles and cursor movements stay."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         if isinstance(renderable, Text) and len(renderable) > LONGEST and not (options or self.options).no_wrap:
@@ -86,7 +86,7 @@ def print_json(value: Any) -> None:
 
 
 def print_json_line(value: Any) -> None:
-    """Prints one JSON value on a line of its own, at once."""
+    """Prints one JSON value as one line, and flushes."""
     print(_json(value), flush=True)
 
 
@@ -242,7 +242,7 @@ def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) 
     from rich.table import Table
 
     class Rows(Table):
-        """Shows a line break in a cell as its escape: a name in somebody's file cannot pass for another row."""
+        """Shows a line break in a cell as its escape: a name in a foreign file cannot pass for another row."""
 
         def add_row(self, *cells: RenderableType | None, **more: Any) -> None:
             super().add_row(*(_one_line(cell) for cell in cells), **more)

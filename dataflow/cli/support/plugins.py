@@ -48,7 +48,7 @@ RENAMED = {"one-host": "one-process", "host-each": "process-each", "patience": "
 
 @cache
 def renamed(word: str) -> str:
-    """The name that an option has now; says so, once, where it is called by its former one."""
+    """Returns the present name of an option; prints a note, once, where the former one is used."""
     if word in RENAMED:
         say(f"[dim]--{word} is now --{RENAMED[word]}; the old name ends with the next version[/]")
     return RENAMED.get(word, word)
@@ -108,7 +108,7 @@ def _without_traceback(words: list[str]) -> list[str]:
 def tidy(command: Any, ctx: Any) -> None:
     """Makes the help of a command and its subcommands alike.
 
-    Examples stay on lines of their own, values have a name in capitals and not a type, flags have neither, and there
+    Examples keep their line breaks, values have a name in capitals and not a type, flags have neither, and there
     are no options to install completion.
     """
     if command.help:
@@ -136,7 +136,7 @@ def _metavar(param: Any) -> str | None:
 
 
 def load(entry: EntryPoint) -> Any:
-    """The command of an entry point; for one that does not load, a command that says why."""
+    """Returns the command of an entry point; for one that does not load, a command that prints why."""
     try:
         return _command(entry)
     except Exception as error:  # a plug-in may fail in any way when it is imported

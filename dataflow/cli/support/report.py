@@ -182,8 +182,8 @@ def _outcome(report: RunReport) -> tuple[str, str]:
 
 
 def _operators(report: RunReport) -> Table:
-    """A row for each operator; Hz is firings per second of event time, CPU that of its calls, wall s their
-    wall time. What is nothing of all has no column."""
+    """Returns a row for each operator; Hz is firings per second of event time, CPU that of its calls, wall s their
+    wall time. Figures that are zero for all operators have no column."""
     timeouts, late = _total(report.waits, "timeout"), _total(report.waits, "late")
     lost: Counter[str] = Counter()
     for operator, _, _, number in dropped(report):
@@ -220,7 +220,7 @@ def _total(rows: Rows, wanted: str) -> dict[str, int]:
 
 
 def _figures(summary: Mapping[str, Any]) -> Table:
-    """One line a figure; the decimal values in a column of their own, with their unit."""
+    """Returns one line a figure; the decimal values in a separate column, with their unit."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold", max_width=_VALUE_WIDTH)

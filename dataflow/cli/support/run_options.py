@@ -18,7 +18,7 @@ OneProcess = Annotated[
 ProcessEach = Annotated[
     bool,
     typer.Option(
-        "--process-each", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run every operator in a process of its own."
+        "--process-each", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run every operator in a separate process."
     ),
 ]
 Place = Annotated[

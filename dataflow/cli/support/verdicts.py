@@ -189,7 +189,7 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
 
 
 def _cut(report: VerifyReport) -> str:
-    """Tells why a recording tells of its run only up to a cut; nothing where it tells of all."""
+    """Returns why a recording covers its run only up to a cut; empty where it covers all of it."""
     if report.part is not None:
         span = " ".join(
             f"{word} {format_stamp(stamp)}"
@@ -254,7 +254,7 @@ def _left_out(v: Verification) -> Iterator[str]:
         yield (
             f"{v.operator}: {plural(v.unknown, 'firing')} could not be repeated: the recording was cut there, and "
             "holds no state of it at or before the cut (`record: {snapshots: 10s}` records what `snapshot()` gives; an "
-            "operator without a state says `stateless = True`)"
+            "operator without a state sets `stateless = True`)"
         )
     if v.unaccounted:
         yield f"{v.operator}: {plural(v.unaccounted, 'message')} that no firing record accounts for: records are lost"
@@ -265,7 +265,7 @@ def _left_out(v: Verification) -> Iterator[str]:
         after = ", after the cut" if v.cut and v.beyond else ""
         yield f"{v.operator}: {plural(v.unverifiable, 'firing')} could not be repeated (missing {missing}{after})"
     if v.after_cut:
-        yield f"{v.operator}: {plural(v.after_cut, 'message')} after the cut, of which no firing record tells"
+        yield f"{v.operator}: {plural(v.after_cut, 'message')} after the cut, in no firing record"
     if v.not_stored:
         yield f"{v.operator}: {plural(v.not_stored, 'message')} made again, not in the recording (never sent, or lost)"
 

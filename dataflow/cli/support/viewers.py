@@ -21,7 +21,7 @@ DRAW_WITHIN = 15.0
 
 
 def open_saved(path: Path) -> None:
-    """Opens a saved viewer file in a window that stays; says so where there is no display."""
+    """Opens a saved viewer file in a window that stays; prints a note where there is no display."""
     from dataflow.view import ViewerError
     from dataflow.view.process import display_problem, start
 
@@ -40,7 +40,7 @@ def open_saved(path: Path) -> None:
 def attached_viewer(target: str | None) -> Iterator[None]:
     """While the block runs: a viewer's process that attaches to this process's graph as soon as it runs.
 
-    The block begins when that process is ready to attach, so that a short run is seen too. What the viewer says goes to
+    The block begins when that process is ready to attach, so that a short run is seen too. The viewer's output goes to
     standard error. Its failure never ends the run.
     """
     if target is None:

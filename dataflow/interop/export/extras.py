@@ -71,7 +71,7 @@ def carry(material: Material, writer: Writer, done: Exported, *, without: Collec
     extras = Extras(material)
     for name, values in extras.metadata:
         if name in without:
-            done.left_out[f"metadata {name}"] = "it tells of the file that it was in, and is written anew"
+            done.left_out[f"metadata {name}"] = "it describes the file that it was in, and is written anew"
         else:
             writer.add_metadata(name, values)
             done.metadata += 1
@@ -91,7 +91,7 @@ def tell_left_out(material: Material, what: str, done: Exported) -> None:
 
 
 def tell_runs(extras: Extras, done: Exported) -> None:
-    """Says that the metadata of a run are not carried over."""
+    """Notes in `done` that the metadata of a run are not carried over."""
     if extras.runs:
-        tells = "record tells" if extras.runs == 1 else "records tell"
-        done.left_out[RUN_FACTS] = f"{extras.runs} {tells} of the run and its firing records, which stay behind"
+        describe = "record describes" if extras.runs == 1 else "records describe"
+        done.left_out[RUN_FACTS] = f"{extras.runs} {describe} the run and its firing records, which stay behind"

@@ -59,7 +59,7 @@ def write_png(path: Path, message: Image | Image16) -> None:
 
 
 def write_depth(path: Path, message: DepthImage, units: float, name: str, done: Exported) -> None:
-    """Writes depth as 16-bit `units` a metre, 0 for no return. What the format cannot hold is counted in pixels."""
+    """Writes depth as 16-bit `units` a metre, 0 for no return. Counts the pixels that the format cannot hold."""
     metres = message.data.astype(np.float64)
     seen = np.isfinite(metres) & (metres > 0)
     scaled = np.rint(np.where(seen, metres, 0) * units)

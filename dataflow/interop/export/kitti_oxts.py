@@ -33,7 +33,7 @@ def write_oxts(material: Material, stamps: Sequence[int], drive: Path, times: An
 
     A packet takes the reading (Imu with an orientation), the position (NavSatFix) and the velocity (Odometry in the
     unit's frame) nearest to its frame, within 20 ms. Where one of the three is missing, nothing is written, and
-    `done.left_out` says which; a recording without readings and positions is not expected to have packets.
+    `done.left_out` names it; a recording without readings and positions is not expected to have packets.
     `times`: writes stamps as KITTI does.
     """
     if not material.of_type(Imu) and not material.of_type(NavSatFix):

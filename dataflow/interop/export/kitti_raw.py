@@ -83,7 +83,7 @@ def _images(material: Material, camera: str, wanted: list[int], folder: Path, do
 
 
 def _calibration(material: Material, folder: Path, camera: str, lidar: str, done: Exported) -> None:
-    """Writes calib_cam_to_cam.txt and calib_velo_to_cam.txt, as far as the recording says it."""
+    """Writes calib_cam_to_cam.txt and calib_velo_to_cam.txt, as far as the recording holds calibration."""
     infos = [m.message for name in material.of_type(CameraInfo) for m in material.messages([name])]
     info = next((i for i in infos if isinstance(i, CameraInfo) and i.frame == camera), None)
     if info is None:
@@ -95,7 +95,7 @@ def _calibration(material: Material, folder: Path, camera: str, lidar: str, done
         write_text(folder / "calib_cam_to_cam.txt", _lines(lines), done)
     T = _between(material, lidar, camera)
     if T is None:
-        done.left_out["calib_velo_to_cam.txt"] = f"no transform says where {camera!r} is in {lidar!r}"
+        done.left_out["calib_velo_to_cam.txt"] = f"no transform between {lidar!r} and {camera!r}"
     else:
         T_camera_lidar = invert(T)
         lines = {"R": T_camera_lidar[:3, :3].ravel(), "T": T_camera_lidar[:3, 3]}
@@ -103,16 +103,16 @@ def _calibration(material: Material, folder: Path, camera: str, lidar: str, done
 
 
 def _mounting(material: Material, folder: Path, lidar: str, unit: str, done: Exported) -> None:
-    """Writes calib_imu_to_velo.txt, if a transform says it."""
+    """Writes calib_imu_to_velo.txt, if a transform gives it."""
     T = _between(material, lidar, unit)
     if T is None:
-        done.left_out["calib_imu_to_velo.txt"] = f"no transform says where {unit!r} is in {lidar!r}"
+        done.left_out["calib_imu_to_velo.txt"] = f"no transform between {lidar!r} and {unit!r}"
     else:
         write_text(folder / "calib_imu_to_velo.txt", _lines({"R": T[:3, :3].ravel(), "T": T[:3, 3]}), done)
 
 
 def _between(material: Material, parent: str, child: str) -> np.ndarray | None:
-    """T_parent_child (4, 4) from the first transform that says it directly, either way round."""
+    """Returns T_parent_child (4, 4) from the first transform between the two frames, either way round; None without."""
     for name in material.of_type(Transforms):
         for recorded in material.messages([name]):
             message = recorded.message

@@ -1,4 +1,4 @@
-"""Tables of streams: one CSV or Parquet file a stream, a row a message, small arrays as columns of their own."""
+"""Tables of streams: one CSV or Parquet file a stream, a row a message, small arrays as one column an element."""
 
 from __future__ import annotations
 

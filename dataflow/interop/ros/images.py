@@ -30,7 +30,7 @@ _CONVERTED = {
 
 
 def image(message: Any, stamp: int) -> Image | Image16 | DepthImage:
-    """sensor_msgs/Image: depth where its encoding says so, and all 16 bits of greys and colours that have them."""
+    """sensor_msgs/Image: depth for a depth encoding, and all 16 bits of greys and colours that have them."""
     rows = stored_rows(
         message.encoding,
         message.width,

@@ -36,13 +36,13 @@ def unit(quaternion: F64) -> F64:
 
 
 def covariance(values: Any, size: int) -> F64 | None:
-    """(size, size); None where it is all zeros, which in ROS says that it is not known."""
+    """(size, size); None where it is all zeros, which in ROS means unknown."""
     data = np.asarray(values, np.float64)
     return data.reshape(size, size) if data.any() else None
 
 
 def known(values: Any) -> F64 | None:
-    """The numbers; None where all are zero, which in ROS says that they are not known, or one is NaN or infinite."""
+    """The numbers; None where all are zero, which in ROS means unknown, or one is NaN or infinite."""
     data = np.asarray(values, np.float64)
     return data if data.any() and np.isfinite(data).all() else None
 

@@ -31,7 +31,7 @@ CHUNK_HEAD = _CHUNK.size
 
 @dataclass(frozen=True, slots=True)
 class ChunkRef:
-    """One chunk: where its record's body begins in the file, and what the index says of it.
+    """One chunk: where its record's body begins in the file, and its entry in the index.
 
     `torn`: the file ends within it; `length` is what there is of it.
     """
@@ -43,7 +43,7 @@ class ChunkRef:
 
 
 def size_in_head(head: bytes) -> int:
-    """The uncompressed size that the head of a chunk record's body tells."""
+    """Returns the uncompressed size stated in the head of a chunk record's body."""
     return int(_CHUNK.unpack_from(head)[2])
 
 
@@ -144,7 +144,7 @@ class Chunks:
         if at + 8 > len(body):
             raise self._file.damaged(f"{where} is too short")
         if size > MAX_CHUNK_BYTES:
-            raise self._file.damaged(f"{where} says it has {size} bytes, at most {MAX_CHUNK_BYTES} are read")
+            raise self._file.damaged(f"{where} states {size} bytes, at most {MAX_CHUNK_BYTES} are read")
         name = body[_CHUNK.size : at].decode("ascii", "replace")
         (length,) = struct.unpack_from("<Q", body, at)
         packed = memoryview(body)[at + 8 : at + 8 + length]
@@ -155,13 +155,13 @@ class Chunks:
         if ref.torn:
             return data[: _whole_records(data)]
         if len(data) != size:
-            raise self._file.damaged(f"{where} does not hold the {size} bytes that it says it has")
+            raise self._file.damaged(f"{where} does not hold the {size} bytes that it states")
         if crc and zlib.crc32(data) != crc:
             raise self._file.damaged(f"{where} fails its checksum")
         return data
 
     def _unpack(self, compression: str, packed: memoryview, size: int, where: str, *, torn: bool) -> bytes:
-        """At most `size` + 1 bytes, whatever the data says of itself; of a torn chunk, those that can be unpacked."""
+        """Returns at most `size` + 1 bytes, whatever the data states; of a torn chunk, those that can be unpacked."""
         match compression:
             case "":
                 return bytes(packed[: size + 1])
@@ -172,7 +172,7 @@ class Chunks:
                 if stated == size:
                     return self._decompressor.decompress(packed, max_output_size=size)
                 if stated > size:  # one-shot decompression would believe it
-                    raise self._file.damaged(f"{where} says it has {size} bytes, its zstd frame {stated}")
+                    raise self._file.damaged(f"{where} states {size} bytes, its zstd frame {stated}")
                 with self._decompressor.stream_reader(packed, read_across_frames=True) as reader:
                     return reader.read(size + 1)
             case "lz4":

@@ -2,8 +2,8 @@
 
 Schemas and channels are written at once, outside chunks, and messages are gathered into chunks: those of streams in
 one, the run's records (firing records, events) in another, so that records can be read without the streams. Both go to
-the operating system, with their message indexes, in one step, the records first. What is in the file at any moment is
-therefore readable, and holds what was added up to some moment.
+the operating system, with their message indexes, in one step, the records first. The file is
+therefore readable at any moment, and holds everything added up to some moment.
 Layout: https://mcap.dev/spec.
 """
 
@@ -140,7 +140,7 @@ class ContainerWriter:
         self._metadata.append(MetadataIndex(offset=offset, length=len(record), name=name))
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """Adds a file inside this one; its record has a checksum of its own."""
+        """Adds a file inside this one; its record has a separate checksum."""
         self._count_parsed()
         record = record_bytes(attachment.record())
         if len(record) > MAX_CHUNK_BYTES:

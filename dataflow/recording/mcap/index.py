@@ -205,7 +205,7 @@ class McapFile:
         return contents, LoadedIndex(contents.entries()) if summary is None else summary.index
 
     def _load_header(self) -> None:
-        """The header, which also tells whether records outside chunks have checksums."""
+        """Loads the header, which also states whether records outside chunks have checksums."""
         file, start = self._file, len(MAGIC)
         head = file.read_up_to(start, RECORD.size)
         opcode, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)

@@ -80,7 +80,7 @@ class LoadedIndex:
 class LongIndex:
     """The messages of a file of very many chunks, whose message indexes are read as they are needed.
 
-    `counts`: messages by channel, where the file's statistics count them. What is damaged is then noted in `damage`.
+    `counts`: messages by channel, where the file's statistics count them. Damage found on reading is noted in `damage`.
     """
 
     def __init__(
@@ -194,8 +194,8 @@ def take_messages(
 def _message_indexes(
     file: RawFile, start: int, indexes: ChunkIndexes, number: int, sealed: bool, wanted: frozenset[int] | None
 ) -> list[bytes] | None:
-    """The bodies of the message indexes behind a chunk, all or those of `wanted` channels; None where they are not what
-    the chunk index says."""
+    """Returns the bodies of the message indexes behind a chunk, all or those of `wanted` channels; None where they
+    contradict the chunk index."""
     data = file.read(start, int(indexes.index_lengths[number]))
     bodies: list[bytes] = []
     found: list[int] = []

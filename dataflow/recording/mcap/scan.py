@@ -108,7 +108,7 @@ class Scan:
         self.salvaged = f"the file ends within {where}: {saved} whole messages and records of it are saved"
 
     def _body(self, at: int, length: int) -> bytes | None:
-        """The body of a record; None, and a note, where its checksum says that it is damaged."""
+        """Returns the body of a record; None, and a note, where it fails its checksum."""
         record = self._file.record(at, length)
         if self._sealed and seal_of(record) is not Seal.SOUND:
             self.contents.damage.append(f"the record at byte {at} is damaged and left out")
@@ -137,7 +137,7 @@ class Scan:
 
 
 def scan(file: RawFile, *, sealed: bool, trusting: bool, lenient: bool = False) -> Scan:
-    """The pass that tells what `file` holds: where a trusting one comes upon damage, one that reads every chunk."""
+    """Scans `file` and returns the scan: where a trusting one meets damage, one that reads every chunk."""
     found = Scan(file, sealed=sealed, trusting=trusting, lenient=lenient)
     found.run()
     if trusting and found.contents.damage:

@@ -51,14 +51,14 @@ def read_footer(file: RawFile) -> Footer | None:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Returns what a summary tells of the file; `index`: of its messages."""
+    """Contents of a file according to its summary; `index`: of its messages."""
 
     contents: Contents
     index: MessageIndex
 
 
 def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Summary | None:
-    """Returns what the summary tells; None where it does not suffice to find every message.
+    """Returns the summary; None where it does not suffice to find every message.
 
     Raises `DamagedError` where it fails its checksum or contradicts itself or the file. Chunks, message indexes and
     metadata must not overlap, so that what is read is bounded by the size of the file. The message indexes of a file of

@@ -172,8 +172,8 @@ def codec_for(message: type[Message]) -> Codec:
 
 
 def declaration_metadata(message: type[Message]) -> dict[str, str]:
-    """Returns what a stream's channel says of its type: a digest of the declaration, and the whole of it for an own
-    type."""
+    """Returns a channel's metadata on its message type: a digest of the declaration, and the whole declaration for an
+    own type."""
     declared = {"declaration": declaration_digest(message)}
     if not is_built_in(message):
         declared[FIELDS] = json.dumps(Declaration.of(message).to_json(), ensure_ascii=False)

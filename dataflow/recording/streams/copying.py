@@ -29,7 +29,7 @@ from dataflow.recording.streams.reader import Recording
 
 Mask = npt.NDArray[np.bool_]
 RUN_KINDS = (Kind.FIRINGS, Kind.EVENTS, Kind.LOGS)
-"""Channels that lie in chunks of their own."""
+"""Channels that lie in separate chunks."""
 
 TIMES = 2**64
 """Times in a file are unsigned; those that are read from 2^63 on stand before the epoch."""
@@ -171,7 +171,7 @@ class Copy:
         return self.writer.add_channel(firings_topic(namespace, operator), "msgpack", 0, metadata)
 
     def attachments(self, origin: Origin, names: Sequence[str | None] | None = None) -> int:
-        """Takes over the attachments of `origin`, under other names where `names` says so (None: not); how many."""
+        """Takes over the attachments of `origin`, renamed where `names` gives a name (None: not); returns how many."""
         before = self.attached
         for place, name in zip(origin.file.attachments, names or repeat(""), strict=False):
             if name is not None:

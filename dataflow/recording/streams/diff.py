@@ -22,7 +22,7 @@ Outcome = Literal["same", "within tolerance", "different", "only in A", "only in
 class FieldDifference:
     """One field that differs in the messages of one stamp.
 
-    `detail` says how, for people; `max_difference` is the largest absolute difference where both sides are numbers of
+    `detail`: text for people; `max_difference` is the largest absolute difference where both sides are numbers of
     one shape (infinite where one is NaN or infinite and the other is not the same), else None. In arrays of one shape
     `index` is the first element that differs, `count` how many of `size` do. `a` and `b` are the two values there, as
     JSON values: text where JSON has no word for them.

@@ -69,8 +69,8 @@ CPU_FEATURES = frozenset(_FEATURES.split())
 def machine_facts(environment: Mapping[str, str] | None = None) -> dict[str, dict[str, str]]:
     """Metadata records `machine`, `packages`, `threads` and `device`, keys sorted; equal on an equal machine.
 
-    `environment`: that of the processes which compute, this process's own by default. What cannot be found out is left
-    out or empty. Nothing is imported or started for it.
+    `environment`: that of the processes which compute, this process's own by default. Facts that cannot be
+    found out are left out or empty. Nothing is imported or started for it.
     """
     variables = os.environ if environment is None else environment
     model, features = _cpu()

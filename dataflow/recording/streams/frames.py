@@ -18,7 +18,7 @@ VIEWER_ROOT = "tf#/"
 
 
 class FrameTree:
-    """Watches messages go by and says which transforms they imply."""
+    """Derives the transforms that messages imply, one message after the other."""
 
     def __init__(self) -> None:
         self._placed_by: dict[str, str] = {}

@@ -3,10 +3,10 @@
     {"timestamp": {"sec": 12, "nsec": 5}, "frame": "base", "score": 0.5, "boxes": [0.0, 1.0, 2.0, 3.0],
      "_exact": {"boxes": {"dtype": "float32", "shape": [1, 4]}}}
 
-Every property has one JSON type, so that plotting tools, which know no unions, take the schema. What plain JSON cannot
-hold stands under `_exact` instead: integers beyond ±2^53 and floats that are not finite as strings, arrays that are
+Every property has one JSON type, so that plotting tools, which know no unions, take the schema. Values that plain JSON
+cannot hold stand under `_exact`: integers beyond ±2^53 and floats that are not finite as strings, arrays that are
 long (over 64 elements) or hold such values as {dtype, shape, base64}, and the dtype and shape of arrays whose flat list
-does not tell them. A field that stands nowhere is None.
+does not give them. A field that stands nowhere is None.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def _vectors(field: ArrayField, plain: list[Any]) -> Values | None:
         return None
     try:
         stacked = np.array(plain, field.dtypes[0])
-    except (ValueError, TypeError, OverflowError):  # the way through single messages says which one, and why
+    except (ValueError, TypeError, OverflowError):  # the way through single messages names the one, and why
         return None
     stacked.flags.writeable = False
     return stacked if stacked.ndim == 2 else None

@@ -23,7 +23,7 @@ class LogLine:
     text: str
     process: str = ""
     operator: str = ""
-    """Empty where nobody knows which operator of the process it was."""
+    """Empty where the operator of the process is unknown."""
     stamp: int | None = None
     """Event time (ns) of the call in which it was said; None outside of calls, and in `setup()`."""
     time: int = 0

@@ -1,6 +1,6 @@
 """A folder of the parts of one recording, NAME_000.mcap and so on, read as one file.
 
-What several parts hold, since firings of both take it, is taken once.
+A message that several parts hold, since firings of both take it, is read once.
 """
 
 from __future__ import annotations

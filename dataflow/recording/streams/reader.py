@@ -36,7 +36,7 @@ from dataflow.recording.streams.tracks import tracks
 class Recording:
     """A recording opened for reading: a context manager, with random access. Not thread-safe.
 
-    Opens our own recordings, a folder of the parts of one (NAME_000.mcap and so on), and anybody's MCAP. A file without
+    Opens our own recordings, a folder of the parts of one (NAME_000.mcap and so on), and any other MCAP. A file without
     an index (torn by `kill -9`, or foreign) is indexed by a pass over it. Raises `RecordingError` for a file that is no
     MCAP or is damaged.
     """
@@ -71,7 +71,7 @@ class Recording:
 
     @property
     def damage(self) -> tuple[str, ...]:
-        """Returns what in the file is damaged, for people: it was read by other means, or is left out as the note says.
+        """Returns notes on damage in the file, for people: read by other means, or left out, as each note states.
         Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read."""
         return tuple(self._file.damage)
 
@@ -146,7 +146,7 @@ class Recording:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order: all of them,
         or those with log times from `start` (ns) on, which are those of a batch's last record.
 
-        One pass: they lie in chunks of their own, without the messages of streams (in older recordings among them).
+        One pass: they lie in separate chunks, without the messages of streams (in older recordings among them).
         """
         channels = {
             c.id: c.metadata.get("operator", "")

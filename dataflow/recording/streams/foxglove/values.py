@@ -53,7 +53,7 @@ def frozen(values: Iterable[float], dtype: str, shape: tuple[int, ...]) -> npt.N
 
 
 def as_doubles(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one; `bits_survive` tells
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one, which `bits_survive` detects
         return data.astype("<f8")
 
 
