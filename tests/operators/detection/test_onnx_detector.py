@@ -108,7 +108,7 @@ def test_class_names_come_from_a_file(tmp_path: Path) -> None:
 def test_as_many_class_names_are_needed_as_the_model_has_classes(tmp_path: Path, given: tuple[str, ...]) -> None:
     model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
     made = detector(model=model, decoder="yolov8", classes=names(tmp_path, *given))
-    with pytest.raises(ModelError, match=rf"m\.onnx tells 2 classes apart, but there are {len(given)} class names;"):
+    with pytest.raises(ModelError, match=rf"m\.onnx separates 2 classes, but there are {len(given)} class names;"):
         made.process(red())
 
 
