@@ -116,7 +116,7 @@ def test_a_network_of_other_classes_than_cocos_is_not_given_their_names(tmp_path
     output = np.ones((1, 5 + 3, 2, 2))
     made = detector(model=save_model(tmp_path / "m.onnx", output), decoder="fastestdet")
     with pytest.raises(
-        ModelError, match=r"3 classes apart, .* 80 class names \(those of COCO\); give the model's own in"
+        ModelError, match=r"separates 3 classes, .* 80 class names \(those of COCO\); give the model's own in"
     ):
         made.process(red())
 
