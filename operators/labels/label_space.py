@@ -18,7 +18,7 @@ ROLES: Mapping[Role, str] = {
     "person": "an agent with hands: it holds and reaches, sits, and has goals",
     "rolls": "an agent that is moved by others: its activities are rolling and resting",
     "seat": "persons sit on it",
-    "container": "things are in it, not only on it or under it",
+    "container": "objects are in it, not only on it or under it",
     "portable": "persons carry it away in their hands",
     "support": "has a top at which persons stand, such as a table",
     "drink": "persons drink from it",
