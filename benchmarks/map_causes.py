@@ -1,4 +1,4 @@
-"""What the misses and the false objects of a map are made of, step by step from the truth to the map.
+"""Breaks the misses and the false objects of a map down by cause, step by step from the truth to the map.
 
     python benchmarks/map_causes.py CACHE [--first 600] [--worlds 10] [--every 1]
 

@@ -18,10 +18,9 @@ from operators.weights import shipped, trained_in_simulation
 class CustomDetector(Operator):
     """Finds objects with a grid detector on one CPU thread, so equal images give equal boxes.
 
-    The file tells classes, input size and anchors. Where it has a refiner (training adds one), each box is looked at
-    once more, at the image's full resolution, and its sides move to the object's. Without a file, the network that
-    comes with the project is used; it knows the objects of the simulated worlds. To find your own objects: `dataflow
-    train detector DATA`.
+    The file holds classes, input size and anchors. If it has a refiner (training adds one), the sides of each box are
+    refined at the image's full resolution. Without a file, the network that comes with the project is used; it detects
+    the objects of the simulated worlds only. To detect your own objects: `dataflow train detector DATA`.
     """
 
     stateless = True

@@ -1,6 +1,6 @@
 """Decodes the output of detector networks into scored boxes in the pixels of the network's input.
 
-A layout says how an image becomes the network's input (colour order, fit) and how its output is read.
+A layout describes how an image becomes the network's input (colour order, fit) and how its output is read.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Decode = Callable[[Outputs, Size, float], Candidates]
 class Layout:
     """One family of networks. Its input is (pixel - `mean`) / `scale`, pixels from 0 to 255.
 
-    `classes` tells of outputs that were decoded how many classes they have; none where they do not show it.
+    `classes` returns the number of classes of decoded outputs; None if the outputs do not show it.
     """
 
     decode: Decode

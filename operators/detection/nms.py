@@ -25,7 +25,7 @@ def class_wise_nms(
 ) -> NDArray[np.int64]:
     """Indices of the boxes to keep, by falling score.
 
-    A box is dropped when a kept box of its own class with a higher score overlaps it by more than `iou_threshold`.
+    A box is dropped when a kept box of the same class with a higher score overlaps it by more than `iou_threshold`.
     Equal scores are ordered by class, then by coordinates, so the result depends on the set of boxes alone.
     """
     return np.array([best for best, _, _ in _rounds(boxes, scores, classes, iou_threshold)], np.int64)

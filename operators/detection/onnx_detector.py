@@ -19,7 +19,8 @@ from operators.network_input import image_input, read_labels, three_channels
 class OnnxDetector(Operator):
     """Finds objects in an image with an ONNX model; on the CPU with one thread, so equal images give equal boxes.
 
-    The model takes one (1, 3, H, W) float32 input; the decoder says what its colours, range, fit and output mean.
+    The model takes one (1, 3, H, W) float32 input; the decoder defines its colours, range and fit, and the meaning of
+    the output.
     """
 
     stateless = True
@@ -85,7 +86,7 @@ class OnnxDetector(Operator):
         count = int(found.classes.max(initial=-1)) + 1 if known is None else known(outputs)
         if count > len(self._names) or (known is not None and count != len(self._names)):
             raise ModelError(
-                f"{self.model} tells {count} {'classes' if known is not None else 'or more classes'} apart, but there "
+                f"{self.model} separates {count} {'classes' if known is not None else 'or more classes'}, but there "
                 f"are {len(self._names)} class names{' (those of COCO)' if self.classes is None else ''}; give the "
                 f"model's own in OnnxDetector.classes, one a line"
             )

@@ -43,5 +43,5 @@ class ScoreFilter(Operator):
                 near = get_close_matches(name, names, 1)
                 hint = f"did you mean {near[0]!r}? " if near else ""
                 known = ", ".join(names) or "no names"
-                raise ValueError(f"ScoreFilter.classes: the detector knows no {name!r}; {hint}it knows {known}")
+                raise ValueError(f"ScoreFilter.classes: the detector has no class {name!r}; {hint}it has {known}")
         return np.array([name in self.classes for name in names])

@@ -23,7 +23,7 @@ class _Detection(Operator, abstract=True):
 
     model: str = Param("fasterrcnn_resnet50_fpn_v2", doc="a detection model of torchvision")
     weights: str = Param(DEFAULT, doc="torchvision's weights by name (COCO_V1), from its cache; nothing is downloaded")
-    checkpoint: str | None = Param(None, doc="weights of your own in place of them: a file of torch.save")
+    checkpoint: str | None = Param(None, doc="your weights in place of them: a file of torch.save")
     device: str = Param("cpu", doc="cpu, cuda, cuda:1 or mps")
     half: bool = Param(False, doc="compute in half precision; on a GPU alone")
     classes: tuple[str, ...] = Param((), doc="only these classes, by name; none means all")
@@ -91,8 +91,8 @@ class TorchvisionRigDetector(_Detection, merge=True):
     Boxes are those that TorchvisionDetector finds camera by camera, to 1e-4 of a pixel. A camera without an image at a
     stamp is left out of that call, so one that fails holds up no other; cameras that take their images at different
     times (no common trigger) are served one by one. Images of different sizes go through the network by size, since
-    borders around the smaller ones would change their boxes. More than six cameras: a class of your own, derived from
-    this one, with more outputs.
+    borders around the smaller ones would change their boxes. For more than six cameras derive a class with more
+    outputs.
     """
 
     images: In[Image] = In(many=True, doc="RGB or grey images of all cameras, told apart by their frames")

@@ -18,7 +18,7 @@ ROLES: Mapping[Role, str] = {
     "person": "an agent with hands: it holds and reaches, sits, and has goals",
     "rolls": "an agent that is moved by others: its activities are rolling and resting",
     "seat": "persons sit on it",
-    "container": "things are in it, not only on it or under it",
+    "container": "objects are in it, not only on it or under it",
     "portable": "persons carry it away in their hands",
     "support": "has a top at which persons stand, such as a table",
     "drink": "persons drink from it",
@@ -41,10 +41,10 @@ class LabelSpaceError(ValueError):
 class SizePrior:
     """One of the usual sizes of a class: shorter and longer side on the ground and height, in metres.
 
-    `spread` holds the standard deviations of the natural logarithms of the three. What is `round` has the outline of an
-    ellipse, as seen from above. Points of what is leafy lie inside its box, by the share `inset` of half its side. What
-    stands on the floor may have so much of its `foot` hidden, metres; 0 for what does not. What lies `along` the room
-    does so always: it stands at a wall. A prior may prefer one box over another; it removes nothing from a map.
+    `spread` holds the standard deviations of the natural logarithms of the three. A `round` object has an elliptic
+    outline, as seen from above. Points of a leafy object lie inside its box, by the share `inset` of half its side. An
+    object on the floor may have up to `foot` metres of its foot hidden; 0 for others. An object `along` the room is
+    always aligned with it: it stands at a wall. A prior may prefer one box over another; it removes nothing from a map.
     """
 
     size: tuple[float, float, float]

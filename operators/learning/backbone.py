@@ -68,7 +68,7 @@ class InvertedResidual(nn.Module):
 class Backbone(nn.Module):
     """Feature maps by stride (2, 4, 8, 16 and 32) of images (N, 3, H, W) in [0, 1], RGB.
 
-    `features` are its blocks in order; `taps` tells the stride of the map after a block (by index), and `channels` the
+    `features` are its blocks in order; `taps` maps a block (by index) to the stride of its output, and `channels` the
     channels of each stride's map.
     """
 

@@ -36,7 +36,7 @@ class Labelled(Protocol[Shown]):
 
 
 class SecondTask(ABC, Generic[Image, Batch]):
-    """A task for the training loop: the second network for the first one in `file`, which knows `known`.
+    """A task for the training loop: the second network for the first one in `file`, whose classes are `known`.
 
     It learns from rows, such as boxes, that the first network finds in labelled images. They are gathered once and stay
     in memory; `chunk` of them are varied alike and stay together, as one sample of the training loop.
@@ -56,7 +56,7 @@ class SecondTask(ABC, Generic[Image, Batch]):
         self.data, self.file = data, file
         self.variation = Variation() if variation is None else variation
         if known != data.classes:
-            raise TrainingFileError(f"{file} knows {', '.join(known)}; the data have {', '.join(data.classes)}")
+            raise TrainingFileError(f"{file} has {', '.join(known)}; the data have {', '.join(data.classes)}")
         self._rows: Columns = ()
 
     @property

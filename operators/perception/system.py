@@ -49,7 +49,7 @@ FUSION: dict[str, tuple[str, dict[str, Any]]] = {
     "wheels": (f"{SENSORS_NODE}/wheels", {"use": "wheels", "sigma": 0.03}),
     "command": (f"{SENSORS_NODE}/command", {"use": "control"}),
 }
-"""Sensor → the stream that stands for it in the fusion, and how far it is believed unless the caller says otherwise."""
+"""Sensor → its stream in the fusion, and the default noise parameters of that stream."""
 CHECKED_WHEELS = "motion_check/checked"
 """The stream that stands for wheels where something is there to check them against."""
 Array = NDArray[Any]
@@ -142,7 +142,7 @@ class PerceptionSystem:
         """Takes what was measured up to `stamp` (ns) and returns what follows from it.
 
         Images (H, W, 3) or (H, W) uint8, depths (H, W) metres and points (N, 3) metres may be arrays, which then have
-        the stamp of the step; messages have stamps of their own, after the last step's and up to this one's. `imu`,
+        the stamp of the step; messages keep their stamps, which lie after the last step's and up to this one's. `imu`,
         `wheels` and `command` may be several messages. Depth belongs to the image of the same stamp.
 
         Raises ValueError for a stamp that is not after the last one, a sensor that the system was not made for, and

@@ -47,8 +47,8 @@ class ActivityRecognizer(Operator):
     0.15 s at least, however often graphs come; the network answers for a quarter of a second ago. `unknown` stands for
     what is too unsure, or too long out of sight.
 
-    Where the postures of people are given, too, what they look like counts beside what the network says: the product of
-    both, since they see different things.
+    If postures of people are given, the probabilities of the posture and of the motion network are multiplied, since
+    the two see different evidence.
 
     Persons stand, walk, sit down, sit, stand up, reach or drink; balls roll or rest; robots drive or rest. Method:
     Hochreiter and Schmidhuber, "Long short-term memory", 1997; trained on simulated people (`dataflow train activity`).

@@ -13,7 +13,7 @@ from operators.recognition.episodes import Episode
 from operators.recognition.tracked_people import Moment, tracked_moments, true_moments
 
 LAG = 0.25
-"""Seconds by which what is said trails what is done: what comes right after tells a beginning from a passing look."""
+"""Delay of the answers in seconds: the moments after a change separate a beginning activity from a passing look."""
 
 STEP = 0.15
 """Seconds that a step of the network takes at least, however often agents are seen."""

@@ -197,9 +197,9 @@ def lingered(
 
 
 def varied(features: NDArray[np.float32], held: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Returns a part of a track as of somebody of other extents, at times without what stands around.
+    """Returns a part of a track with the extents of the agent varied, at times without its surroundings.
 
-    What tells an activity must not hang on a single group of features. Nothing moves in rows that are `held`.
+    No activity must depend on a single group of features. Motion is zero, up to noise, in rows that are `held`.
     """
     found = features + rng.normal(0, 0.01, features.shape).astype(np.float32)
     resting = found[held]

@@ -1,4 +1,4 @@
-"""Features of an agent, one vector for each moment: what of its recent past and surroundings tells what it does."""
+"""Features of an agent, one vector for each moment: its recent motion and surroundings, as evidence of its activity."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class AgentWindow:
         self._heights: tuple[float, float] | None = None
 
     def add(self, time: float, body: Body) -> None:
-        """Takes where the agent is; times rise. The velocity of a rigid one that is new tells where it was before."""
+        """Adds the agent's body at a time; times rise. The velocity of a new rigid agent gives its earlier position."""
         if self._looks:
             self._step = time - self._looks[-1].time
         elif not body.person and body.velocity.any():  # that of a person is mostly of limbs and of what hides

@@ -32,7 +32,7 @@ class LabelledImage:
 
 @dataclass(frozen=True)
 class ClassificationData:
-    """Class names, images to train on and images to score on; `notes` says what was assumed in reading them."""
+    """Class names, images to train on and images to score on; `notes` lists the assumptions made."""
 
     classes: tuple[str, ...]
     training: tuple[LabelledImage, ...]

@@ -31,7 +31,7 @@ class FeatureExtractor(Operator):
 
     The network is one of `dataflow train classifier` (`weights`: its last hidden layer, 256 wide) or, without that, a
     classification network of torchvision without its head (`model`: resnet50 gives 2048, mobilenet_v3_large 960). The
-    scalar product of two vectors of the same model says how alike they are, 1 for equal. Method: features of a trained
+    scalar product of two vectors of the same model is their similarity, 1 for equal. Method: features of a trained
     classifier as descriptors, Sharif Razavian et al. 2014.
     """
 
@@ -41,7 +41,7 @@ class FeatureExtractor(Operator):
 
     weights: str | None = Param(None, doc="network file of `dataflow train classifier`")
     model: str = Param("resnet50", doc="without `weights`: a classification model of torchvision")
-    checkpoint: str | None = Param(None, doc="weights of your own for `model`: a file of torch.save; none: its cache's")
+    checkpoint: str | None = Param(None, doc="your weights for `model`: a file of torch.save; none: its cache's")
     device: str = Param("cpu", doc="for `model`: cpu, cuda, cuda:1 or mps")
     per: Per = Param("image", doc="what a row is about: the image, or each detected object")
 
@@ -62,7 +62,7 @@ class FeatureExtractor(Operator):
         )
 
     def summary(self) -> Mapping[str, float | int | str]:
-        """Counts the images that came without detections of their own."""
+        """Counts the images without detections of the same stamp."""
         return self._subjects.summary()
 
     def _trained(self) -> tuple[str, Describe]:

@@ -53,5 +53,5 @@ class ImageClassifier(Operator):
         )
 
     def summary(self) -> Mapping[str, float | int | str]:
-        """Counts the images that came without detections of their own."""
+        """Counts the images without detections of the same stamp."""
         return self._subjects.summary()

@@ -131,7 +131,7 @@ class LearnedDetector(Operator):
         return Candidates(restored, np.concatenate(scores), np.concatenate(classes))
 
     def _drawn(self, glance: Glance, each: LearnedObject, boxes: F32, described: F32) -> tuple[F32, F32]:
-        """Moves the boxes that may show a learned object to its outline, and tells how surely they show it there."""
+        """Moves the boxes that may show a learned object to its outline; returns them with their probabilities."""
         rows = np.flatnonzero(each.probability(described) >= _MAYBE)
         boxes, described = boxes[rows], described[rows]
         for _ in range(_STEPS):

@@ -28,7 +28,7 @@ _FARTHEST = 0.5  # share of a box's size by which one step moves a side at most
 
 
 class LearnedObjectError(ModelError):
-    """A file of a learned object, or labelled images, that cannot be used: says what would be right."""
+    """Raised for an unusable file of a learned object or labelled images; the message gives what would be right."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +36,9 @@ class LearnedObject:
     """A class by what sets it apart: `direction` (D,) from the `background` (D,) mean towards the prototype.
 
     A vector's resemblance is 0 at the background's mean and 1 at the prototype; `threshold` lies between objects and
-    background. `outline` (D + 1, 4) tells from the vector of a box how to change its middle and size to those of the
-    object: shares of its size, and logarithms. `detector` is the SHA-256 of the network that the features come from,
-    `inner` the maps of it.
+    background. `outline` (D + 1, 4) is the linear regression from the vector of a box to the change of its middle and
+    size to those of the object: shares of its size, and logarithms. `detector` is the SHA-256 of the network that the
+    features come from, `inner` the maps of it.
     """
 
     name: str

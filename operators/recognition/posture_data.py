@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 POSTURES = ("standing", "walking", "sitting_down", "sitting", "standing_up", "reaching", "drinking")
-"""Activities of persons that a single look tells something of."""
+"""Activities of persons for which a single look is evidence."""
 BODY = 18
 """Values that tell a posture: five joints (right, away, up), where the chest points (away, right), the lean."""
 

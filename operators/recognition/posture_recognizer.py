@@ -27,11 +27,11 @@ _APART = 0.5  # metres on the ground between a node and the points that are of i
 class PostureRecognizer(Operator):
     """Says what the posture of each person of a scene looks like, by one look of the depth sensor.
 
-    The points of each person that is in view make a silhouette of 64x64 cells, with how much nearer or farther they
-    are, and what stands before and behind; a small network says what somebody of that shape does: stands, walks, sits
-    down, sits, stands up, reaches or drinks. It knows nothing of the past: `ActivityRecognizer` takes these answers
-    together with how people move and what is around them. Trained on simulated depth alone (`dataflow train posture`),
-    as in Shotton et al., "Real-time human pose recognition in parts from single depth images", 2011.
+    The points of each person in view are drawn as a silhouette of 64x64 cells, with relative depth and with the points
+    before and behind the person; a small network classifies it as standing, walking, sitting down, sitting, standing
+    up, reaching or drinking. It has no memory: `ActivityRecognizer` combines its answers with the motion and the
+    surroundings of people. Trained on simulated depth alone (`dataflow train posture`), as in Shotton et al.,
+    "Real-time human pose recognition in parts from single depth images", 2011.
     """
 
     nodes: In[SceneGraph] = In(doc="objects with persons among them; z points up in their frame")
@@ -77,7 +77,7 @@ class PostureRecognizer(Operator):
         if fresh:
             T_world_cloud = pose.matrix() @ transform_between(extrinsics, cloud.frame, pose.child_frame)
             found = _silhouettes(nodes, boxes, clusters, cloud, T_world_cloud, self._labels)
-        self._counts.update({"graphs": 1, "persons": len(found), "without a look of their own": int(not fresh)})
+        self._counts.update({"graphs": 1, "persons": len(found), "graphs without a new view": int(not fresh)})
         names = self._model.classes
         probabilities = np.zeros((0, len(names)), np.float32)
         if found:

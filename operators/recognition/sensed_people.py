@@ -45,8 +45,8 @@ def sensed_tracks(
 ) -> list[SensedTrack]:
     """Returns the agents of a map over time; `doings` and `views` tell what true agents do, and which are in view.
 
-    `objects` are what the recogniser takes besides. Of graphs that come more often than the network takes steps, every
-    second, third ... moment is a track of its own.
+    `objects` are what the recogniser takes besides. If graphs come n times as often as the network takes steps, each
+    track is split into n, of every n-th moment.
     """
     of = [nearest_agents(graph, truth) for graph, truth in zip(graphs, truths, strict=True)]
     times = np.array([truth.stamp for truth in truths]) * 1e-9

@@ -14,7 +14,7 @@ Per = Literal["image", "object"]
 
 
 class Subjects:
-    """Gives the views of each image. `missed` counts the images without detections of their own stamp."""
+    """Gives the views of each image. `missed` counts the images without detections of the same stamp."""
 
     def __init__(self, per: Per) -> None:
         self.per = per

@@ -16,7 +16,7 @@ _NEAREST = 0.1  # metres before the camera from which a corner has a place in th
 def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
     """Returns the image boxes (K, 4) of upright boxes (K, 7), centre, sizes and heading, NaN where partly behind.
 
-    `rounded` (K,) says which hold something of round outline.
+    `rounded` (K,) marks boxes of objects with a round outline.
     """
     rows = boxes.copy()
     rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))

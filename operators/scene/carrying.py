@@ -1,4 +1,4 @@
-"""Things in the hands of people: seen at somebody, and no longer where they lay."""
+"""Finds objects in the hands of people: seen at a person, and no longer where they lay."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def carried(
     kinds: Kinds,
     views: int,
 ) -> dict[int, int]:
-    """Returns the object's id of each observation that is of none where it lay, but of one in somebody's hand.
+    """Returns the id of the carried object for each observation of an object in a person's hand.
 
     `joined` holds the object's ids of the other observations, `views` in how many views a thing must
     have been seen. Notes with the things whether they are held now.

@@ -154,7 +154,7 @@ def _built(recording: Recording, stream: str | None) -> tuple[str, int]:
 
 
 def _activities(recording: Recording, built: str, *, start: int | None, end: int | None) -> dict[int, Activity]:
-    """Returns the activities that the graph's own operator tells, by stamp."""
+    """Returns the activities from the graph's activity operator, by stamp."""
     beside = f"{built.rpartition('/')[0]}/activities"
     if beside not in recording.streams or recording.streams[beside].message_type is not Activity:
         return {}

@@ -49,8 +49,8 @@ class LiftSettings:
 class Seen:
     """A cloud as the camera sees it: points (N, 3), their pixels (N, 2), which are in the image, and up (3,).
 
-    `classes` (N,) is the class of each point's pixel, -1 where it has none; None without masks. `grain` is by how many
-    pixels the image of a thing's points falls short of its own on each side.
+    `classes` (N,) is the class of each point's pixel, -1 where it has none; None without masks. `grain` is the number
+    of pixels by which the image of an object's points is smaller than the object's image on each side.
     """
 
     points: Array
@@ -110,8 +110,8 @@ def lift(
     holds enough of it, only such points count. Otherwise points of `background` classes and on level surfaces that
     reach beyond the box do not. Points go to the box that they fit best, once.
 
-    Of the boxes in `bodies` the mask tells more than the edges: such an object is what of its mask hangs together, also
-    beyond the box, and how much of the mask in the box it is counts in place of the overlap.
+    For the boxes in `bodies` the mask counts more than the edges: the object is the connected part of its mask, also
+    beyond the box, and its share of the mask in the box replaces the overlap.
     """
     candidates: list[tuple[int, Indices, float]] = []
     inside = np.flatnonzero(seen.inside)
@@ -300,7 +300,7 @@ def _linked(places: Array, reach: float) -> NDArray[np.intp]:
 
 
 def _groups(linked: Sequence[int]) -> NDArray[np.intp]:
-    """Returns the group of each place (N,), its first place's number; bit j of `linked[i]` says whether i reaches j."""
+    """Returns the group of each place (N,), its first place's number; bit j of `linked[i]` is set if i reaches j."""
     group = np.empty(len(linked), np.intp)
     left = (1 << len(linked)) - 1
     while left:

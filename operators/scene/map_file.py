@@ -147,7 +147,7 @@ def _is_map(path: Path) -> bool:
         with np.load(path, allow_pickle=False) as archive:
             return bool(json.loads(str(archive["facts"])).get("kind") == KIND)
     except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
-        return False  # whoever reads it says what is wrong with it
+        return False  # reading it raises the error
 
 
 def _flat(value: Any, kept: bytearray) -> Any:

@@ -23,7 +23,7 @@ WHOLE = 100_000_000
 
 _BRINK = 0.012  # metres that masks and clouds lose of each side of an object
 _KEPT = 16  # views of an object
-_FAR, _ENOUGH = 1.6, 5  # times as far as the third nearest of so many views, and one tells nothing more
+_FAR, _ENOUGH = 1.6, 5  # a view is dropped at so many times the range of the third nearest of so many views
 _SAMPLE = 16  # points of a view that are kept
 _SMALL = 0.5  # metres up to which things are seen whole, so that the kept views have points enough
 _STRAYS = 2.5  # standard deviations by which the edges of a view stray that is of something else
@@ -43,7 +43,7 @@ class MapObject:
     `view` (2,) the horizontal directions of the views; `most` is the largest number of voxels that it had; `images` are
     the views that its box is fitted to, `form` which of the ways in which its class stands, -1 while that is open,
     `fresh` how many of them are new since the last fit; `held` whether it was last seen in a hand. `beside` counts by
-    id in how many views another one was seen too, in a place of its own in the image.
+    id the views in which another object was seen too, in a separate place in the image.
     """
 
     id: int
@@ -100,7 +100,7 @@ class MapObject:
         return self.center, self.size, self.yaw
 
     def look(self, view: ImageView, points: Array | None = None) -> bool:
-        """Keeps a view that tells something new, with some of its points (N, 3).
+        """Keeps a view that adds information, with some of its points (N, 3).
 
         Of things that are seen whole from near, views from afar are dropped. Returns whether to fit the box again.
         """
@@ -136,8 +136,8 @@ class MapObject:
     ) -> None:
         """Puts the box around what is surely the object's and not `others`', in agreement with its images and class.
 
-        `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square. How high
-        it reaches over the `floor`, if that is known, tells which of the ways in which its class stands is its own.
+        `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square. Its height
+        over the `floor`, if that is known, selects among the usual forms of its class.
         """
         self.fresh = 0
         sure = self.cells.sure(others)
@@ -213,9 +213,9 @@ def _most_alike(ways: Sequence[Array]) -> int:
 def completed(box: tuple[Array, Array, float], view: Array, usual: SizePrior) -> tuple[Array, Array, float]:
     """Returns a box that is as deep as usual where only its near side was seen.
 
-    `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. Of the usual
-    sides on the ground, that across the view tells which of the two lies along it. The box grows away from the viewer,
-    less where views differ. No side is much shorter than is usual.
+    `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. The side across
+    the view decides which of the two usual sides on the ground lies along it. The box grows away from the viewer, less
+    where views differ. No side is much shorter than is usual.
     """
     center, size, yaw = box[0].copy(), box[1].copy(), box[2]
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])

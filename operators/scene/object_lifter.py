@@ -54,7 +54,9 @@ class ObjectLifter(Operator):
     segmentation: Sampled[SegmentationMap] = Sampled(
         required=False, doc="class of every pixel of the same image; one of another stamp is not used"
     )
-    pose: Sampled[Pose | Odometry] = Sampled(required=False, doc="the cloud's sensor or its robot; tells what is up")
+    pose: Sampled[Pose | Odometry] = Sampled(
+        required=False, doc="the cloud's sensor or its robot; gives the upward direction"
+    )
     boxes: Out[Boxes3D] = Out(doc="objects in the cloud's frame, with their numbers of points")
     images: Out[Detections2D] = Out(doc="the image's boxes of the objects, in the order of the boxes")
     clusters: Out[Clusters] = Out(doc="the object of every point of the cloud, in the order of the boxes")

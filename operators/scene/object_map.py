@@ -197,7 +197,7 @@ class ObjectMap:
         made.view = _direction(eye, cells)
         made.center = cells.middle
         image = each.image
-        if image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
+        if image is not None and not self._kinds.is_mover(made):  # a single view is weaker evidence than the points
             made.look(image, cells.points)
         self._fit(made)
         self.objects[made.id] = made
@@ -206,7 +206,7 @@ class ObjectMap:
     def _look_around(
         self, view: RangeView, objects: Sequence[MapObject], shown: Mapping[int, Cells], seconds: float
     ) -> None:
-        """Takes what a view says of the places of objects; `shown` are the voxels of those that it shows, by id."""
+        """Updates objects by what a view shows at their places; `shown` are the voxels of visible ones, by id."""
         s = self._settings
         if not objects:
             return
@@ -219,7 +219,7 @@ class ObjectMap:
             look_at(object, sight, view.origin, own, seconds, self._kinds, s, left=left)
 
     def _note_beside(self, seen: Sequence[Observation], ids: Sequence[int | None]) -> None:
-        """Counts for neighbours in how many views both were seen, each in a place of its own in the image."""
+        """Counts for neighbours the views in which both were seen, in separate places in the image."""
         rows = [(k, i, each.image) for k, (i, each) in enumerate(zip(ids, seen, strict=True)) if i is not None]
         images = [image for _, _, image in rows if image is not None]
         if len(rows) < 2 or len(images) < len(rows):

@@ -13,14 +13,14 @@ from operators.scene.range_view import GROWTH, RangeView, Sight
 
 Array = NDArray[np.float64]
 
-_SELDOM = 3  # of so many views of an object, one tells which voxels are not its own
+_SELDOM = 3  # one view in so many is used to remove voxels of other objects
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
 _EMPTY = 0.6  # share of the voxels looked at that are seen through, from which a place is empty
 _STRAY, _NOISES = 0.03, 3.0  # metres, and standard deviations of ranges, by which voxels stray from a surface
 
 
 def has_left(object: MapObject, view: RangeView, s: MapSettings) -> bool:
-    """Tells whether a view looks through the place of an object, as finely as its ranges allow.
+    """Returns whether a view looks through the place of an object, as finely as its ranges allow.
 
     What a small thing stood on is not far behind it: less than the margin that is safe for all.
     """
@@ -40,10 +40,10 @@ def look_at(
     *,
     left: bool,
 ) -> None:
-    """Takes what a view says of an object's place, and what of it (`own`) the view shows, if any.
+    """Updates an object by what a view shows at its place, and by its voxels in the view (`own`), if any.
 
-    `seconds` are those since the view before: soon after it a view tells less. `left` says that a finer look found its
-    place empty.
+    `seconds` is the time since the view before: a view soon after it weighs less. `left` marks an object whose place a
+    finer look found empty.
     """
     mover = kinds.is_mover(object)
     if not len(object.cells):

@@ -1,4 +1,4 @@
-"""Tells of places what one cloud says: seen through, confirmed, hidden, or not looked at."""
+"""Classifies places by one cloud: seen through, confirmed, hidden, or not looked at."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class RangeView:
         return transform_points(self._T_world_sensor, self._own)
 
     def of(self, places: Array, margin: float, growth: float = GROWTH) -> Sight:
-        """Tells what the view says of places (N, 3) in the world, within a margin and a share of the range."""
+        """Classifies places (N, 3) in the world by the view, within a margin and a share of the range."""
         column, row, ranges = self._directions(transform_points(self._T_sensor_world, places))
         if not len(self._nearest):
             none = np.zeros(len(places), np.bool_)

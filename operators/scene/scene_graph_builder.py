@@ -32,12 +32,12 @@ class SceneGraphBuilder(Operator):
     """Relates the objects of a map: what is on, in, under, near, left of what, who does what, and where they are going.
 
     Nodes are the room (id -2), the robot (-1), surfaces (the floor is 0, walls and table tops count from -11 down),
-    objects and agents. The map's floor says how high things stand; without one it is made up from them. Relations are
+    objects and agents. Heights are over the map's floor; without one it is estimated from the objects. Relations are
     worked out from upright boxes, scored, and begin and end with hysteresis: on, in, under, above, near, left_of and
     in_front_of (of things near each other, as the robot sees them at that moment), part_of, sitting_on, holding,
     facing, approaching, and heads_for, whose score is the probability that the agent is going there. supports, right_of
-    and behind are inverses and asked for as such. Activities come from a recogniser, or where there is none or it does
-    not know, from motion and contact.
+    and behind are inverses and asked for as such. Activities come from a recogniser or, if it is absent or gives no
+    answer, from motion and contact.
 
     Method: layers after Armeni et al., "3D scene graph", 2019, and Hughes et al., "Hydra", 2022; goals after Ramirez
     and Geffner, "Probabilistic plan recognition using off-the-shelf classical planners", 2010.
@@ -213,10 +213,10 @@ class SceneGraphBuilder(Operator):
 
 
 def _recognized(act: Act, recognized: Activity, *, in_sight: bool) -> Act:
-    """Returns an act with what a recogniser says of its agent in place of ours.
+    """Returns an act with the recogniser's activity of its agent in place of the rule-based one.
 
-    That it does not know counts too, while the agent is in sight: ours would more often be wrong than right. Out of
-    sight nobody can tell, and ours is what the agent did last.
+    `unknown` is kept, too, while the agent is in sight: the rules would more often be wrong than right. Out of sight
+    there is no evidence, and the rule-based activity is the agent's last one.
     """
     rows = np.flatnonzero(recognized.subjects == act.agent)
     if not len(rows):
@@ -235,7 +235,7 @@ def _name(body: Body) -> str:
 
 
 def _usable(nodes: SceneGraph) -> NDArray[np.intp]:
-    """Returns the rows of the nodes that are finite and of a kind that the graph knows."""
+    """Returns the rows of the nodes that are finite and of a kind that the graph supports."""
     usable = np.isfinite(nodes.positions).all(axis=1) & np.isfinite(nodes.sizes).all(axis=1)
     usable &= (nodes.sizes >= 0).all(axis=1) & ((nodes.ids >= FLOOR) | (nodes.ids < SURFACE))
     return np.flatnonzero(usable)

@@ -47,15 +47,15 @@ class SemanticMap(Operator):
     """Accumulates objects and surfaces in the world, each with class, box, existence and when it was last seen.
 
     What a view shows is joined to the map by place, class and colour; two entries that come to share their place and
-    are not seen beside each other are one. Each view also says where nothing is: an object whose place is empty goes,
-    and one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move
-    by themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is
-    out of sight. What is seen often enough is given, whatever its size: where no thing of its class is so large, or
-    where a small class was seldom surely detected, it is doubted, which halves its score or lowers it by what the label
+    are not seen beside each other are one. Each view also shows empty space: an object whose place is empty goes, and
+    one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move by
+    themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is out
+    of sight. An object that is seen often enough is given, whatever its size: if its class is never so large, or if it
+    is of a small class and seldom surely detected, it is doubted, which halves its score or lowers it by what the label
     lacks. Surfaces are joined by their planes and by where they lie; there is one floor, and people stand on it.
 
     With `save` the map is written at the end, and with it the classes that were learned for it; `map_file` begins with
-    such a map, in whose frame the pose must be. What moves by itself is not taken over.
+    such a map, in whose frame the pose must be. Objects that move by themselves are not taken over.
 
     Method: after Hughes et al., "Hydra: a real-time spatial perception system", 2022, and Gu et al., "ConceptGraphs",
     2024, with free space from the views themselves.
@@ -63,7 +63,7 @@ class SemanticMap(Operator):
 
     boxes: In[Boxes3D] = In(doc="objects of one view, as ObjectLifter gives them")
     clusters: In[Clusters] = In(doc="the object of every point of the cloud, in the order of the boxes")
-    cloud: In[PointCloud] = In(doc="the whole view: what is behind an empty place says that it is empty")
+    cloud: In[PointCloud] = In(doc="the whole view: points behind a place show that it is empty")
     pose: Sampled[Pose | Odometry] = Sampled(
         doc="the cloud's sensor or its robot in the frame of the map, whose z is up"
     )

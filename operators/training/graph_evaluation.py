@@ -55,7 +55,7 @@ def evaluate_graph(
 
     `--data FOLDER` sets the parameter data, path, folder, file or recording, whichever the graph has; `--data
     NAME=FOLDER` one of another name. `--data FILE.mcap` replays a recording in place of the graph's sources. Metrics
-    are the operators of operators.evaluation and those of your own that give figures and have no outputs.
+    are the operators of operators.evaluation and your operators that give figures and have no outputs.
 
     Examples:
 

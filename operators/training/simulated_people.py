@@ -1,7 +1,7 @@
 """Episodes of people and other movers in simulated worlds, as true boxes over time: no image is rendered.
 
-Each world is drawn from a seed of its own and driven through; what a tracker would see of it is made of these by
-`operators.recognition.tracked_people`.
+Each world is drawn from a separate seed and driven through; `operators.recognition.tracked_people` derives from it what
+a tracker would see.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Silhouettes of simulated people with what they do: what a depth sensor sees of them from anywhere around.
 
-Each world is drawn from a seed of its own. Every person is looked at some times in each of its activities, from a place
+Each world is drawn from a separate seed. Every person is looked at some times in each of its activities, from a place
 that is drawn at random, with a sensor's noise and with masks that are wrong at their rims.
 """
 

@@ -1,6 +1,6 @@
 """A data folder rendered from simulated worlds: images, class masks and COCO boxes, for both networks.
 
-Each world is drawn from a seed of its own; a few images are taken from each, far apart in time, with varied cameras.
+Each world is drawn from a separate seed; a few images are taken from each, far apart in time, with varied cameras.
 
 python -m operators.training.simulated_worlds DATA [--worlds 480] [--first-seed 10000] [--validation 10] [--frames 10]
                                              [--processes 1]

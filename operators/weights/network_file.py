@@ -1,9 +1,9 @@
 """Network files: ONNX models that carry, as metadata, all that is needed to use them (classes, input size, anchors).
 
 The metadata entry `dataflow.network` holds a JSON object with at least `kind`, `classes`, `width` and `height`. A
-second network, which looks again at what the first one answered, lies in the entry `dataflow.second`: an ONNX model of
-its own with such metadata, in base64. A file without one is used without. Where the first entry tells by `trunk` where
-a trunk ends, other networks of the process that have the same one share it.
+second network, which refines the answers of the first one, lies in the entry `dataflow.second`: a separate ONNX model
+with such metadata, in base64; it is optional. If the first entry marks the end of a trunk (`trunk`), other networks of
+the process with the same trunk share it.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def shipped(name: str) -> Path:
 
 
 def trained_in_simulation(file: str | Path) -> bool:
-    """Returns whether a network knows simulated worlds alone: one that comes with the project, or whose file says so
-    by `trained_on` in its metadata. Opens no network; False for a file that is not there or is none of ours."""
+    """Returns whether a network was trained in simulated worlds alone: it comes with the project, or its metadata state
+    it (`trained_on`). Opens no network; False for a missing file and any other network."""
     file = Path(file).expanduser()
     if file.resolve().parent == _FOLDER.resolve():
         return True
@@ -148,7 +148,7 @@ def _divided(network: Network, reveal: Sequence[str] = ()) -> Network:
 
 @dataclass(frozen=True, eq=False)
 class SecondNetwork:
-    """An opened second network. `told` says where it lies, `facts` is its whole metadata."""
+    """An opened second network. `told` describes where it lies, `facts` is its whole metadata."""
 
     told: str
     facts: dict[str, Any]

@@ -1,8 +1,8 @@
 """The trunk that networks trained together have alike: computed once for an image, however many of them see it.
 
-A network file tells by `trunk` in its metadata which inner values end it: the names of 8-bit maps, in an order that is
-the same in all files with this trunk. Networks of a process that have the same trunk (the same arithmetic with the same
-constants, by digest) share one. What they compute is the same as if each had its own.
+`trunk` in the metadata of a network file lists the inner values that end it: the names of 8-bit maps, in an order that
+is the same in all files with this trunk. Networks of a process that have the same trunk (the same arithmetic with the
+same constants, by digest) share one. Their results are the same as with separate trunks.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class SharedTrunk:
     """A trunk: an image of the networks' input size → its maps.
 
     The maps of the latest images are kept, by the digest of their pixels: 1.4 MB an image for the networks that come
-    with the project. It may be used by several threads: nobody waits, at worst two compute the same.
+    with the project. Several threads may use it without waiting; at worst two compute the same maps.
     """
 
     def __init__(self, session: onnxruntime.InferenceSession) -> None:

@@ -59,6 +59,4 @@ def candidates(found: Detections2D, classes: Sequence[str]) -> Candidates:
 def _check(weights: Path, labels: LabelledImage, classes: Sequence[str], known: Sequence[str]) -> None:
     unknown = [classes[k] for k in labels.classes[~labels.ignored].tolist() if classes[k] not in known]
     if unknown:
-        raise DataError(
-            f"{labels.file} has an object {unknown[0]!r}, which {weights} does not know; it knows {', '.join(known)}"
-        )
+        raise DataError(f"{labels.file} has an object {unknown[0]!r}, but {weights} finds only {', '.join(known)}")

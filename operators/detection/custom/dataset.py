@@ -49,8 +49,8 @@ class LabelledImage:
 
 @dataclass(frozen=True, eq=False)
 class DetectionData:
-    """Class names, images to train on and images to score on; `notes` says what was assumed in reading them, `origin`
-    what made them (see `origin_of`)."""
+    """Class names, images to train on and images to score on; `notes` lists the assumptions made in reading
+    them, `origin` is their producer (see `origin_of`)."""
 
     classes: tuple[str, ...]
     training: tuple[LabelledImage, ...]
@@ -87,7 +87,7 @@ class DetectionData:
 
 
 def origin_of(folder: Path) -> str:
-    """Returns what made the images of a data folder, as its file origin.txt says (`simulator`); '' without one."""
+    """Returns the producer of a data folder's images from its file origin.txt (`simulator`); '' without the file."""
     file = folder / ORIGIN
     return read_utf8(file).strip() if file.is_file() else ""
 
@@ -96,7 +96,7 @@ def split(data: DetectionData, seed: int) -> DetectionData:
     """Sets a share of the training images aside for validation."""
     images = data.training
     if len(images) < 2:
-        note = "one image only: it serves for training and validation, so the score says little"
+        note = "one image only: it serves for training and validation, so the score means little"
         return replace(data, validation=images, notes=(*data.notes, note))
     count = max(1, round(len(images) * _VALIDATION_SHARE))
     aside = set(np.random.default_rng(seed).permutation(len(images))[:count].tolist())

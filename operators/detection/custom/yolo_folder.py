@@ -47,7 +47,7 @@ def read_yolo(folder: Path) -> DetectionData:
     held_out = set(validation)
     if held_out.issuperset(training):
         notes.append(
-            f"{source.name} names the images to train on for validation too: the score says little about new images"
+            f"{source.name} names the images to train on for validation too: the score means little for new images"
         )
     else:
         training = [file for file in training if file not in held_out]
@@ -120,7 +120,7 @@ def _unpaired(images: Iterable[Path]) -> Iterable[str]:
     bare = [image for image in images if not label_file(image).is_file()]
     if bare:
         yield f"{len(bare)} images have no label file and count as background; the first is {bare[0]}"
-    # Only folders of their own hold nothing but labels.
+    # Only folders separate from the images hold nothing but labels.
     folders = {label_file(i).parent: i.parent for i in images if label_file(i).parent != i.parent}
     orphans = []
     for labels, pictures in sorted(folders.items()):

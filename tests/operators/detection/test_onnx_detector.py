@@ -108,7 +108,7 @@ def test_class_names_come_from_a_file(tmp_path: Path) -> None:
 def test_as_many_class_names_are_needed_as_the_model_has_classes(tmp_path: Path, given: tuple[str, ...]) -> None:
     model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
     made = detector(model=model, decoder="yolov8", classes=names(tmp_path, *given))
-    with pytest.raises(ModelError, match=rf"m\.onnx tells 2 classes apart, but there are {len(given)} class names;"):
+    with pytest.raises(ModelError, match=rf"m\.onnx separates 2 classes, but there are {len(given)} class names;"):
         made.process(red())
 
 
@@ -116,7 +116,7 @@ def test_a_network_of_other_classes_than_cocos_is_not_given_their_names(tmp_path
     output = np.ones((1, 5 + 3, 2, 2))
     made = detector(model=save_model(tmp_path / "m.onnx", output), decoder="fastestdet")
     with pytest.raises(
-        ModelError, match=r"3 classes apart, .* 80 class names \(those of COCO\); give the model's own in"
+        ModelError, match=r"separates 3 classes, .* 80 class names \(those of COCO\); give the model's own in"
     ):
         made.process(red())
 

@@ -387,7 +387,7 @@ def test_a_refiner_is_not_trained_for_other_classes_nor_resumed_for_another_dete
 ) -> None:
     plain, _, data = refined
     other = untrained(tmp_path, ("crate", "ball", "lamp"))
-    with pytest.raises(TrainingFileError, match=r"knows crate, ball, lamp; the data have crate, ball"):
+    with pytest.raises(TrainingFileError, match=r"has crate, ball, lamp; the data have crate, ball"):
         RefinerTask(data, other)
     few = DetectionData(data.classes, data.training[:4], data.validation)
     own = Settings(epochs=1, batch=4, threads=1)

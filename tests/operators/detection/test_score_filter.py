@@ -44,5 +44,5 @@ def test_only_classes_that_are_asked_for_pass() -> None:
 
 
 def test_a_class_that_the_detector_does_not_know_is_an_error_with_the_nearest_name() -> None:
-    with pytest.raises(ValueError, match=r"the detector knows no 'cups'; did you mean 'cup'[?] it knows cup, box"):
+    with pytest.raises(ValueError, match=r"the detector has no class 'cups'; did you mean 'cup'[?] it has cup, box"):
         ScoreFilter(classes=("cups",)).process(FOUND)

@@ -125,7 +125,7 @@ def test_only_persons_seen_in_this_very_look_are_judged() -> None:
     operator = PostureRecognizer()
     operator.setup()
     assert operator.process(**other).ids.tolist() == []  # type: ignore[union-attr]
-    assert operator.summary()["without a look of their own"] == 1
+    assert operator.summary()["graphs without a new view"] == 1
 
 
 def test_a_body_far_from_the_node_is_not_its() -> None:

@@ -260,7 +260,7 @@ def test_a_segmenter_without_scores_or_of_other_classes_is_refused(
     with pytest.raises(TrainingFileError, match="gives no scores to look at again"):
         BorderTask(data, old)
     other = SegmentationData(("wall", "floor", "cube"), data.training, data.validation)
-    with pytest.raises(TrainingFileError, match="knows wall, floor, ball; the data have wall, floor, cube"):
+    with pytest.raises(TrainingFileError, match="has wall, floor, ball; the data have wall, floor, cube"):
         BorderTask(other, plain)
 
 
