@@ -1,4 +1,4 @@
-"""Combines what several sensors say about one thing by their covariances, and tells which contradict the others.
+"""Combines measurements of one state by several sensors, weighted by covariance, and names contradicting sensors.
 
 Positions with full covariance and bearings, of which only the direction is known, are solved for together, so bearings
 alone are triangulated. Rotations are averaged on the manifold: Hartley et al., "Rotation averaging", 2013.
@@ -21,7 +21,7 @@ _ITERATIONS, _CONVERGED = 20, 1e-9
 
 
 class Unknown(Exception):
-    """Nothing follows from what is given: says why."""
+    """Raised when the measurements do not determine a result; the message names the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,8 @@ def _start(seen: Sequence[Place | Bearing]) -> Array:
 def posed(seen: Sequence[RigidPose]) -> RigidPose:
     """Returns the pose that explains all best; its information is the sum of theirs.
 
-    What no sensor knows stays as the first has it. Iterates on the manifold, so rotations far apart have a mean, too.
+    Directions that no sensor measures keep the first's value. Iterates on the manifold, so rotations far apart have a
+    mean, too.
     """
     position, R = seen[0].position, seen[0].rotation
     for one in seen:  # begin where something is known
@@ -162,7 +163,7 @@ def pose_misfits(seen: Sequence[RigidPose]) -> Array:
 
 
 def _normalised(off: Array, information: Array, spread: Array) -> float:
-    """Squared distance over its degrees of freedom, along what the information knows."""
+    """Squared distance over its degrees of freedom, along the directions with information."""
     values, vectors = np.linalg.eigh(information)
     known = values > 1e-9 * max(float(values[-1]), 1e-12)
     axes = vectors[:, known]

@@ -31,9 +31,9 @@ class Constraints:
     """Makes measurements of what need not be measured, from inertial samples, ten times a second at most.
 
     *Standstill*: over half a second the readings stray less than a body that moves lets them. An inertial sensor alone
-    does not tell rest from even motion, so this is for what trembles as it moves: hands, legs, rough ground; and the
-    gate, which never yields, refuses it where the filter knows better. *Slip*: what rolls moves neither aside nor
-    upwards, up to a standard deviation.
+    does not distinguish rest from even motion, so this is for bodies that tremble as they move: hands, legs, rough
+    ground; and the gate, which never yields, refuses it where the filter's state contradicts it. *Slip*: a rolling body
+    moves neither aside nor upwards, up to a standard deviation.
 
     After Skog, Händel, Nilsson and Rantakokko, "Zero-velocity detection: an algorithm evaluation", 2010, and
     Dissanayake et al., "The aiding of a low-cost strapdown inertial measurement unit using vehicle model constraints",

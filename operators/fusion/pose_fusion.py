@@ -27,7 +27,7 @@ class PoseFusion(Operator):
     Rotations are averaged on the manifold. Sensors whose messages are at most `window` old count as simultaneous.
 
     Each sensor is compared with the others. Of three or more the one that contradicts the rest is left out; of two
-    nobody knows which is wrong, and the covariance grows until it holds both. Either is said in the status before it
+    it is undecidable which is wrong, and the covariance grows until it holds both. The status reports either before it
     is averaged. Covariances follow how far a sensor is from the others, so a degrading one loses its say. For one that
     moves fast, or with biases and delays, there is EkfFusion.
 

@@ -27,7 +27,7 @@ class PositionFusion(Operator):
     count as simultaneous.
 
     Each sensor is compared with the others. Of three or more the one that contradicts the rest is left out; of two
-    nobody knows which is wrong, and the covariance grows until it holds both. Either is said in the status before it
+    it is undecidable which is wrong, and the covariance grows until it holds both. The status reports either before it
     is averaged. Covariances follow how far a sensor is from the others, so a degrading one loses its say.
 
     Method: positions and bearings in one weighted least squares, as in Hartley and Zisserman, "Multiple view geometry",

@@ -51,8 +51,8 @@ class SensorSettings(BaseModel):
     )
     drift: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0),
-        description="standard deviations (east, north, up, m) of an error of positions that changes slowly, a part of "
-        "what the covariance says: if above 0, it is estimated",
+        description="standard deviations (east, north, up, m) of an error of positions that changes slowly, included "
+        "in the covariance: if above 0, it is estimated",
     )
     drift_time: float = Field(30.0, gt=0, description="seconds in which that error changes")
     scale_sigma: float = Field(
