@@ -1,6 +1,6 @@
-"""The likeliest other place: tells a pose from one that a mirrored place would explain as well.
+"""The likeliest other place: distinguishes a pose from that in a mirrored place, which would explain as much.
 
-A cloud settles in one of several places that look alike, and its spread does not tell of the others. So when the robot
+A cloud settles in one of several places that look alike, and its spread does not reflect the others. So when the robot
 has been looked for, places elsewhere that explain the observation are tried, and the best is followed beside the cloud
 until the observations decide between the two. Multiple-hypothesis localisation: Jensfelt and Kristensen, "Active global
 localization for a mobile robot using multiple hypothesis tracking", 2001.
