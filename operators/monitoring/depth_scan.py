@@ -54,10 +54,10 @@ class Misfit:
 class DepthScanAgreement:
     """Follows, pair by pair, the misfit of depth images and scans by point-to-plane alignment with forgetting.
 
-    Each pair is aligned from where the last ones led, and what it tells is added to what they told, whose weight falls
-    by `keep`. Directions that surfaces do not tell of stay at zero, within a prior. Method: projective association as
-    in Blais and Levine, "Registering multiview range data to create 3D computer objects", 1995, with the scale as one
-    more unknown.
+    Each pair is aligned from where the last ones led, and its information is added to theirs, whose weight falls by
+    `keep`. Directions that the surfaces do not constrain stay at zero, within a prior. Method: projective association
+    as in Blais and Levine, "Registering multiview range data to create 3D computer objects", 1995, with the scale as
+    one more unknown.
     """
 
     def __init__(self, keep: float = 0.9) -> None:

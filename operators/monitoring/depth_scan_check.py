@@ -37,7 +37,7 @@ class DepthScanCheck(Operator, tolerance="60ms"):
     depth_info: Sampled[CameraInfo] = Sampled(doc="calibration of the depth camera")
     extrinsics: Sampled[Transforms] = Sampled(doc="holds the transform between the two sensors")
     motion: Sampled[Odometry] = Sampled(
-        required=False, max_age="500ms", doc="the LiDAR's odometry, whose velocity says what its points are moved by"
+        required=False, max_age="500ms", doc="the LiDAR's odometry, by whose velocity its points are moved"
     )
     status: Out[Diagnostics] = Out(doc="with every scan; a warning while they do not fit")
 

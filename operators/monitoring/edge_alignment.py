@@ -85,7 +85,7 @@ class EdgeAlignment:
 
 def rims(depth: NDArray[np.float32], K: Array) -> Array:
     """Returns points (N, 3), metres, in the frame of a depth camera (K) on rims: every second pixel beside one much
-    farther. What is not finite is no return."""
+    farther. Values that are not finite are no returns."""
     z = np.where(np.isfinite(depth[::2, ::2]), depth[::2, ::2], np.float32(0))
     rim = np.zeros(z.shape, np.bool_)
     for here, there in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
