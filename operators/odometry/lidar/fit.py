@@ -1,4 +1,4 @@
-"""The pose of a scan in a map of planes, with what the scan says about it and what it does not."""
+"""The pose of a scan in a map of planes, with its information matrix and the unobservable directions."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ ITERATIONS = 20
 _KERNEL = 3.0  # standard deviations at which a residual loses three quarters of its weight
 _WIDER = 3.0  # times that, in the first iteration
 _NARROWS = 0.6  # per iteration
-_LEANS = 3.0  # standard deviations of a normal: a plane tells of a direction that leans so far out of it
-_ENOUGH = 5.0  # as many planes across a direction tell enough of it
-_LITTLE = 0.01  # what is left of the information on a direction of which less is told
+_LEANS = 3.0  # standard deviations of a normal: a plane constrains a direction that leans so far out of it
+_ENOUGH = 5.0  # as many planes across a direction constrain it enough
+_LITTLE = 0.01  # share kept of the information on a direction with fewer
 _STILL = (1e-3, 1e-4)  # metres, radians: a step less than this ends the iterations
 
 Motion = Callable[[Matrix], Vector]
@@ -41,11 +41,10 @@ class Prior:
 class Fit:
     """A pose `T` (4, 4) of the sensor in the map.
 
-    `information` (6, 6) is the scan's own, of a right perturbation, with little on the directions it tells too little
-    of: those are `blind` (K, 6), unit twists. `inliers` is the share of the `paired` points that agree with their
-    planes;
-    `known` that of all points in places of which the map knows something; `rmse` is over the inliers, metres.
-    `births` (K,) are those of the planes, with `weights` (K,).
+    `information` (6, 6) is the scan's own, of a right perturbation, reduced along the directions that it constrains
+    too little: those are `blind` (K, 6), unit twists. `inliers` is the share of the `paired` points that agree with
+    their planes; `known` that of all points in mapped places; `rmse` is over the inliers, metres. `births` (K,) are
+    those of the planes, with `weights` (K,).
     """
 
     T: Matrix

@@ -158,7 +158,7 @@ def _motions(E: Matrix) -> list[Matrix]:
 
 
 def _motions_of_plane(H: Matrix, K: Matrix) -> list[Matrix]:
-    """Each solution with the translation as it stands: its normal tells which side the plane is on."""
+    """Each solution with the translation as it stands: its normal gives the side of the plane."""
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, K)
     found = [(R, t) for R, t in zip(rotations, translations, strict=True) if np.linalg.norm(t) > 1e-6]
     return [_motion(R, np.asarray(t)) for R, t in found]

@@ -244,7 +244,7 @@ class Alignment:
 
     @cached_property
     def normals(self) -> tuple[Normal, ...]:
-        """The state of every term; worked out when somebody asks, for a rough pose needs none."""
+        """The state of every term; computed on first access, since a rough pose needs none."""
         return self.last or tuple(term.linearise(self.T_world_camera) for term in self.terms)
 
     @property

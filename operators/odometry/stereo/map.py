@@ -51,8 +51,8 @@ class StereoMap:
         return replace(self, apart_since=stamp, recalls=0)
 
     def placed(self, known: StereoKeyframe, T_known_newest: Matrix | None) -> StereoMap:
-        """Moves the newest segment rigidly to where one of its motions into a keyframe's world says that it is; without
-        such a motion, forgets it."""
+        """Moves the newest segment rigidly as given by one of its motions into a keyframe's world; without such a
+        motion, forgets it."""
         if known.segment == self.segment:
             return replace(self, recalls=0)
         kept = [k if k.segment != self.segment else _moved(k, known, T_known_newest) for k in self.keyframes]
