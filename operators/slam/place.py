@@ -19,7 +19,7 @@ class Place(StrEnum):
 
 
 def place_of(graph: PlaceGraph[Any], added: Added, adrift: str, reason: str) -> tuple[Place, str]:
-    """Returns the place and the reason; `adrift` says why the odometry measures nothing, `reason` what it does."""
+    """Returns the place and the reason, from the odometry's: `adrift` if it measures nothing, else `reason`."""
     refused = f"; refused: {', '.join(added.refused)}" if added.refused else ""
     if added.found:
         return Place.CORRECTED, "the map is found"

@@ -90,7 +90,7 @@ class VisualGraph(PlaceGraph[View]):
     def add(self, keyframe: Keyframe, fitter: Fitter, found_again: bool) -> Added:
         """Takes a keyframe of the odometry, and what fits its poses.
 
-        `found_again` says that the odometry has found its own map again, so that its pose jumped.
+        `found_again`: the odometry has found its own map again, so that its pose jumped.
         """
         return self.grow(
             keyframe.stamp, keyframe.T_world_camera, keyframe.covariance, keyframe.segment, found_again,
