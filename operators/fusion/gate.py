@@ -80,7 +80,7 @@ class Health:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the sensor's measurements were refused too often in a row for chance."""
+        """Returns whether the sensor's measurements were refused too often in a row for chance."""
         return self.streak >= (2 if self.leap else 3)
 
     def after(
