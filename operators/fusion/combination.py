@@ -131,9 +131,9 @@ def posed(seen: Sequence[RigidPose]) -> RigidPose:
 
 
 def place_misfits(seen: Sequence[Place | Bearing]) -> Array:
-    """Returns for each (K,) its squared distance from what the others say, over the one explained.
+    """Returns for each (K,) its squared distance from the others' combination, over the one explained.
 
-    NaN where the others say nothing.
+    NaN where the others determine nothing.
     """
     found = np.full(len(seen), np.nan)
     for k, one in enumerate(seen):
@@ -146,7 +146,7 @@ def place_misfits(seen: Sequence[Place | Bearing]) -> Array:
 
 
 def pose_misfits(seen: Sequence[RigidPose]) -> Array:
-    """Returns for each (K,) its squared distance from what the others say, over the one explained; NaN if nothing."""
+    """Returns for each (K,) its squared distance from the others' combination, over the one explained; NaN if none."""
     found = np.full(len(seen), np.nan)
     for k, one in enumerate(seen):
         others = [other for other in seen if other is not one]
@@ -195,6 +195,6 @@ def pose_consistency(seen: Sequence[RigidPose]) -> tuple[float, int]:
 
 
 def contradicts(consistency: tuple[float, int], share: float) -> bool:
-    """Says whether residuals are larger than chance makes them in the given share of cases."""
+    """Returns whether residuals are larger than chance makes them in the given share of cases."""
     total, freedom = consistency
     return freedom > 0 and total > threshold(share, freedom)

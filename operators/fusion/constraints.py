@@ -1,4 +1,4 @@
-"""Tells what holds of a body's motion without a sensor of it: that it stands still, that it slips nowhere."""
+"""Constraints on a body's motion without a sensor of it: standstill, and no slip."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from operators.fusion.sensor_settings import SensorSettings
 Array = NDArray[np.float64]
 _I3 = np.eye(3)
 _SPAN, _PERIOD = 500_000_000, 100_000_000
-"""ns: of the readings that tell a standstill, and from one constraint to the next."""
+"""ns: of the readings that show a standstill, and from one constraint to the next."""
 _FEWEST = 10
-"""Readings that tell a standstill."""
+"""Readings that show a standstill."""
 _TURNS = 0.2
 """Angular rates at a standstill stray so many rad/s where forces stray one m/s²."""
 _FASTEST = 0.1

@@ -211,7 +211,7 @@ class EkfFusion(Operator):
         return figures(health, self._offsets(), dict(self._unheard()), ignored)
 
     def _follows(self, name: str, stamp: int) -> bool:
-        """Tells whether a message comes after the sensor's last; one that does not is counted."""
+        """Returns whether a message comes after the sensor's last; one that does not is counted."""
         if self._last.follows(name, stamp):
             return True
         self._ignored[f"{name}: stamp not later than the last"] += 1

@@ -174,7 +174,7 @@ def _squared(residual: Array, covariance: Array) -> float:
 
 
 def _leaps(config: GateConfig, doubt: Doubt, state: State, H: Array, acceleration: float, seconds: float) -> bool:
-    """Tells whether a measurement does not fit even an inertial sensor that erred by an acceleration (m/s², σ).
+    """Returns whether a measurement does not fit even an inertial sensor that erred by an acceleration (m/s², σ).
 
     It may have erred for the `seconds` since the sensor was last believed.
     """
@@ -187,7 +187,7 @@ def _leaps(config: GateConfig, doubt: Doubt, state: State, H: Array, acceleratio
 
 
 def _witnessed(config: GateConfig, sensor: str, doubt: Doubt, health: Mapping[str, Health]) -> bool:
-    """Tells whether another sensor's refused positions, of another kind, agree with this one."""
+    """Returns whether another sensor's refused positions, of another kind, agree with this one."""
     if doubt.kind not in PLACES:
         return False
     for name, other in health.items():

@@ -66,7 +66,7 @@ def prior_of(
 
 
 def rests(samples: Sequence[Sample], prior: Prior) -> bool:
-    """Says whether the readings are those of a body at rest: steady, and of about the strength of gravity."""
+    """Returns whether the readings are those of a body at rest: steady, and of about the strength of gravity."""
     gyro, accel = np.array([s.gyro for s in samples]), np.array([s.accel for s in samples])
     steady = float(gyro.std(axis=0).max()) < prior.rest_gyro and float(accel.std(axis=0).max()) < prior.rest_accel
     mean = float(np.linalg.norm(gyro.mean(axis=0)))

@@ -20,7 +20,7 @@ _I3 = np.eye(3)
 
 
 def well_known(covariance: Array, sigma: float) -> bool:
-    """Tells whether the position is known to `sigma` (m): its horizontal coordinates, and the height where anything
+    """Returns whether the position is known to `sigma` (m): its horizontal coordinates, and the height where anything
     measures it."""
     variances = np.diag(covariance)[POSITION]
     measured = variances < UNMEASURED**2

@@ -135,7 +135,7 @@ def unheard(names: Sequence[str], streams: Sequence[str]) -> dict[str, str]:
 
 
 def never_yields(gate: GateConfig) -> bool:
-    """Tells whether refused measurements that agree with each other are refused all the same."""
+    """Returns whether refused measurements that agree with each other are refused all the same."""
     return gate.agreeing == NEVER_AGREE
 
 

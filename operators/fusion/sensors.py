@@ -188,7 +188,7 @@ def _velocity(
 
 
 def _metric(message: Message) -> bool:
-    """Tells whether lengths are metres: a camera that does not know its scale gives positions an infinite variance."""
+    """Returns whether lengths are metres: positions of a camera without known scale have infinite variance."""
     given = message.pose_covariance if isinstance(message, Odometry) else None
     return given is None or bool(np.isfinite(np.diag(given)[:3]).any())
 

@@ -63,7 +63,7 @@ class CompetingHypothesis:
 
     @property
     def decided(self) -> bool:
-        """Tells that the place was looked for elsewhere, and that nowhere else explains what was observed."""
+        """Notes that a search elsewhere found no place that explains the observations."""
         return self._other is None and self._searched >= _SEARCHES
 
     @property
@@ -163,6 +163,6 @@ class CompetingHypothesis:
 
 
 def apart(one: Array, other: Array) -> bool:
-    """Tells whether two poses (3,) are of different places."""
+    """Returns whether two poses (3,) are of different places."""
     far = float(np.hypot(one[0] - other[0], one[1] - other[1])) > _FAR
     return far or abs(float(wrapped(one[2] - other[2]))) > _TURNED

@@ -34,7 +34,7 @@ class Observation(Protocol):
 
     @property
     def whole(self) -> bool:
-        """Tells whether it can place the robot with its heading, alone."""
+        """Returns whether it can place the robot with its heading, alone."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Motions of one body by several sensors, against each other: who is off is named."""
+"""Compares the motion of one body by several sensors, and names the outlier."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class MotionCheck(Operator, merge=True):
         limits = Limits(self.way, self.turn, self.coarse_turn, float(np.deg2rad(self.angle)))
         self._tracks: dict[str, Track] = {}
         self._blind: set[str] = set()
-        """Sensors that tell turns alone."""
+        """Sensors that measure turns alone."""
         self._agreement = MotionAgreement(limits)
         self._found: list[Contradiction] = []
         self._end = 0
@@ -162,7 +162,7 @@ class MotionCheck(Operator, merge=True):
         (self._hanging.add if hangs else self._hanging.discard)(name)
 
     def _slips(self, wheels: Odometry) -> bool:
-        """Tells whether two others that agree, or more, say that the robot moves at another speed than the wheels."""
+        """Returns whether two others that agree, or more, contradict the speed of the wheels."""
         assert wheels.linear is not None
         own = float(wheels.linear[0])
         others = []
