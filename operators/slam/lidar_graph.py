@@ -85,7 +85,7 @@ class LidarGraph(PlaceGraph[LidarView]):
     def _lesser(self, covariance: Matrix, covariance_odom: Matrix) -> Matrix:
         """Returns the covariance of a pose in the map, which is no greater than the odometry's where both frames began.
 
-        Along the chain of keyframes it grows with every step, while the odometry's own map may know better.
+        Along the chain of keyframes it grows with every step, while the odometry's own map may be more precise.
         """
         newest = self.newest
         began_here = newest is not None and newest.island == 0 and SAVED not in self.tied

@@ -94,7 +94,7 @@ class LidarEyes:
         return found.reason or self._checked(self._fitted(other, planes, found.T), found)
 
     def _near(self, one: LidarView, other: LidarView, planes: PlaneMap, guess: Matrix) -> LidarSight | str:
-        """Measures a scan that is expected near a guess; along what the planes tell nothing of, the guess stands."""
+        """Measures a scan that is expected near a guess; the guess stands along unconstrained directions."""
         fitted = self._fitted(other, planes, guess)
         found = explained(other.prepared, one.prepared, fitted.T, self.expected)
         if not found.reason:

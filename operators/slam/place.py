@@ -10,7 +10,7 @@ from operators.slam.sensor_model import Added
 
 
 class Place(StrEnum):
-    """Says what is known of the sensor's place in the map."""
+    """Basis of the sensor's place in the map."""
 
     MAPPED = "mapped"  # by a chain of odometry from places that are in the map
     CORRECTED = "corrected"  # by a loop at this very measurement

@@ -49,7 +49,7 @@ class PlaceGraph(Generic[V]):
 
     @property
     def located(self) -> bool:
-        """Tells whether the newest keyframe's place in the map is known."""
+        """Returns whether the newest keyframe's place in the map is known."""
         newest = self.newest
         return (newest.island if newest else 0) in self.tied
 
@@ -245,7 +245,7 @@ class PlaceGraph(Generic[V]):
         ]  # fmt: skip
 
     def _expected(self, k: int, number: int, seen: Sighting) -> bool:
-        """Tells whether a sight is where the map, with its covariance, has it."""
+        """Returns whether a sight is where the map, with its covariance, has it."""
         known, new = self.nodes[k], self.nodes[number]
         if new.island not in self.tied:
             return False

@@ -88,14 +88,14 @@ class Surprise:
 
 
 def alike(T_a: Matrix, T_b: Matrix) -> bool:
-    """Tells whether two poses found for one view say the same."""
+    """Returns whether two poses found for one view agree."""
     off = se3.log(invert(T_a) @ T_b)
     return bool(np.linalg.norm(off[:3]) < AGREE[0] and np.linalg.norm(off[3:]) < AGREE[1])
 
 
 @dataclass(eq=False)
 class Added:
-    """Tells what became of a keyframe: loops found from it, and why views that were compared with were refused."""
+    """Holds the result for a keyframe: loops found from it, and why views that were compared with were refused."""
 
     node: bool = False
     loops: int = 0

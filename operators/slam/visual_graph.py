@@ -55,7 +55,7 @@ class CameraEyes:
         return view_distance(T_a, T_b, self.depth)
 
     def sight(self, nodes: Mapping[int, Node[View]], known: int, seen: int, expected: bool) -> Sight | str:
-        """Features tell where a view is; where they are too few, it is looked for where the map expects it."""
+        """Features place a view; where they are too few, it is looked for where the map expects it."""
         one, other = nodes[known].view, nodes[seen].view
         assert one is not None
         assert other is not None

@@ -73,7 +73,7 @@ def fit(scan: Scan, planes: PlaneMap, prior: Prior, motion: Motion, noise: float
 
     `motion` gives the velocity (6,) during the scan that a pose means; `noise` is the standard deviation of a range,
     metres. The kernel is Geman and McClure's, narrowing, as in Vizzo et al., "KISS-ICP", 2023. Directions without
-    support are told by planes that lean out of them: Tuna et al., "X-ICP", 2023; there the prediction stands.
+    support are constrained by planes that lean out of them: Tuna et al., "X-ICP", 2023; there the prediction stands.
     """
     points, offsets = scan.points[scan.sample], None if scan.offsets is None else scan.offsets[scan.sample]
     T = prior.T
@@ -141,7 +141,7 @@ def _equations(points: Array, planes: PlaneMap, T: Matrix, width: float, noise: 
 
 
 def _blind(system: _Equations, points: Array) -> Array:
-    """Returns unit twists (K, 6) that too few planes tell of: translations first, then rotations about the sensor."""
+    """Returns unit twists (K, 6) that too few planes constrain: translations first, then rotations about the sensor."""
     own, slopes = points[system.pairs.points], system.pairs.slopes
     deviation = np.sqrt(np.einsum("ij,ij->i", system.J[:, :3], system.J[:, :3]))
     lean = system.J / np.maximum(deviation, 1e-12)[:, None]

@@ -1,4 +1,4 @@
-"""Says how a LiDAR moved, how it will, and how far that can be wrong."""
+"""Motion of a LiDAR: the measured one, its prediction, and the covariance of both."""
 
 from __future__ import annotations
 

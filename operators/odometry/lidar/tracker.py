@@ -1,4 +1,4 @@
-"""Says where a LiDAR is, scan by scan, in a map that it makes; and whether that is known."""
+"""Tracks a LiDAR scan by scan in a map built from its scans, and detects when it is lost."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class TrackerConfig:
 class Tracked:
     """The pose `T` (4, 4) of the sensor, covariance (6, 6) of its right perturbation, velocity (6,) in its axes.
 
-    `blind` (K, 6) are unit twists in the sensor's axes that the scan told nothing of. `velocity_covariance` is None
+    `blind` (K, 6) are unit twists in the sensor's axes that the scan did not constrain. `velocity_covariance` is None
     where the velocity was not measured. `points` (N, 3) are the scan's, thinned and deskewed, in the sensor's frame at
     the stamp; None where the pose or the velocity was not measured.
     """

@@ -51,7 +51,7 @@ class MonoMap:
 
     @property
     def begun(self) -> bool:
-        """Tells whether there is anything to track."""
+        """Returns whether there is anything to track."""
         return len(self.numbers) > 0
 
     def find(self, numbers: Numbers) -> tuple[NDArray[np.int64], Mask]:

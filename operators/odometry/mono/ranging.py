@@ -32,7 +32,7 @@ PERSISTENT = 5  # images in succession that contradict it alike are believed
 
 
 class RangingUse(StrEnum):
-    """Says what became of a depth image."""
+    """Outcomes of a depth image."""
 
     FOUND = "gives the scale"
     TAKEN = "agrees"

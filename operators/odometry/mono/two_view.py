@@ -25,7 +25,7 @@ SHARP = 0.3  # share of the corners that must become points
 
 
 class Unsolved(StrEnum):
-    """Says why two views do not determine a motion."""
+    """Reasons for which two views do not determine a motion."""
 
     FEW = "too few corners are seen by both views"
     STILL = "the view has hardly changed"

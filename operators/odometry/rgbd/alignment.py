@@ -52,7 +52,7 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class Freedom:
-    """Says how far a pose may still be off before it is refined: standard deviations, metres and radians."""
+    """Holds the uncertainty of a pose before it is refined: standard deviations, metres and radians."""
 
     translation: float = 1.0
     rotation: float = 1.0

@@ -18,7 +18,7 @@ DRIFTED = 0.06  # metres: no view is laid on the surfaces of keyframes that the 
 
 
 def drifted(a: Keyframe, b: Keyframe) -> bool:
-    """Tells whether the odometry may have drifted far from one keyframe to the other: see DRIFTED."""
+    """Returns whether the odometry may have drifted far from one keyframe to the other: see DRIFTED."""
     return abs(a.place_variance - b.place_variance) >= DRIFTED**2
 
 

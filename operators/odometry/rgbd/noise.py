@@ -1,4 +1,4 @@
-"""Says how noisy a camera's measurements are, learnt from the residuals of the frames so far."""
+"""Noise of a camera's measurements, learnt from the residuals of the frames so far."""
 
 from dataclasses import dataclass
 

@@ -28,7 +28,7 @@ def camera_of(image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transf
 
 
 def same(known: Calibration | None, given: Calibration) -> bool:
-    """Tells whether these are the very messages that are known, so that nothing has to be compared."""
+    """Returns whether these are the very messages that are known, so that nothing has to be compared."""
     return known is not None and all(a is b for a, b in zip(known, given, strict=True))
 
 

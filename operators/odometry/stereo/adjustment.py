@@ -73,7 +73,7 @@ class StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Says who saw what where: frames (S,) and points (S,) by index, sightings (S, 3) in pixels."""
+    """Holds observations: frames (S,) and points (S,) by index, sightings (S, 3) in pixels."""
 
     frames: NDArray[np.int64]
     points: NDArray[np.int64]

@@ -105,7 +105,7 @@ class StereoRelocalizer:
             yield FoundAgain(T, covariance, fit.inliers, by)
 
     def believed(self, view: StereoKeyframe, known: Sequence[StereoKeyframe], unit: float) -> bool:
-        """Tells whether shape and brightness of what a view and keyframes of its segment see make sure of its pose."""
+        """Returns whether shape and brightness in a view and keyframes of its segment confirm its pose."""
         frame = self._frame(view, unit)
         if frame.depth_flaw is not None:
             return False

@@ -183,7 +183,7 @@ class StereoOdometry:
 
     @property
     def _lost(self) -> bool:
-        """Tells whether nothing was measured for longer than the patience."""
+        """Returns whether nothing was measured for longer than the patience."""
         assert self._state.motion is not None
         return self._state.motion.blind_s > self.config.patience_s
 
