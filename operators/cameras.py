@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class Cameras:
-    """Knows the output of each camera, by the frame of its images, in the order of the frames."""
+    """Holds the output of each camera, by the frame of its images, in the order of the frames."""
 
     def __init__(self, frames: Sequence[str], ports: Sequence[str], where: str) -> None:
         """Raises ValueError where there is no frame, a frame is named twice, or there are more frames than outputs."""

@@ -89,7 +89,7 @@ def image_input(
 
 
 def _is_image(shape: Sequence[Any], layout: Layout) -> bool:
-    """Tells whether a shape is [1, 3, H, W] or [1, H, W, 3]; a batch of open size takes one image, too."""
+    """Returns whether a shape is [1, 3, H, W] or [1, H, W, 3]; a batch of open size takes one image, too."""
     if len(shape) != 4 or (isinstance(shape[0], int) and shape[0] != 1):
         return False
     return bool(shape[1 if layout == "nchw" else 3] == 3)

@@ -37,14 +37,14 @@ class Rays:
 
 
 def within_range(depth: Depth, stride: int, near: float, far: float) -> NDArray[np.bool_]:
-    """Tells which strided pixels have a depth in [near, far]; 0 and NaN never do."""
+    """Returns which strided pixels have a depth in [near, far]; 0 and NaN never do."""
     z = depth[::stride, ::stride]
     usable: NDArray[np.bool_] = (z >= np.float32(near)) & (z <= np.float32(far)) & (z > 0)
     return usable
 
 
 def beside_edge(depth: Depth, stride: int, ratio: float) -> NDArray[np.bool_]:
-    """Tells which strided pixels differ from a direct neighbour with a return by more than `ratio` of the nearer depth.
+    """Returns which strided pixels differ from a direct neighbour with a return by over `ratio` of the nearer depth.
 
     Such pixels mix foreground and background and fly between both. Neighbours are those of the full image.
     """

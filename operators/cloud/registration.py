@@ -98,7 +98,7 @@ class Registered:
         return self.agreement - _CONTRADICTS * self.violation
 
     def rivals(self, best: Registered, voxel: float) -> bool:
-        """Tells whether this is another motion than the best, and explains the clouds as well.
+        """Returns whether this is another motion than the best, and explains the clouds as well.
 
         Less of the clouds is explained more easily, and most easily by surfaces that leave a direction free.
         """
@@ -229,7 +229,7 @@ class _Seen:
 
 
 def _settled(points: Array, normals: Array) -> bool:
-    """Tells whether surfaces face along every direction, and about every axis."""
+    """Returns whether surfaces face along every direction, and about every axis."""
     centred = points - points.mean(axis=0)
     arms = np.cross(centred, normals)
     _, axes = np.linalg.eigh(arms.T @ arms)
@@ -241,13 +241,13 @@ def _settled(points: Array, normals: Array) -> bool:
 
 
 def apart(A: Array, B: Array, voxel: float) -> bool:
-    """Tells whether two motions are different ones."""
+    """Returns whether two motions are different ones."""
     off = se3.log(np.linalg.inv(A) @ B)
     return bool(np.linalg.norm(off[:3]) > 4 * voxel or np.linalg.norm(off[3:]) > 0.1)
 
 
 def _led_by(start: Array, found: Array, voxel: float) -> bool:
-    """Tells whether a start is so near to a motion that it would lead to it again."""
+    """Returns whether a start is so near to a motion that it would lead to it again."""
     off = se3.log(np.linalg.inv(start) @ found)
     return bool(np.linalg.norm(off[:3]) < 10 * voxel and np.linalg.norm(off[3:]) < 0.35)
 

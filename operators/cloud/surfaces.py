@@ -127,7 +127,7 @@ def _names(
 
 
 def _hangs_askew(plane: Plane, seen: Rectangle, rules: Rules, walls: Array) -> bool:
-    """Tells whether an upright plane is as narrow as a door and turned against the walls, as one that stands ajar."""
+    """Returns whether an upright plane is as narrow as a door and turned against the walls, as one that stands ajar."""
     return bool(seen.size[0] <= rules.door_side and np.abs(walls @ plane.normal).max() < math.cos(ASKEW))
 
 
@@ -162,7 +162,7 @@ def _level(plane: Plane, height: float, seen: Rectangle, scene: Scene, rules: Ru
 
 
 def _is_wall(plane: Plane, seen: Rectangle, scene: Scene, rules: Rules, floor: float | None, cell: float) -> bool:
-    """Tells whether an upright plane is wide and high enough, and nothing that stands is seen behind it."""
+    """Returns whether an upright plane is wide and high enough, and nothing that stands is seen behind it."""
     if seen.size[0] < rules.wall_side or plane.area < rules.wall_area:
         return False
     members = scene.points[plane.members] @ scene.up

@@ -34,7 +34,7 @@ def effective_size(weights: Array) -> float:
 def systematic(weights: Array, count: int, offset: float) -> NDArray[np.intp]:
     """Draws `count` indices in proportion to weights (N,) that sum to 1; `offset` in [0, 1) decides which.
 
-    Every sample is drawn as often as its share says, but for rounding (Kitagawa, 1996).
+    Every sample is drawn in proportion to its weight, except for rounding (Kitagawa, 1996).
     """
     steps = (offset + np.arange(count)) / count
     return np.minimum(np.searchsorted(np.cumsum(weights), steps, side="right"), len(weights) - 1)

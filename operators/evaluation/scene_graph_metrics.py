@@ -34,7 +34,7 @@ class SceneGraphMetrics(Operator):
     pixels: int = Param(200, ge=1, doc="and its pixels")
     images: int = Param(5, ge=1, doc="images in which an object is plainly seen that counts")
     recent: float = Param(2.0, ge=0, doc="agents count that were in view so shortly before", unit="s")
-    labels: str = Param("simulator", doc="label space: coco, simulator, or a YAML file; says which classes are agents")
+    labels: str = Param("simulator", doc="label space: coco, simulator, or a YAML file; defines the agent classes")
 
     def setup(self) -> None:
         """Raises FileNotFoundError or ValueError for a bad label space."""

@@ -90,7 +90,7 @@ def match(estimate: Trajectory, truth: Trajectory, tolerance: int) -> Matches:
 
 
 def few_matched(matches: Matches, estimate: Trajectory, truth: Trajectory, tolerance: int) -> str | None:
-    """Says why figures mean little where fewer than half of what could have a partner has one; None where enough
+    """Returns why figures mean little where fewer than half of what could have a partner has one; None where enough
     has."""
     possible = min(len(estimate), len(truth))
     if not possible or 2 * len(matches.estimate) >= possible:

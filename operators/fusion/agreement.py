@@ -22,8 +22,8 @@ _SMOOTH, _SUDDEN, _LARGEST = 0.05, 20.0, 100.0
 class Agreement:
     """Follows how far each sensor is from the others: `noise` is by how much its covariance is too small.
 
-    Of three or more sensors one that contradicts the others is left out. Of two nobody knows which is wrong: both stay,
-    and the result's covariance has to hold both. Innovation-based adaptation: Mehra, 1970.
+    Of three or more sensors one that contradicts the others is left out. Of two it is undecidable which is wrong: both
+    stay, and the result's covariance has to hold both. Innovation-based adaptation: Mehra, 1970.
     """
 
     def __init__(self, share: float) -> None:
@@ -81,7 +81,7 @@ class Agreement:
             self._noise[sensor] = min(max(grown, 1.0), _LARGEST)
 
     def status(self, stamp: int, ignored: Mapping[str, int]) -> Diagnostics:
-        """Returns a status for the whole and one for every sensor, and forgets the doubts it tells of."""
+        """Returns a status for the whole and one for every sensor, and forgets the doubts that it reports."""
         text = "sensors contradict each other" if self._doubted else "sensors agree"
         rows: list[Row] = [
             ("fusion", text, Level.WARN if self._doubted else Level.OK, {k: str(n) for k, n in sorted(ignored.items())})
@@ -91,7 +91,7 @@ class Agreement:
             text, level = ("contradicts the others", Level.WARN) if doubted else ("used", Level.OK)
             noise = self.noise(sensor)
             if noise > 2.0 and not doubted:
-                text, level = "worse than it says", Level.WARN
+                text, level = "covariance too small", Level.WARN
             values = {"used": str(self._used[sensor]), "doubted": str(doubted), "noise": f"{noise:.2f}"}
             rows.append((sensor, text, level, values))
         self._doubted.clear()

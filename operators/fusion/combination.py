@@ -1,4 +1,4 @@
-"""Combines what several sensors say about one thing by their covariances, and tells which contradict the others.
+"""Combines measurements of one state by several sensors, weighted by covariance, and names contradicting sensors.
 
 Positions with full covariance and bearings, of which only the direction is known, are solved for together, so bearings
 alone are triangulated. Rotations are averaged on the manifold: Hartley et al., "Rotation averaging", 2013.
@@ -21,7 +21,7 @@ _ITERATIONS, _CONVERGED = 20, 1e-9
 
 
 class Unknown(Exception):
-    """Nothing follows from what is given: says why."""
+    """Raised when the measurements do not determine a result; the message names the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,8 @@ def _start(seen: Sequence[Place | Bearing]) -> Array:
 def posed(seen: Sequence[RigidPose]) -> RigidPose:
     """Returns the pose that explains all best; its information is the sum of theirs.
 
-    What no sensor knows stays as the first has it. Iterates on the manifold, so rotations far apart have a mean, too.
+    Directions that no sensor measures keep the first's value. Iterates on the manifold, so rotations far apart have a
+    mean, too.
     """
     position, R = seen[0].position, seen[0].rotation
     for one in seen:  # begin where something is known
@@ -130,9 +131,9 @@ def posed(seen: Sequence[RigidPose]) -> RigidPose:
 
 
 def place_misfits(seen: Sequence[Place | Bearing]) -> Array:
-    """Returns for each (K,) its squared distance from what the others say, over the one explained.
+    """Returns for each (K,) its squared distance from the others' combination, over the one explained.
 
-    NaN where the others say nothing.
+    NaN where the others determine nothing.
     """
     found = np.full(len(seen), np.nan)
     for k, one in enumerate(seen):
@@ -145,7 +146,7 @@ def place_misfits(seen: Sequence[Place | Bearing]) -> Array:
 
 
 def pose_misfits(seen: Sequence[RigidPose]) -> Array:
-    """Returns for each (K,) its squared distance from what the others say, over the one explained; NaN if nothing."""
+    """Returns for each (K,) its squared distance from the others' combination, over the one explained; NaN if none."""
     found = np.full(len(seen), np.nan)
     for k, one in enumerate(seen):
         others = [other for other in seen if other is not one]
@@ -162,7 +163,7 @@ def pose_misfits(seen: Sequence[RigidPose]) -> Array:
 
 
 def _normalised(off: Array, information: Array, spread: Array) -> float:
-    """Squared distance over its degrees of freedom, along what the information knows."""
+    """Squared distance over its degrees of freedom, along the directions with information."""
     values, vectors = np.linalg.eigh(information)
     known = values > 1e-9 * max(float(values[-1]), 1e-12)
     axes = vectors[:, known]
@@ -194,6 +195,6 @@ def pose_consistency(seen: Sequence[RigidPose]) -> tuple[float, int]:
 
 
 def contradicts(consistency: tuple[float, int], share: float) -> bool:
-    """Says whether residuals are larger than chance makes them in the given share of cases."""
+    """Returns whether residuals are larger than chance makes them in the given share of cases."""
     total, freedom = consistency
     return freedom > 0 and total > threshold(share, freedom)

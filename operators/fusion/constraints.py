@@ -1,4 +1,4 @@
-"""Tells what holds of a body's motion without a sensor of it: that it stands still, that it slips nowhere."""
+"""Constraints on a body's motion without a sensor of it: standstill, and no slip."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from operators.fusion.sensor_settings import SensorSettings
 Array = NDArray[np.float64]
 _I3 = np.eye(3)
 _SPAN, _PERIOD = 500_000_000, 100_000_000
-"""ns: of the readings that tell a standstill, and from one constraint to the next."""
+"""ns: of the readings that show a standstill, and from one constraint to the next."""
 _FEWEST = 10
-"""Readings that tell a standstill."""
+"""Readings that show a standstill."""
 _TURNS = 0.2
 """Angular rates at a standstill stray so many rad/s where forces stray one m/s²."""
 _FASTEST = 0.1
@@ -31,9 +31,9 @@ class Constraints:
     """Makes measurements of what need not be measured, from inertial samples, ten times a second at most.
 
     *Standstill*: over half a second the readings stray less than a body that moves lets them. An inertial sensor alone
-    does not tell rest from even motion, so this is for what trembles as it moves: hands, legs, rough ground; and the
-    gate, which never yields, refuses it where the filter knows better. *Slip*: what rolls moves neither aside nor
-    upwards, up to a standard deviation.
+    does not distinguish rest from even motion, so this is for bodies that tremble as they move: hands, legs, rough
+    ground; and the gate, which never yields, refuses it where the filter's state contradicts it. *Slip*: a rolling body
+    moves neither aside nor upwards, up to a standard deviation.
 
     After Skog, Händel, Nilsson and Rantakokko, "Zero-velocity detection: an algorithm evaluation", 2010, and
     Dissanayake et al., "The aiding of a low-cost strapdown inertial measurement unit using vehicle model constraints",

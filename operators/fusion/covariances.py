@@ -1,4 +1,4 @@
-"""Covariances of measurements: what a message or a setting says, checked."""
+"""Covariances of measurements, from a message or a setting, checked."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class Unusable(Exception):
-    """A message that is ignored: says why."""
+    """Raised for a message that is ignored; the text names the reason."""
 
 
 def covariance_of(name: str, given: Array | None, sigma: float | None, setting: str) -> Array:

@@ -52,15 +52,15 @@ class EkfFusion(Operator):
     late, up to `window`, is put in its place and the rest is done again.
 
     Settings of a stream stand under the end of its name (`robot/fix`); the status names those of no stream. A
-    chi-square gate refuses what does not fit; measurements that fit only because the filter knows little wait for a
-    second one that agrees, and refused ones that agree for a second show the filter to be wrong, which makes room for
-    them, unless they leapt and the inertial sensor felt nothing; the status warns at once. Detections of a radar and
-    ranges may be of something else, so the filter never yields to those. A radar counts by its Doppler velocities, or,
-    as `range`, by its distances from landmarks that its `ids` name.
+    chi-square gate refuses what does not fit; measurements that fit only because the filter's covariance is large wait
+    for a second one that agrees, and refused ones that agree for a second show the filter to be wrong, which makes room
+    for them, unless they leapt and the inertial sensor felt nothing; the status warns at once. Detections of a radar
+    and ranges may be of something else, so the filter never yields to those. A radar counts by its Doppler velocities,
+    or, as `range`, by its distances from landmarks that its `ids` name.
 
     A sensor's time offset is a setting, `offset`; with `offset_sigma` it is a state of the filter and estimated, as far
-    as the motion tells of it. So are a position's error that changes slowly, as satellites have (`drift`), and the
-    scale of wheels (`scale_sigma`): taken for white noise, these would make the covariance too small.
+    as the motion makes it observable. So are a position's error that changes slowly, as satellites have (`drift`), and
+    the scale of wheels (`scale_sigma`): taken for white noise, these would make the covariance too small.
 
     `standstill` and `slip` say what is known of the motion without a sensor of it (wheels say both by themselves).
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
@@ -211,7 +211,7 @@ class EkfFusion(Operator):
         return figures(health, self._offsets(), dict(self._unheard()), ignored)
 
     def _follows(self, name: str, stamp: int) -> bool:
-        """Tells whether a message comes after the sensor's last; one that does not is counted."""
+        """Returns whether a message comes after the sensor's last; one that does not is counted."""
         if self._last.follows(name, stamp):
             return True
         self._ignored[f"{name}: stamp not later than the last"] += 1
@@ -239,7 +239,7 @@ class EkfFusion(Operator):
         )
 
     def _unknown(self) -> Noise:
-        """The noise of a motion that no inertial sensor tells of."""
+        """The process noise of a motion without inertial sensor."""
         if self.motion == "inertial":
             return Noise(self.free_turning, self.free_acceleration, self.gyro_walk, self.accel_walk)
         return Noise(0.0, self.free_acceleration, self.free_turning, 0.0)

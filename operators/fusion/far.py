@@ -16,7 +16,7 @@ UNMEASURED = FARTHEST / 2
 
 
 def unplaced(state: State, kind: str) -> bool:
-    """Tells whether a measurement by a model of this name is the first that places the body."""
+    """Returns whether a measurement by a model of this name is the first that places the body."""
     return kind in PLACES and bool((np.diag(state.covariance)[POSITION][:2] >= UNMEASURED**2).all())
 
 

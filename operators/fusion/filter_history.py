@@ -29,7 +29,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Holds what a sensor said about a time (ns), with covariance (M, M).
+    """Holds a sensor's measurement of a time (ns), with covariance (M, M).
 
     `clock`: which of the state's time offsets is the sensor's, -1 for none; `assumed`: seconds taken for it in `time`.
     """

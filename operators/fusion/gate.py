@@ -2,9 +2,9 @@
 outlier.
 
 A measurement that does not fit is refused. So is, until another agrees with it, one that fits only because the filter
-knows much less than the sensor (after an outage, an outlier fits as well). When refused measurements agree with each
-other for a time, it is the filter that is wrong: room is made for them, unless they leapt in a way that the inertial
-sensor would have felt. Then a witness of another kind is needed.
+is much less certain than the sensor (after an outage, an outlier fits as well). When refused measurements agree with
+each other for a time, the filter is wrong: room is made for them, unless they leapt in a way that the inertial sensor
+would have felt. Then a witness of another kind is needed.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Health:
 
     @property
     def contradicts(self) -> bool:
-        """Tells whether what the sensor says has been refused too often in a row to be chance."""
+        """Returns whether the sensor's measurements were refused too often in a row for chance."""
         return self.streak >= (2 if self.leap else 3)
 
     def after(
@@ -97,7 +97,7 @@ class Health:
         if verdict == "widened":
             return replace(counted, last_used=time, doubts=(), streak=0, leap=0.0, room=time)
         kept = [d for d in self.doubts if time - d.time <= config.memory * 1e9]
-        kept = kept[:1] + kept[1:][-15:]  # the first says for how long they agree
+        kept = kept[:1] + kept[1:][-15:]  # the first gives the time for which they agree
         streak = (self.streak if kept else 0) + (verdict == "refused")
         return replace(counted, doubts=(*kept, doubt), streak=streak, leap=leap)
 
@@ -113,7 +113,7 @@ def judge(
 ) -> Verdict:
     """Decides about a measurement: `doubt` is what it would be if not believed, `normalised` its NIS.
 
-    `leapt`: refused even where it agrees with those before it, since the inertial sensor says otherwise.
+    `leapt`: refused even where it agrees with those before it, since the inertial sensor contradicts it.
     """
     if leapt:
         return "refused"
@@ -143,8 +143,8 @@ def leap(
 
     A leap begins with the first measurement that is refused. It lasts until the sensor is nearer to where it was
     expected than to what was refused last, or has gone on for as far again, or something of another kind agrees with
-    it, or the filter's own errors have come to be as large. What never makes the filter yield does not leap: it is not
-    always what it seems. `unfelt`: standard deviation (m/s²) of what the inertial sensor may fail to feel.
+    it, or the filter's own errors have come to be as large. A sensor of a kind that the filter never yields to does not
+    leap. `unfelt`: standard deviation (m/s²) of what the inertial sensor may fail to feel.
     """
     if config.agreeing >= NEVER_AGREE or doubt.kind not in (*PLACES, "Velocity"):
         return 0.0
@@ -174,7 +174,7 @@ def _squared(residual: Array, covariance: Array) -> float:
 
 
 def _leaps(config: GateConfig, doubt: Doubt, state: State, H: Array, acceleration: float, seconds: float) -> bool:
-    """Tells whether a measurement does not fit even an inertial sensor that erred by an acceleration (m/s², σ).
+    """Returns whether a measurement does not fit even an inertial sensor that erred by an acceleration (m/s², σ).
 
     It may have erred for the `seconds` since the sensor was last believed.
     """
@@ -187,7 +187,7 @@ def _leaps(config: GateConfig, doubt: Doubt, state: State, H: Array, acceleratio
 
 
 def _witnessed(config: GateConfig, sensor: str, doubt: Doubt, health: Mapping[str, Health]) -> bool:
-    """Tells whether another sensor's refused positions, of another kind, agree with this one."""
+    """Returns whether another sensor's refused positions, of another kind, agree with this one."""
     if doubt.kind not in PLACES:
         return False
     for name, other in health.items():

@@ -37,7 +37,7 @@ class ImuDropout:
             self._seen, self._turning = time, turning
 
     def lasts(self, time: int) -> bool:
-        """Tells whether the inertial sensor has been silent for too long."""
+        """Returns whether the inertial sensor has been silent for too long."""
         return self._felt >= 0 and time - self._felt > self._patience
 
     def sample(self, time: int, state: State) -> Sample:

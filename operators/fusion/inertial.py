@@ -50,7 +50,7 @@ class InertialSensor:
 
         Raises Unusable for readings that are not finite or all zero (a sensor that is off: at rest there is gravity, in
         free fall there is noise), and for a sample not later than the last, ValueError where
-        nothing says how good the samples are.
+        the noise of the samples is unspecified.
         """
         if not (np.isfinite(imu.angular_velocity).all() and np.isfinite(imu.linear_acceleration).all()):
             raise Unusable("not finite")

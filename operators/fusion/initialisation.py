@@ -66,7 +66,7 @@ def prior_of(
 
 
 def rests(samples: Sequence[Sample], prior: Prior) -> bool:
-    """Says whether the readings are those of a body at rest: steady, and of about the strength of gravity."""
+    """Returns whether the readings are those of a body at rest: steady, and of about the strength of gravity."""
     gyro, accel = np.array([s.gyro for s in samples]), np.array([s.accel for s in samples])
     steady = float(gyro.std(axis=0).max()) < prior.rest_gyro and float(accel.std(axis=0).max()) < prior.rest_accel
     mean = float(np.linalg.norm(gyro.mean(axis=0)))
@@ -78,7 +78,7 @@ def first_node(
 ) -> Node:
     """Returns the estimate at the last of the samples, with one hypothesis for each heading in question.
 
-    `T_body_base` (4, 4): the frame whose position and heading the prior knows; the body itself if none.
+    `T_body_base` (4, 4): the frame to which the prior's position and heading refer; None for the body itself.
     """
     base = np.eye(4) if T_body_base is None else T_body_base
     gyro = np.mean([s.gyro for s in samples], axis=0)
@@ -101,7 +101,7 @@ def first_node(
         P = np.zeros((SIZE, SIZE))
         P[POSITION, POSITION] = np.eye(3) * prior.position_sigma**2
         P[VELOCITY, VELOCITY] = np.eye(3) * (0.01 if at_rest else prior.moving_velocity) ** 2
-        tilt = np.eye(3) - np.outer(R[2], R[2])  # in the body: what gravity tells, and the heading about it
+        tilt = np.eye(3) - np.outer(R[2], R[2])  # in the body: the tilt, observed by gravity, and the heading about it
         P[ROTATION, ROTATION] = tilt * TILT**2 + np.outer(R[2], R[2]) * spread**2
         P[GYRO_BIAS, GYRO_BIAS] = np.eye(3) * prior.gyro_bias**2
         P[ACCEL_BIAS, ACCEL_BIAS] = np.eye(3) * prior.accel_bias**2

@@ -1,4 +1,4 @@
-"""Holds what each sensor of a filter has said last."""
+"""Holds the latest measurement of each sensor of a filter."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LastMeasurements:
         self.streams |= {stream.partition("/")[2] for stream in streams}
 
     def follows(self, name: str, stamp: int) -> bool:
-        """Tells whether a message comes after the sensor's last; then it is the last."""
+        """Returns whether a message comes after the sensor's last; then it is the last."""
         if stamp <= self.stamps.get(name, -1):
             return False
         self.stamps[name] = stamp

@@ -20,7 +20,7 @@ _I3 = np.eye(3)
 
 
 def well_known(covariance: Array, sigma: float) -> bool:
-    """Tells whether the position is known to `sigma` (m): its horizontal coordinates, and the height where anything
+    """Returns whether the position is known to `sigma` (m): its horizontal coordinates, and the height where anything
     measures it."""
     variances = np.diag(covariance)[POSITION]
     measured = variances < UNMEASURED**2
@@ -73,8 +73,7 @@ def diagnostics(
     A warning with the name of a sensor stands in the sensor's row.
 
     `offsets`: the estimated time offset of a sensor and its standard deviation, s. `nis` is the sum of the normalised
-    innovations squared of all that was used, and `freedom` what it would be on average if the sensor were as good as
-    it says.
+    innovations squared of all used measurements, and `freedom` its expectation for a consistent covariance.
     """
     text = "one hypothesis" if hypotheses == 1 else f"{hypotheses} headings in question"
     rows: list[Row] = [("filter", text, Level.OK if hypotheses == 1 else Level.WARN, dict(ignored))]
@@ -87,7 +86,7 @@ def diagnostics(
         elif silent:
             level, text = Level.STALE, "silent"
         elif h.nis > 3:
-            level, text = Level.WARN, "worse than it says"
+            level, text = Level.WARN, "covariance too small"
         else:
             level, text = Level.OK, "used"
         counts = {"used": h.used, "made room for": h.widened, "refused": h.refused, "unconfirmed": h.unconfirmed}

@@ -27,9 +27,9 @@ class PoseFusion(Operator):
     Rotations are averaged on the manifold. Sensors whose messages are at most `window` old count as simultaneous.
 
     Each sensor is compared with the others. Of three or more the one that contradicts the rest is left out; of two
-    nobody knows which is wrong, and the covariance grows until it holds both. Either is said in the status before it
-    is averaged. Covariances follow how far a sensor is from the others, so a degrading one loses its say. For one that
-    moves fast, or with biases and delays, there is EkfFusion.
+    it is undecidable which is wrong, and the covariance grows until it holds both. The status reports either before it
+    is averaged. Covariances follow how far a sensor is from the others, so a degrading one loses its weight. For a
+    body that moves fast, or sensors with biases and delays, there is EkfFusion.
 
     Methods: rotations, Hartley et al., "Rotation averaging", 2013; positions by least squares with the covariances as
     weights; contradictions by the chi-square test of the difference.

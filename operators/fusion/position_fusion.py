@@ -20,15 +20,15 @@ Array = NDArray[np.float64]
 
 
 class PositionFusion(Operator):
-    """Combines what cameras, lidars and others say about the places of the same things, by their covariances.
+    """Combines positions of the same things by cameras, lidars and others, by their covariances.
 
     Things are matched by identity. Sightings with range count as positions with covariance; those with bearings alone
     are solved for together with the rest, so two cameras triangulate. Sensors whose sightings are at most `window` old
     count as simultaneous.
 
     Each sensor is compared with the others. Of three or more the one that contradicts the rest is left out; of two
-    nobody knows which is wrong, and the covariance grows until it holds both. Either is said in the status before it
-    is averaged. Covariances follow how far a sensor is from the others, so a degrading one loses its say.
+    it is undecidable which is wrong, and the covariance grows until it holds both. The status reports either before it
+    is averaged. Covariances follow how far a sensor is from the others, so a degrading one loses its weight.
 
     Method: positions and bearings in one weighted least squares, as in Hartley and Zisserman, "Multiple view geometry",
     2004, 12; contradictions by the chi-square test of the residuals.
@@ -112,7 +112,7 @@ class PositionFusion(Operator):
 
 
 def _holding(frame: str, extrinsics: Mapping[str, Transforms]) -> Transforms | None:
-    """The transforms that tell of a frame; any where none do, and None where there are none at all."""
+    """The transforms that hold a frame; any where none do, and None where there are none at all."""
     given = [transforms for _, transforms in sorted(extrinsics.items())]
     return next((one for one in given if frame in (*one.frames, *one.child_frames)), given[0] if given else None)
 

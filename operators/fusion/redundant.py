@@ -1,4 +1,4 @@
-"""Keeps what several sensors said last about the same thing, and how far they agree, for all that average them."""
+"""Stores the latest measurements of each sensor and their consistency, for the fusion operators."""
 
 from __future__ import annotations
 

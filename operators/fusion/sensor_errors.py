@@ -22,7 +22,7 @@ _CLOCK_WALK = 1e-4
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Says which errors are states, by sensor, in the order of the state's `errors`.
+    """Holds the errors that are states, by sensor, in the order of the state's `errors`.
 
     `clocks`: standard deviation of the first time offset, s; `drifts`: standard deviations of what is added to a
     position (east, north, up, m) and the time in which that changes, s; `scales`: that of the share by which a forward

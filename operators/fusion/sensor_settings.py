@@ -51,8 +51,8 @@ class SensorSettings(BaseModel):
     )
     drift: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0),
-        description="standard deviations (east, north, up, m) of an error of positions that changes slowly, a part of "
-        "what the covariance says: if above 0, it is estimated",
+        description="standard deviations (east, north, up, m) of an error of positions that changes slowly, included "
+        "in the covariance: if above 0, it is estimated",
     )
     drift_time: float = Field(30.0, gt=0, description="seconds in which that error changes")
     scale_sigma: float = Field(
@@ -135,7 +135,7 @@ def unheard(names: Sequence[str], streams: Sequence[str]) -> dict[str, str]:
 
 
 def never_yields(gate: GateConfig) -> bool:
-    """Tells whether refused measurements that agree with each other are refused all the same."""
+    """Returns whether refused measurements that agree with each other are refused all the same."""
     return gate.agreeing == NEVER_AGREE
 
 

@@ -115,8 +115,8 @@ def _absolute(
     assert isinstance(message, Pose | Odometry)
     if message.frame != around.world_frame:
         raise ValueError(
-            f"{name}: poses are in the frame {message.frame!r}, the filter's is {around.world_frame!r}: odometry of a "
-            "frame of its own is used as 'velocity'"
+            f"{name}: poses are in the frame {message.frame!r}, the filter's is {around.world_frame!r}: odometry in "
+            "another frame is used as 'velocity'"
         )
     check_finite(message.position, message.orientation)
     given = message.covariance if isinstance(message, Pose) else message.pose_covariance
@@ -188,7 +188,7 @@ def _velocity(
 
 
 def _metric(message: Message) -> bool:
-    """Tells whether lengths are metres: a camera that does not know its scale gives positions an infinite variance."""
+    """Returns whether lengths are metres: positions of a camera without known scale have infinite variance."""
     given = message.pose_covariance if isinstance(message, Odometry) else None
     return given is None or bool(np.isfinite(np.diag(given)[:3]).any())
 
@@ -228,7 +228,7 @@ def _doppler(time: int, name: str, scan: RadarScan, settings: SensorSettings, ar
 def _ranges(
     time: int, name: str, sightings: LandmarkSightings | RadarScan, settings: SensorSettings, around: Surroundings
 ) -> Iterator[Found]:
-    """Distances to landmarks, of a sensor that knows which they are: a radar's detections by their `ids`."""
+    """Distances to identified landmarks, for a radar by the `ids` of its detections."""
     if sightings.ranges is None:
         raise Unusable("no ranges")
     if sightings.ids is None:

@@ -1,6 +1,6 @@
-"""The likeliest other place: tells a pose from one that a mirrored place would explain as well.
+"""The likeliest other place: distinguishes a pose from that in a mirrored place, which would explain as much.
 
-A cloud settles in one of several places that look alike, and its spread does not tell of the others. So when the robot
+A cloud settles in one of several places that look alike, and its spread does not reflect the others. So when the robot
 has been looked for, places elsewhere that explain the observation are tried, and the best is followed beside the cloud
 until the observations decide between the two. Multiple-hypothesis localisation: Jensfelt and Kristensen, "Active global
 localization for a mobile robot using multiple hypothesis tracking", 2001.
@@ -63,7 +63,7 @@ class CompetingHypothesis:
 
     @property
     def decided(self) -> bool:
-        """Tells that the place was looked for elsewhere, and that nowhere else explains what was observed."""
+        """Notes that a search elsewhere found no place that explains the observations."""
         return self._other is None and self._searched >= _SEARCHES
 
     @property
@@ -163,6 +163,6 @@ class CompetingHypothesis:
 
 
 def apart(one: Array, other: Array) -> bool:
-    """Tells whether two poses (3,) are of different places."""
+    """Returns whether two poses (3,) are of different places."""
     far = float(np.hypot(one[0] - other[0], one[1] - other[1])) > _FAR
     return far or abs(float(wrapped(one[2] - other[2]))) > _TURNED

@@ -43,7 +43,7 @@ def flat(odometry: Odometry) -> Array:
 
 
 def apart(first: Estimate, second: Estimate) -> bool:
-    """Says whether two estimates, both to be believed, contradict each other."""
+    """Returns whether two estimates, both to be believed, contradict each other."""
     if first.word != "localised" or second.word != "localised":
         return False
     off = first.mean - second.mean

@@ -52,7 +52,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
     number follows the spread of the cloud (KLD sampling); it is drawn anew by systematic resampling.
 
     A sensor whose innovations are larger than its noise explains, while another sensor's are not, counts less, and the
-    status says so. Beside the fused cloud every modality has a cloud of its own, with the same motion.
+    status reports it. Beside the fused cloud every modality has a separate cloud, with the same motion.
 
     Poses come while the robot is localised: most of the weight lies in one place, observations fit there, and nowhere
     else. A robot that has been found is looked for elsewhere too; while another place explains the observations about
@@ -77,9 +77,9 @@ class ParticleFilterLocalizer(Operator, merge=True):
     pose: Out[Odometry] = Out(doc="the base in the map with covariance, at every odometry message while localised")
     correction: Out[Transforms] = Out(doc="the odometry frame in the map frame (REP 105), with every pose")
     particles: Out[ParticleSet] = Out(doc="the fused cloud")
-    lidar_pose: Out[Odometry] = Out(doc="what lidar alone says, while its cloud is in one place")
-    landmark_pose: Out[Odometry] = Out(doc="what landmarks and objects alone say")
-    position_pose: Out[Odometry] = Out(doc="what positions alone say")
+    lidar_pose: Out[Odometry] = Out(doc="estimate by lidar alone, while its cloud is in one place")
+    landmark_pose: Out[Odometry] = Out(doc="estimate by landmarks and objects alone")
+    position_pose: Out[Odometry] = Out(doc="estimate by positions alone")
     status: Out[Diagnostics] = Out(
         doc="localised, ambiguous, searching or lost, and what each sensor counts; every second"
     )
@@ -213,7 +213,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
         self._grid, self._field = grid, LikelihoodField(grid, self.hit_sigma, self.stray)
 
     def _moves(self, odometry: Odometry) -> bool:
-        """Tells whether odometry can be used; where not, it is counted, and the next tells of both ways."""
+        """Returns whether odometry can be used; if not, it is counted, and the next one covers both steps."""
         if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
             self._ignored["odometry: not finite"] += 1
             return False

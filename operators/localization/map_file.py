@@ -22,7 +22,7 @@ _MODES = ("trinary", "scale", "raw")
 def read_map(path: Path, frame: str, stamp: int = 0) -> OccupancyGrid:
     """Reads a map: the YAML file names the image, its resolution (m), origin (x, y, yaw) and thresholds.
 
-    A pixel's darkness is its occupancy. `mode` says what is made of it: `trinary` (the default) taken above
+    A pixel's darkness is its occupancy. `mode` selects its interpretation: `trinary` (the default) taken above
     `occupied_thresh`, free below `free_thresh`, unknown between them; `scale` the same with shares of 100 between them,
     unknown where the image is transparent; `raw` the pixel itself, unknown above 100. Raises ValueError for a file that
     is no such map, FileNotFoundError where file or image is missing.

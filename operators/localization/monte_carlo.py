@@ -103,23 +103,23 @@ class MonteCarlo:
         self.poses, self.logarithms = poses, np.zeros(len(poses))
 
     def weigh(
-        self, sensor: str, observation: Observation, rng: np.random.Generator, says: Mapping[str, float] | None = None
+        self, sensor: str, observation: Observation, rng: np.random.Generator, trust: Mapping[str, float] | None = None
     ) -> float:
         """Takes an observation; returns the logarithm of its likelihood in the cloud.
 
-        `says`: how much each sensor counts, (0, 1]; 1 for those that it does not name.
+        `trust`: weight of each sensor, (0, 1]; 1 for sensors that it lacks.
         """
-        says = says or {}
+        trust = trust or {}
         logarithms, fits = observation.score(self.poses)
-        logarithms = logarithms * says.get(sensor, 1.0)
+        logarithms = logarithms * trust.get(sensor, 1.0)
         evidence = evidence_of(self.weights, logarithms)
         self.logarithms += logarithms
         weights = self.weights
         before = self.fits.get(sensor, Fit(self.config.expected, self.config.expected))
         self.fits[sensor] = before.after(float(weights @ fits))
-        doubt = self.doubt(says)
+        doubt = self.doubt(trust)
         heard = self._heard[sensor] = self._heard.get(sensor, 0) + 1
-        if says.get(sensor, 1.0) < 0.5:  # who is outvoted proposes a little: others judge it before it outweighs them
+        if trust.get(sensor, 1.0) < 0.5:  # an outvoted sensor proposes little: others judge it before it outweighs them
             self._draw(weights, rng, observation, _EXPLORED)
         elif doubt > _DOUBTFUL:
             self._draw(weights, rng, observation, min(1.5 * doubt, self.config.largest))
@@ -129,9 +129,9 @@ class MonteCarlo:
             self._draw(weights, rng)
         return evidence
 
-    def doubt(self, says: Mapping[str, float]) -> float:
+    def doubt(self, trust: Mapping[str, float]) -> float:
         """Returns how much worse than usual sensors fit of late, by what they count, [0, 1]."""
-        counts = {sensor: says.get(sensor, 1.0) for sensor in self.fits}
+        counts = {sensor: trust.get(sensor, 1.0) for sensor in self.fits}
         lost = sum(count * self.fits[sensor].loss for sensor, count in counts.items())
         return lost / sum(counts.values()) if counts else 0.0
 

@@ -42,7 +42,7 @@ class DriveNoise:
 
 
 def moved(poses: Array, step: Array, covariance: Array, rng: np.random.Generator) -> Array:
-    """Returns poses (N, 3) after a step (3,) in their own frames, each with noise of its own."""
+    """Returns poses (N, 3) after a step (3,) in their own frames, each with independent noise."""
     steps = step + rng.standard_normal((len(poses), 3)) @ np.linalg.cholesky(covariance + 1e-12 * np.eye(3)).T
     return composed(poses, steps)
 

@@ -34,7 +34,7 @@ class Observation(Protocol):
 
     @property
     def whole(self) -> bool:
-        """Tells whether it can place the robot with its heading, alone."""
+        """Returns whether it can place the robot with its heading, alone."""
         ...
 
 
@@ -125,7 +125,7 @@ class Sightings:
         return float(np.median(off)) / _MEDIAN[2]
 
     def propose(self, count: int, rng: np.random.Generator) -> Array:
-        """Puts pairs of sightings onto places that are as far apart; one alone says only how far it is away."""
+        """Puts pairs of sightings onto places that are as far apart; one alone gives only its distance."""
         M = len(self.seen)
         noise = np.linalg.cholesky(self.covariances)
         first = rng.integers(0, M, count)

@@ -32,7 +32,7 @@ _FARTHEST = 1e6  # metres from the origin of a map: farther landmarks are none
 
 
 class Unusable(Exception):
-    """A message that is ignored: says why."""
+    """Raised for a message that is ignored; the text names the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ MODALITIES: dict[type[Message], str] = {
 
 
 def observation(name: str, message: Message, around: Surroundings) -> Observation:
-    """Returns what a message says about the pose.
+    """Returns a message's observation of the pose.
 
     Raises Unusable for a message without use, ValueError for one that does not belong to this map or robot.
     """

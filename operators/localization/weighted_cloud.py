@@ -51,20 +51,20 @@ class WeightedCloud:
             self.competing.move(step, covariance, rng)
 
     def update(self, sensor: str, stamp: int, observation: Observation, rng: np.random.Generator) -> None:
-        """Takes an observation (its time in ns); one that says too little to begin with is passed over."""
+        """Takes an observation (its time in ns); one that is too weak to initialise the cloud is skipped."""
         self.stamp = stamp
         if self._cloud is None:
             self._cloud = MonteCarlo(self._config, observation.propose(self._config.most, rng))
             return
         mean, covariance, share = self._cloud.estimate()
-        says = self.sensor_weights.counts(stamp)
+        trust = self.sensor_weights.counts(stamp)
         if share > _MOST / 2:
-            says[sensor] = self.sensor_weights.update(sensor, stamp, observation.misfit(mean, covariance))
-        evidence = self._cloud.weigh(sensor, observation, rng, says)
-        if self._cloud.doubt(says) > _LOST:
+            trust[sensor] = self.sensor_weights.update(sensor, stamp, observation.misfit(mean, covariance))
+        evidence = self._cloud.weigh(sensor, observation, rng, trust)
+        if self._cloud.doubt(trust) > _LOST:
             self.competing.forget()
         elif self._narrow(covariance):
-            better = self.competing.update(mean, evidence, observation, says.get(sensor, 1.0), rng)
+            better = self.competing.update(mean, evidence, observation, trust.get(sensor, 1.0), rng)
             if better is not None:
                 self._cloud.replace(better)
 

@@ -18,7 +18,7 @@ from operators.status import counted_status
 
 
 class ColorDepthCheck(Operator):
-    """Says when the edges of colour images do not lie where the depth has its rims: one camera is turned or displaced.
+    """Warns when the edges of colour images do not lie where the depth has its rims: one camera is turned or displaced.
 
     A camera that is turned against its extrinsic paints things with what is beside them, and nothing fails: boxes are
     lifted from the wrong points. The check adds up images, since a single one has edges that are none of the depth's.

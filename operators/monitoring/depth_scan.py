@@ -28,7 +28,7 @@ _PRIOR = np.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1, 0.1])  # m, rad, share: stan
 
 @dataclass(frozen=True)
 class Misfit:
-    """Says how far the LiDAR's extrinsic and the scale of depths seem wrong, with standard deviations.
+    """Holds estimated errors of the LiDAR's extrinsic and of the scale of depths, with standard deviations.
 
     `turn` (3,) rad and `shift` (3,) m are what must be put on the LiDAR's points, in the depth camera's axes; `scale`
     is the share by which depths are too long.
@@ -54,10 +54,10 @@ class Misfit:
 class DepthScanAgreement:
     """Follows, pair by pair, the misfit of depth images and scans by point-to-plane alignment with forgetting.
 
-    Each pair is aligned from where the last ones led, and what it tells is added to what they told, whose weight falls
-    by `keep`. Directions that surfaces do not tell of stay at zero, within a prior. Method: projective association as
-    in Blais and Levine, "Registering multiview range data to create 3D computer objects", 1995, with the scale as one
-    more unknown.
+    Each pair is aligned from where the last ones led, and its information is added to theirs, whose weight falls by
+    `keep`. Directions that the surfaces do not constrain stay at zero, within a prior. Method: projective association
+    as in Blais and Levine, "Registering multiview range data to create 3D computer objects", 1995, with the scale as
+    one more unknown.
     """
 
     def __init__(self, keep: float = 0.9) -> None:
@@ -86,7 +86,7 @@ class DepthScanAgreement:
         return True
 
     def misfit(self) -> Misfit:
-        """Returns what the pairs so far tell."""
+        """Returns the misfit by the pairs so far."""
         sigmas = np.sqrt(np.diag(np.linalg.inv(self._posterior())))
         return Misfit(self._x[:3].copy(), self._x[3:6].copy(), float(self._x[6]), sigmas)
 

@@ -23,7 +23,7 @@ _AT_ONCE = 2_000_000  # ns: differences of stamps that need no motion
 
 
 class DepthScanCheck(Operator, tolerance="60ms"):
-    """Says when depth images and LiDAR scans do not lie on each other: one is turned, shifted, or of a wrong scale.
+    """Warns when depth images and LiDAR scans do not lie on each other: one is turned, shifted, or of a wrong scale.
 
     Which of the two is wrong it cannot say, but by how much: the angle and shift between them against the extrinsics,
     and the share by which depths are too long. Where stamps or points differ in time, the LiDAR's velocity is needed.
@@ -37,7 +37,7 @@ class DepthScanCheck(Operator, tolerance="60ms"):
     depth_info: Sampled[CameraInfo] = Sampled(doc="calibration of the depth camera")
     extrinsics: Sampled[Transforms] = Sampled(doc="holds the transform between the two sensors")
     motion: Sampled[Odometry] = Sampled(
-        required=False, max_age="500ms", doc="the LiDAR's odometry, whose velocity says what its points are moved by"
+        required=False, max_age="500ms", doc="the LiDAR's odometry, by whose velocity its points are moved"
     )
     status: Out[Diagnostics] = Out(doc="with every scan; a warning while they do not fit")
 

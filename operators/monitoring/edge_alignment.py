@@ -20,7 +20,7 @@ _HALVES = ("left half", "right half")
 
 @dataclass(frozen=True)
 class Shift:
-    """Says where the edges of the depth fit those of the colour image best.
+    """Holds where the edges of the depth fit those of the colour image best.
 
     `x` and `y` in working pixels; `here` is how well they fit unmoved, as a share of that; `peak` how far the best fit
     stands out, in standard deviations of all; `edges` the pixels that it rests on; `part` names that of the image.
@@ -34,7 +34,7 @@ class Shift:
     edges: float
 
     def off(self, least: int) -> bool:
-        """Tells whether the edges plainly lie `least` pixels or more from where they should."""
+        """Returns whether the edges plainly lie `least` pixels or more from where they should."""
         return max(abs(self.x), abs(self.y)) >= least and self.here < 0.7 and self.peak >= 4.5 and self.edges >= 500
 
 
@@ -85,7 +85,7 @@ class EdgeAlignment:
 
 def rims(depth: NDArray[np.float32], K: Array) -> Array:
     """Returns points (N, 3), metres, in the frame of a depth camera (K) on rims: every second pixel beside one much
-    farther. What is not finite is no return."""
+    farther. Values that are not finite are no returns."""
     z = np.where(np.isfinite(depth[::2, ::2]), depth[::2, ::2], np.float32(0))
     rim = np.zeros(z.shape, np.bool_)
     for here, there in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 class Flaw(StrEnum):
-    """Says why an image is not used."""
+    """Reasons for which an image is not used."""
 
     BLACK = "is black"
     BLANK = "has no contrast"

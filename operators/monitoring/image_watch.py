@@ -10,7 +10,7 @@ from operators.monitoring.watching import Watching
 
 
 class ImageWatch(Watching, Operator):
-    """Passes images on unless they are black or repeat the last one, and says so.
+    """Passes images on unless they are black or repeat the last one, which the status reports.
 
     A camera that hangs gives its last image with new stamps: what is found in it would be placed where the robot has
     moved to since. Held back, it leaves a gap, which the operators behind know how to bear.
@@ -32,7 +32,7 @@ class ImageWatch(Watching, Operator):
 
 
 class DepthWatch(Watching, Operator):
-    """Passes depth images on unless they have no returns or repeat the last one, and says so."""
+    """Passes depth images on unless they have no returns or repeat the last one, which the status reports."""
 
     named = ("depth_watch", "depth image")
 

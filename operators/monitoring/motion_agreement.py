@@ -1,4 +1,4 @@
-"""Motions of one body by several sensors, against each other: who is off is named."""
+"""Compares the motion of one body by several sensors, and names the outlier."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from operators.geometry import se3
 Array = NDArray[np.float64]
 
 _SLIDE, _SPIN = 0.008, np.deg2rad(0.2)  # standard deviations of a window's motion: m, rad
-_ROUGH_SPIN = np.deg2rad(1.5)  # the same of one that only coarsely tells how it turned: wheels
+_ROUGH_SPIN = np.deg2rad(1.5)  # the same of a sensor that measures turns only coarsely: wheels
 _KNEE = 4.0  # standard deviations beyond which a residual counts linearly
 _PRIOR = np.array([0.2, 0.2, 0.2, 0.3, 0.3])  # rad, and shares
 _SURE = 3.0  # standard deviations by which a disagreement must stand out
@@ -33,7 +33,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Window:
-    """Holds what a sensor says of the motion in a window: a twist (6,), metres and rad, NaN where it cannot tell."""
+    """Holds a sensor's motion in a window: a twist (6,), metres and rad, NaN where it measures none."""
 
     twist: Array
     coarse: bool = False
@@ -79,7 +79,7 @@ class Pair:
 class Contradiction:
     """Names a sensor that is contradicted: by whom, in what (`way`, `turn`, `direction`), and how far (shares, rad).
 
-    `alone`: by two or more that agree with each other; else nobody knows which of the two is wrong.
+    `alone`: by two or more that agree with each other; else it is undecidable which of the two is wrong.
     """
 
     sensor: str
@@ -97,14 +97,14 @@ class Contradiction:
 
 
 class MotionAgreement:
-    """Compares sensors two by two, and says who is contradicted by whom."""
+    """Compares sensors two by two, and names those that are contradicted, and by which."""
 
     def __init__(self, limits: Limits, keep: float = 0.95) -> None:
         self._limits, self._keep = limits, keep
         self._pairs: dict[tuple[str, str], Pair] = {}
 
     def add(self, windows: Mapping[str, Window]) -> None:
-        """Takes what each sensor says of one window."""
+        """Takes each sensor's motion in one window."""
         for a, b in combinations(sorted(windows), 2):
             first, second = windows[a], windows[b]
             pair = self._pairs.setdefault((a, b), Pair(first.coarse or second.coarse))

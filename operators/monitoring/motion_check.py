@@ -16,7 +16,7 @@ from operators.geometry.extrinsics import transform_between
 from operators.monitoring.motion_agreement import Contradiction, Limits, MotionAgreement, Track, Window
 from operators.status import counted_status
 
-_NEWEST = 350_000_000  # ns: what an older pose says of the speed is not compared with the wheels'
+_NEWEST = 350_000_000  # ns: the speed from an older pose is not compared with the wheels'
 _SLACK = 300_000_000  # ns that a window waits for the slowest sensor
 _WHEELS = "wheels"
 _HANGS = 500_000_000  # ns for which a sensor gives the same reading of a motion when it counts as hanging
@@ -26,11 +26,11 @@ class MotionCheck(Operator, merge=True):
     """Compares the robot's motion by wheels, odometries and gyroscopes, and holds wheels back that are contradicted.
 
     Window by window each two sensors are compared: their ways, their turns, and the directions of both on the robot.
-    What differs by more than a limit and its noise is said, with the sensor that the others contradict; of two nobody
-    knows which is wrong. A camera whose depths are too long, wheels of another radius, a gyroscope of another scale and
-    a sensor that is turned against its extrinsic show so; so does one that repeats a reading of motion. Wheels are
-    passed on at `checked` unless two others that agree contradict them, over many windows or at once (wheels that slip
-    or say nothing).
+    A difference above a limit and its noise is reported, with the sensor that the others contradict; of two it is
+    undecidable which is wrong. This reveals a camera whose depths are too long, wheels of another radius, a gyroscope
+    of another scale, a sensor that is turned against its extrinsic, and one that repeats a reading of motion. Wheels
+    are passed on at `checked` unless two others that agree contradict them, over many windows or at once (wheels that
+    slip or send nothing).
     """
 
     wheels: In[Odometry] = In(doc="odometry of the wheels, with velocities")
@@ -55,13 +55,13 @@ class MotionCheck(Operator, merge=True):
         limits = Limits(self.way, self.turn, self.coarse_turn, float(np.deg2rad(self.angle)))
         self._tracks: dict[str, Track] = {}
         self._blind: set[str] = set()
-        """Sensors that tell turns alone."""
+        """Sensors that measure turns alone."""
         self._agreement = MotionAgreement(limits)
         self._found: list[Contradiction] = []
         self._end = 0
         self._slipping = self._said = False
         self._slipped = -1
-        """When the wheels last did: a window with it tells nothing of their radii."""
+        """When the wheels last slipped: a window with that time is no evidence on their radii."""
         self._readings: dict[str, tuple[int, np.ndarray]] = {}
         """Since when each of the moving sensors gives the reading that it gives."""
         self._hanging: set[str] = set()
@@ -162,7 +162,7 @@ class MotionCheck(Operator, merge=True):
         (self._hanging.add if hangs else self._hanging.discard)(name)
 
     def _slips(self, wheels: Odometry) -> bool:
-        """Tells whether two others that agree, or more, say that the robot moves at another speed than the wheels."""
+        """Returns whether two others that agree, or more, contradict the speed of the wheels."""
         assert wheels.linear is not None
         own = float(wheels.linear[0])
         others = []

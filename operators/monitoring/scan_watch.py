@@ -12,7 +12,7 @@ from operators.monitoring.watching import Watching
 
 
 class ScanWatch(Watching, Operator):
-    """Passes LiDAR scans on unless they have hardly a point or repeat the last one, and says so.
+    """Passes LiDAR scans on unless they have too few points or repeat the last one, which the status reports.
 
     A LiDAR that hangs looks like a robot that stands: odometry of its scans would hold the pose against all others.
     """

@@ -18,7 +18,7 @@ FROZEN = "repeats the last one"
 
 
 class Watcher:
-    """Tells whether data repeat the last ones, and counts what was wrong. Two exposures are never equal bit by bit."""
+    """Detects data that repeat the last ones, and counts what was wrong. Two exposures are never equal bit by bit."""
 
     def __init__(self, operator: str, what: str) -> None:
         self._operator, self._what = operator, what

@@ -18,7 +18,7 @@ from operators.geometry.se3 import Matrix
 
 SLACK = 0.04  # metres by which two distances may differ, and so much more for each metre of depth
 SLACK_PER_METRE = 0.01
-APART = 0.15  # metres: points nearer to each other say nothing of a rotation
+APART = 0.15  # metres: points nearer to each other do not constrain a rotation
 GATE = 0.12  # metres by which a point may be off the motion
 SEEDS = 4  # cliques that are tried
 FEWEST = 4  # points of a clique

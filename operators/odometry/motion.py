@@ -40,7 +40,7 @@ class Motion:
         )
 
     def measured(self, stamp: int, T_world_camera: Matrix) -> "Motion":
-        """Returns the motion after a measured pose. What was crossed blindly tells nothing of the velocity now."""
+        """Returns the motion after a measured pose. After more than `BRIEF` s without one, the velocity is 0."""
         if self.blind_s > BRIEF:
             return Motion(stamp, T_world_camera, np.zeros(6))
         if self.blind_s > 0:

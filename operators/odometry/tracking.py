@@ -1,4 +1,4 @@
-"""Holds what every visual odometry says of a frame: a pose, how far it can be trusted, and what it rests on."""
+"""Holds the result of every visual odometry for a frame: a pose, its covariance, and its basis."""
 
 from dataclasses import dataclass
 from enum import StrEnum

@@ -30,7 +30,7 @@ _STILL = 1e-5  # metres and radians: a step less than this ends the iterations
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Says which view (S,) sees which point (S,), at what pixel (S, 2) of the colour camera and depth (S,) in the depth
+    """Observations of point (S,) by view (S,), at what pixel (S, 2) of the colour camera and depth (S,) in the depth
     camera, metres, NaN where unknown; and how noisy a pixel is and each depth (S,)."""
 
     views: Indices

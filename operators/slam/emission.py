@@ -25,7 +25,7 @@ LEVELS = {
 def corrections(
     odometry: Odometry, T_odom: Matrix, T_map_odom: Matrix, covariance: Matrix, map_frame: str
 ) -> dict[str, Message]:
-    """Returns the ports `correction` and `pose` where the odometry says `T_odom` (4, 4).
+    """Returns the ports `correction` and `pose` for the odometry's pose `T_odom` (4, 4).
 
     The covariance (6, 6) is of the pose's right perturbation.
     """

@@ -1,7 +1,7 @@
 """Matches the features of two views where a rough pose between them expects them.
 
 Lowe's test asks that a feature be distinct from all others of the view, which few are after a large change of view.
-Distinct from those in a small window is enough where a pose says which window.
+Distinct from those in a small window is enough where a pose predicts that window.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Features(Protocol):
 def guided_pairs(
     known: Features, seen: Features, T_known_seen: Matrix, camera: RgbdCamera, window: float
 ) -> NDArray[np.int64]:
-    """Returns pairs of indices (M, 2), each feature once, at most `window` working pixels from where the pose says."""
+    """Returns pairs of indices (M, 2), each feature once, at most `window` working pixels from its prediction."""
     nothing = np.zeros((0, 2), np.int64)
     there = np.flatnonzero(np.isfinite(known.points[:, 2]))
     if not len(there) or len(seen.pixels) < 2:

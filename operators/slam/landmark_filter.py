@@ -78,7 +78,7 @@ class LandmarkFilter:
         self._moved = np.zeros((3, 3))
 
     def snapshot(self) -> dict[str, Any]:
-        """Returns all that the filter knows, as plain values and arrays."""
+        """Returns the filter's state, as plain values and arrays."""
         size = _FIRST + 2 * len(self.ids)
         return {
             "heading": self.heading,

@@ -54,7 +54,7 @@ class LandmarkSlam(Operator, merge=True):
     turn_noise: float = Param(0.02, gt=0, doc="standard deviation of the heading after 1 m of travel", unit="rad/√m")
     spin_noise: float = Param(0.02, ge=0, doc="and after 1 rad of turning", unit="√rad")
     max_speed: float = Param(
-        50.0, gt=0, doc="odometry that is faster has jumped: it tells nothing of this step", unit="m/s"
+        50.0, gt=0, doc="odometry that is faster has jumped and is not used for this step", unit="m/s"
     )
 
     def setup(self) -> None:
@@ -137,7 +137,7 @@ class LandmarkSlam(Operator, merge=True):
         } | ignored
 
     def _moves(self, odometry: Odometry) -> bool:
-        """Tells whether odometry can be used; where not, it is counted, and the next tells of both ways."""
+        """Returns whether odometry can be used; if not, it is counted, and the next one covers both steps."""
         if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
             self._ignored["odometry: not finite"] += 1
             return False

@@ -16,7 +16,7 @@ from operators.slam.place_graph import PlaceGraph
 from operators.slam.scan_context import likeness
 from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting, alike
 
-DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # what odometry may be off besides what it says, over a metre
+DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # errors of odometry beyond its covariance, over a metre
 STEP = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # and at each keyframe
 LEAST = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # of a sight: noise and calibration err alike in all
 
@@ -70,7 +70,7 @@ class LidarGraph(PlaceGraph[LidarView]):
     ) -> Added:
         """Takes a scan and its pose in the odometry frame.
 
-        `segment` is the number of the odometry's map; `found_again` says that it found this map again after a loss.
+        `segment` is the number of the odometry's map; `found_again`: it found this map again after a loss.
         """
         added = self.grow(stamp, T_odom, covariance, segment, found_again, self._eyes, lambda: view)
         newest = self.newest
@@ -79,13 +79,13 @@ class LidarGraph(PlaceGraph[LidarView]):
         return added
 
     def covariance_at(self, T_odom: Matrix, covariance_odom: Matrix) -> Matrix:
-        """Returns the covariance (6, 6) in the map of a pose that the odometry says."""
+        """Returns the covariance (6, 6) in the map of a pose of the odometry."""
         return self._lesser(super().covariance_at(T_odom, covariance_odom), covariance_odom)
 
     def _lesser(self, covariance: Matrix, covariance_odom: Matrix) -> Matrix:
         """Returns the covariance of a pose in the map, which is no greater than the odometry's where both frames began.
 
-        Along the chain of keyframes it grows with every step, while the odometry's own map may know better.
+        Along the chain of keyframes it grows with every step, while the odometry's own map may be more precise.
         """
         newest = self.newest
         began_here = newest is not None and newest.island == 0 and SAVED not in self.tied

@@ -28,8 +28,8 @@ class LidarSlam(LidarOdometry):
 
     In front runs the odometry of `LidarOdometry`, with its parameters and its `odometry`, which stays smooth; what is
     corrected is the transform from map to odometry frame (REP 105). Keyframes are measured against the planes of older
-    ones that the map has nearby. A loop is closed only where each scan saw what the other says and nothing hangs in
-    what the other saw to be free, and where it is a surprise only when a second keyframe says the same. A pose graph
+    ones that the map has nearby. A loop is closed only where each scan confirms the other's surfaces and nothing hangs
+    in space that the other saw to be free; an unexpected one also needs a second keyframe that agrees. A pose graph
     with a robust kernel moves all keyframes accordingly. A place that was seen before keeps its old scan, so the map
     grows with the space that is seen.
 

@@ -61,7 +61,7 @@ class LidarSight:
 
 @dataclass(frozen=True)
 class LidarEyes:
-    """Compares scans: by `judge`, and by `expected` where the map tells where to look. `noise` is the standard
+    """Compares scans: by `judge`, and by `expected` where the map predicts the pose. `noise` is the standard
     deviation of a range, metres, and `correlation` the number of points whose errors are alike."""
 
     judge: Settings
@@ -79,7 +79,7 @@ class LidarEyes:
     def sight(self, nodes: Mapping[int, Node[LidarView]], known: int, seen: int, expected: bool) -> LidarSight | str:
         """Registers the two scans, and measures the pose against the planes of the scans around the known one.
 
-        Where nothing tells where to look, poses around the known one are tried in all headings, and if two of them
+        Without a predicted pose, poses around the known one are tried in all headings, and if two of them
         explain the scans as well, neither is believed.
         """
         one, other = nodes[known].view, nodes[seen].view
@@ -94,7 +94,7 @@ class LidarEyes:
         return found.reason or self._checked(self._fitted(other, planes, found.T), found)
 
     def _near(self, one: LidarView, other: LidarView, planes: PlaneMap, guess: Matrix) -> LidarSight | str:
-        """Measures a scan that is expected near a guess; along what the planes tell nothing of, the guess stands."""
+        """Measures a scan that is expected near a guess; the guess stands along unconstrained directions."""
         fitted = self._fitted(other, planes, guess)
         found = explained(other.prepared, one.prepared, fitted.T, self.expected)
         if not found.reason:

@@ -12,7 +12,7 @@ from operators.slam.keyframe_graph import KeyframeGraph
 from operators.slam.map_points import MapPoints
 from operators.slam.visual_view import View, astray
 
-FEWEST = 3  # views that a point is seen by: what two see, the sight between them says
+FEWEST = 3  # views of a point; points of two views are covered by the sight between them
 MOST = 400  # points
 ITERATIONS = 3
 PIXEL = 0.5  # working pixels, at least, by which a described feature errs

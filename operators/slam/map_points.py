@@ -34,7 +34,7 @@ def _nobody() -> Indices:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Says which nodes (S,) saw which points (S,), by row, at what pixels (S, 2) of the working image and with what
+    """Holds which nodes (S,) saw which points (S,), by row, at what pixels (S, 2) of the working image and with what
     depths (S,), metres, NaN where unknown or beside an edge."""
 
     nodes: Indices

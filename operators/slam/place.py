@@ -10,7 +10,7 @@ from operators.slam.sensor_model import Added
 
 
 class Place(StrEnum):
-    """Says what is known of the sensor's place in the map."""
+    """Basis of the sensor's place in the map."""
 
     MAPPED = "mapped"  # by a chain of odometry from places that are in the map
     CORRECTED = "corrected"  # by a loop at this very measurement
@@ -19,7 +19,7 @@ class Place(StrEnum):
 
 
 def place_of(graph: PlaceGraph[Any], added: Added, adrift: str, reason: str) -> tuple[Place, str]:
-    """Returns the place and the reason; `adrift` says why the odometry measures nothing, `reason` what it does."""
+    """Returns the place and the reason, from the odometry's: `adrift` if it measures nothing, else `reason`."""
     refused = f"; refused: {', '.join(added.refused)}" if added.refused else ""
     if added.found:
         return Place.CORRECTED, "the map is found"

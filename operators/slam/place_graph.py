@@ -49,7 +49,7 @@ class PlaceGraph(Generic[V]):
 
     @property
     def located(self) -> bool:
-        """Tells whether the newest keyframe's place in the map is known."""
+        """Returns whether the newest keyframe's place in the map is known."""
         newest = self.newest
         return (newest.island if newest else 0) in self.tied
 
@@ -74,8 +74,8 @@ class PlaceGraph(Generic[V]):
     ) -> Added:  # fmt: skip
         """Takes a pose of the odometry, and its view if it becomes a keyframe.
 
-        `segment` is a number for all that one map of the odometry holds; `jumped` says that the odometry has found its
-        own map again, so that its pose jumped.
+        `segment` is a number for all that one map of the odometry holds; `jumped`: the odometry has found its own map
+        again, so that its pose jumped.
         """
         last = self.newest
         island = self._island(segment)
@@ -109,7 +109,7 @@ class PlaceGraph(Generic[V]):
         return added
 
     def _adjust(self, number: int, view: V, eyes: Eyes[V]) -> None:
-        """Improves the newest nodes by what their views share, where the sensor's kind knows of such."""
+        """Improves the newest nodes by what their views share, if the sensor's kind supports it."""
 
     def _island(self, segment: int) -> int:
         """Returns the island of a segment: its own, or a new one for a segment that is new."""
@@ -142,7 +142,7 @@ class PlaceGraph(Generic[V]):
     def _beside(self, number: int, eyes: Eyes[V]) -> int:
         """Measures a new node against nodes a little before it, beyond its neighbour; returns how many it could.
 
-        Odometry errs little from there to here, so a sight that says otherwise is of a pattern that repeats.
+        Odometry errs little from there to here, so a sight that contradicts it is of a pattern that repeats.
         """
         new, found = self.nodes[number], 0
         recent = [k for k in self.nodes if k < number and self.nodes[k].island == new.island][-WINDOW:-1]
@@ -245,7 +245,7 @@ class PlaceGraph(Generic[V]):
         ]  # fmt: skip
 
     def _expected(self, k: int, number: int, seen: Sighting) -> bool:
-        """Tells whether a sight is where the map, with its covariance, has it."""
+        """Returns whether a sight is where the map, with its covariance, has it."""
         known, new = self.nodes[k], self.nodes[number]
         if new.island not in self.tied:
             return False
@@ -257,7 +257,7 @@ class PlaceGraph(Generic[V]):
         return bool(off @ np.linalg.solve(covariance, off) < FAR)
 
     def _confirmed(self, k: int, number: int, seen: Sighting) -> bool:
-        """Notes a surprise; tells whether another view said the same."""
+        """Stores a surprise; returns whether another view agrees with it."""
         known, new = self.nodes[k], self.nodes[number]
         T_map_odom = known.T @ seen.T_known_seen @ invert(new.T_odom)
         agreeing = any(s.agrees(k, number, new, T_map_odom) for s in self.surprises)
@@ -291,7 +291,7 @@ class PlaceGraph(Generic[V]):
     # -- the sensor --------------------------------------------------------------------------------------
 
     def covariance_at(self, T_odom: Matrix, covariance_odom: Matrix) -> Matrix:
-        """Returns the covariance (6, 6) in the map of a pose that the odometry says."""
+        """Returns the covariance (6, 6) in the map of a pose of the odometry."""
         newest = self.newest
         if newest is None:
             return covariance_odom

@@ -55,9 +55,9 @@ class Eyes(Protocol[V]):
         """Returns how differently the sensor sees from two poses."""
 
     def sight(self, nodes: Mapping[int, Node[V]], known: int, seen: int, expected: bool) -> Sighting | str:
-        """Measures a node against a known one, or says why that cannot be believed.
+        """Measures a node against a known one, or returns why the result is not trusted.
 
-        `expected` says that the nodes' poses tell where to look.
+        `expected`: the nodes' poses predict the result.
         """
 
 
@@ -73,7 +73,7 @@ class Index(Protocol[W]):
 
 @dataclass(frozen=True, eq=False)
 class Surprise:
-    """A sight that the map did not expect, of node `known` by node `seen`; it needs another that says the same."""
+    """A sight that the map did not expect, of node `known` by node `seen`; it needs another that agrees."""
 
     seen: int
     known: int
@@ -81,21 +81,21 @@ class Surprise:
     T_map_odom: Matrix
 
     def agrees(self, known: int, number: int, new: Node[Any], T_map_odom: Matrix) -> bool:
-        """Tells whether another surprise, of node `known` by a new one, says the same."""
+        """Returns whether another surprise, of node `known` by a new one, agrees."""
         if self.island != new.island or (self.seen, self.known) == (number, known):
             return False
         return alike(self.T_map_odom @ new.T_odom, T_map_odom @ new.T_odom)
 
 
 def alike(T_a: Matrix, T_b: Matrix) -> bool:
-    """Tells whether two poses found for one view say the same."""
+    """Returns whether two poses found for one view agree."""
     off = se3.log(invert(T_a) @ T_b)
     return bool(np.linalg.norm(off[:3]) < AGREE[0] and np.linalg.norm(off[3:]) < AGREE[1])
 
 
 @dataclass(eq=False)
 class Added:
-    """Tells what became of a keyframe: loops found from it, and why views that were compared with were refused."""
+    """Holds the result for a keyframe: loops found from it, and why views that were compared with were refused."""
 
     node: bool = False
     loops: int = 0

@@ -55,7 +55,7 @@ class CameraEyes:
         return view_distance(T_a, T_b, self.depth)
 
     def sight(self, nodes: Mapping[int, Node[View]], known: int, seen: int, expected: bool) -> Sight | str:
-        """Features tell where a view is; where they are too few, it is looked for where the map expects it."""
+        """Features place a view; where they are too few, it is looked for where the map expects it."""
         one, other = nodes[known].view, nodes[seen].view
         assert one is not None
         assert other is not None
@@ -90,7 +90,7 @@ class VisualGraph(PlaceGraph[View]):
     def add(self, keyframe: Keyframe, fitter: Fitter, found_again: bool) -> Added:
         """Takes a keyframe of the odometry, and what fits its poses.
 
-        `found_again` says that the odometry has found its own map again, so that its pose jumped.
+        `found_again`: the odometry has found its own map again, so that its pose jumped.
         """
         return self.grow(
             keyframe.stamp, keyframe.T_world_camera, keyframe.covariance, keyframe.segment, found_again,

@@ -39,8 +39,8 @@ class VisualSlam(Operator):
 
     In front runs the odometry of `VisualOdometry`, whose poses stay smooth; what is corrected is the transform from map
     to odometry frame (REP 105). Keyframes that look alike, or that the map has near each other, are compared by
-    features and depth; a loop is closed only where both agree, and where it is a surprise only when a second view says
-    the same and neither rests on one plane, since the patterns of floors and walls repeat. A pose graph with a robust
+    features and depth; a loop is closed only where both agree; an unexpected one also needs a second view that agrees,
+    neither of them resting on one plane, since the patterns of floors and walls repeat. A pose graph with a robust
     kernel moves all keyframes accordingly; the newest, and the points that three or more have seen, are adjusted
     together at every keyframe. A place that was seen before keeps its old view, so the map grows with the space that
     is seen.

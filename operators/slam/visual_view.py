@@ -76,7 +76,7 @@ class View:
 
     @cached_property
     def steady(self) -> NDArray[np.bool_]:
-        """Tells which features (N,) lie on a smooth surface, not on an edge, where either depth may do."""
+        """Returns which features (N,) lie on a smooth surface, not on an edge, where either depth may do."""
         known = np.isfinite(self.points[:, 2])
         h, w = self.surface.inverse_depth.shape
         points = np.where(known[:, None], self.points, np.float32(1.0)).astype(np.float64)

@@ -1,4 +1,4 @@
-"""The pose of a scan in a map of planes, with what the scan says about it and what it does not."""
+"""The pose of a scan in a map of planes, with its information matrix and the unobservable directions."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ ITERATIONS = 20
 _KERNEL = 3.0  # standard deviations at which a residual loses three quarters of its weight
 _WIDER = 3.0  # times that, in the first iteration
 _NARROWS = 0.6  # per iteration
-_LEANS = 3.0  # standard deviations of a normal: a plane tells of a direction that leans so far out of it
-_ENOUGH = 5.0  # as many planes across a direction tell enough of it
-_LITTLE = 0.01  # what is left of the information on a direction of which less is told
+_LEANS = 3.0  # standard deviations of a normal: a plane constrains a direction that leans so far out of it
+_ENOUGH = 5.0  # as many planes across a direction constrain it enough
+_LITTLE = 0.01  # share kept of the information on a direction with fewer
 _STILL = (1e-3, 1e-4)  # metres, radians: a step less than this ends the iterations
 
 Motion = Callable[[Matrix], Vector]
@@ -41,11 +41,10 @@ class Prior:
 class Fit:
     """A pose `T` (4, 4) of the sensor in the map.
 
-    `information` (6, 6) is the scan's own, of a right perturbation, with little on the directions it tells too little
-    of: those are `blind` (K, 6), unit twists. `inliers` is the share of the `paired` points that agree with their
-    planes;
-    `known` that of all points in places of which the map knows something; `rmse` is over the inliers, metres.
-    `births` (K,) are those of the planes, with `weights` (K,).
+    `information` (6, 6) is the scan's own, of a right perturbation, reduced along the directions that it constrains
+    too little: those are `blind` (K, 6), unit twists. `inliers` is the share of the `paired` points that agree with
+    their planes; `known` that of all points in mapped places; `rmse` is over the inliers, metres. `births` (K,) are
+    those of the planes, with `weights` (K,).
     """
 
     T: Matrix
@@ -74,7 +73,7 @@ def fit(scan: Scan, planes: PlaneMap, prior: Prior, motion: Motion, noise: float
 
     `motion` gives the velocity (6,) during the scan that a pose means; `noise` is the standard deviation of a range,
     metres. The kernel is Geman and McClure's, narrowing, as in Vizzo et al., "KISS-ICP", 2023. Directions without
-    support are told by planes that lean out of them: Tuna et al., "X-ICP", 2023; there the prediction stands.
+    support are constrained by planes that lean out of them: Tuna et al., "X-ICP", 2023; there the prediction stands.
     """
     points, offsets = scan.points[scan.sample], None if scan.offsets is None else scan.offsets[scan.sample]
     T = prior.T
@@ -142,7 +141,7 @@ def _equations(points: Array, planes: PlaneMap, T: Matrix, width: float, noise: 
 
 
 def _blind(system: _Equations, points: Array) -> Array:
-    """Returns unit twists (K, 6) that too few planes tell of: translations first, then rotations about the sensor."""
+    """Returns unit twists (K, 6) that too few planes constrain: translations first, then rotations about the sensor."""
     own, slopes = points[system.pairs.points], system.pairs.slopes
     deviation = np.sqrt(np.einsum("ij,ij->i", system.J[:, :3], system.J[:, :3]))
     lean = system.J / np.maximum(deviation, 1e-12)[:, None]

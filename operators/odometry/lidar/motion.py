@@ -1,4 +1,4 @@
-"""Says how a LiDAR moved, how it will, and how far that can be wrong."""
+"""Motion of a LiDAR: the measured one, its prediction, and the covariance of both."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class LidarMotion:
 def corrected(T: Matrix, information: Matrix, spread: Matrix, of_map: Matrix, of_last: Matrix) -> tuple[Matrix, Matrix]:
     """Returns the covariance of a pose fitted to a map, as left perturbation, and the share without the map's.
 
-    Where the scan tells of the pose, the error is that of the map (`of_map`), where it does not, that of the last pose
+    Along directions that the scan constrains, the error is that of the map (`of_map`), elsewhere that of the last pose
     (`of_last`) and of the motion since (`spread`, a right perturbation). Both errors are taken as one, since they have
     the same past.
     """

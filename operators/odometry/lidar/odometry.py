@@ -21,14 +21,14 @@ _LEVELS = {State.PREDICTED: Level.WARN, State.LOST: Level.ERROR}
 
 
 class LidarOdometry(Operator):
-    """Tracks a LiDAR by the planes of a map that it makes of its own scans; the first scan is the origin.
+    """Tracks a LiDAR by the planes of a map built from its scans; the first scan is the origin.
 
     A scan whose points have `time_offsets`, or get them by `sweep`, is deskewed with the velocity that its own pose
     means. Without either, its pose is that of the middle of the turn rather than that of the stamp. Scans that measure
     nothing are bridged with the velocity so far, for `patience`; then the LiDAR is lost, there are no poses, and it is
     looked for within three metres of where it was, in any heading; after `give_up` a new map begins there. The
     covariance is that of the whole way: it grows when the LiDAR leaves what it has mapped and with every bridge, and
-    along directions that the surroundings tell nothing of (a bare corridor), which the status names. A scan that
+    along directions that the surroundings do not constrain (a bare corridor), which the status names. A scan that
     repeats the last one means that the LiDAR stands: where a sensor may hang, ScanWatch before this operator holds it
     back.
 
@@ -65,7 +65,7 @@ class LidarOdometry(Operator):
     acceleration: float = Param(10.0, gt=0, doc="standard deviation from constant velocity", unit="m/s²")
     angular_acceleration: float = Param(15.0, gt=0, doc="the same of turning", unit="rad/s²")
     start_speed: float = Param(30.0, gt=0, doc="how fast it may move when first seen", unit="m/s")
-    min_known: float = Param(0.2, ge=0, le=1, doc="least share of a scan in places that the map knows")
+    min_known: float = Param(0.2, ge=0, le=1, doc="least share of a scan in mapped places")
     min_inliers: float = Param(0.5, ge=0, le=1, doc="least share of the points on planes that agree with them")
     patience: float = Param(0.5, ge=0, doc="time bridged by prediction", unit="s")
     give_up: float = Param(2.0, ge=0, doc="and time lost until a new map begins", unit="s")

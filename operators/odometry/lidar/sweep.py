@@ -1,4 +1,4 @@
-"""When a turning LiDAR measured each point, where its messages do not say: the azimuth tells."""
+"""Times of a turning LiDAR's points, derived from their azimuth if the messages hold none."""
 
 from __future__ import annotations
 

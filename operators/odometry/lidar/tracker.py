@@ -1,4 +1,4 @@
-"""Says where a LiDAR is, scan by scan, in a map that it makes; and whether that is known."""
+"""Tracks a LiDAR scan by scan in a map built from its scans, and detects when it is lost."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class TrackerConfig:
 class Tracked:
     """The pose `T` (4, 4) of the sensor, covariance (6, 6) of its right perturbation, velocity (6,) in its axes.
 
-    `blind` (K, 6) are unit twists in the sensor's axes that the scan told nothing of. `velocity_covariance` is None
+    `blind` (K, 6) are unit twists in the sensor's axes that the scan did not constrain. `velocity_covariance` is None
     where the velocity was not measured. `points` (N, 3) are the scan's, thinned and deskewed, in the sensor's frame at
     the stamp; None where the pose or the velocity was not measured.
     """
@@ -79,7 +79,7 @@ class LidarTracker:
     """Fits every scan to a map of planes, starting from constant velocity, and adds it to the map.
 
     Bad scans are bridged by the prediction; after `patience` the sensor is lost and looked for around where it was;
-    after `give_up` a new map begins at the last pose, and the covariance says how far that may be wrong.
+    after `give_up` a new map begins at the last pose, and the covariance holds the error of that.
     """
 
     def __init__(self, config: TrackerConfig) -> None:
@@ -192,7 +192,7 @@ class LidarTracker:
         min_known = max(config.min_known, 0.5) if lost else config.min_known
         min_inliers = max(config.min_inliers, 0.7) if lost else config.min_inliers
         if found.known < min_known:
-            return f"{found.known:.0%} of the scan lie in places that the map knows"
+            return f"{found.known:.0%} of the scan lie in mapped places"
         if found.paired < FEWEST / 2:
             return f"{found.paired} points lie on planes of the map"
         if found.inliers < min_inliers:
@@ -215,7 +215,7 @@ class LidarTracker:
         information = found.information / config.correlation
         covariance, own = corrected(found.T, information, spread, of_map, motion.covariance)
         dt = motion.seconds(stamp)
-        if state is State.RELOCALISED:  # what was crossed unseen tells nothing of the velocity
+        if state is State.RELOCALISED:  # a way crossed unseen is no evidence on the velocity
             self._motion = LidarMotion(stamp, found.T, np.zeros(6), covariance)
             points = None
         else:
@@ -308,4 +308,4 @@ _SCAN = ("points", "offsets", "sample", "unusable")
 def _told_nothing(twist: Vector) -> str:
     axis = twist[:3] if twist[:3].any() else twist[3:]
     x, y, z = (0.0 if abs(c) < 5e-3 else c for c in axis * np.sign(axis[np.argmax(np.abs(axis))]))
-    return f"nothing tells of {'motion along' if twist[:3].any() else 'turning about'} ({x:.2f}, {y:.2f}, {z:.2f})"
+    return f"nothing constrains {'motion along' if twist[:3].any() else 'turning about'} ({x:.2f}, {y:.2f}, {z:.2f})"

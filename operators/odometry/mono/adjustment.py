@@ -23,7 +23,7 @@ NEAR = 1e-3  # of the map's unit; nearer points are behind or in the lens
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Says who saw what where: frames (S,) and points (S,) by index, pixels (S, 2)."""
+    """Holds observations: frames (S,) and points (S,) by index, pixels (S, 2)."""
 
     frames: NDArray[np.int64]
     points: NDArray[np.int64]

@@ -51,7 +51,7 @@ class MonoMap:
 
     @property
     def begun(self) -> bool:
-        """Tells whether there is anything to track."""
+        """Returns whether there is anything to track."""
         return len(self.numbers) > 0
 
     def find(self, numbers: Numbers) -> tuple[NDArray[np.int64], Mask]:
@@ -72,7 +72,7 @@ class MonoMap:
     # -- what changes it -----------------------------------------------------------------------------------
 
     def with_view(self, view: View, capacity: int, window: int) -> "MonoMap":
-        """Adds a keyframe, forgets the old one that its neighbours make up for, and points that nobody saw."""
+        """Adds a keyframe, forgets the old one that its neighbours make up for, and points without a view."""
         views = [*self.views, view]
         if len(views) > capacity:
             old = views[: len(views) - window]
@@ -91,7 +91,7 @@ class MonoMap:
         return replace(self, numbers=all_numbers[order], points=np.concatenate([self.points[fresh], points])[order])
 
     def without(self, numbers: Numbers) -> "MonoMap":
-        """Forgets points, and that anybody saw them."""
+        """Removes points, with their observations in all views."""
         kept = ~np.isin(self.numbers, numbers)
         views = []
         for view in self.views:

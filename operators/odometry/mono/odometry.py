@@ -28,13 +28,13 @@ from operators.odometry.tracking import Status, TrackResult
 class MonoVisualOdometry(Operator):
     """Tracks one camera by its corners; where the camera was when the first map began is the origin.
 
-    Two views with parallax begin a map; until then `status` says *initialising* with the reason (the view has hardly
+    Two views with parallax begin a map; until then `status` is *initialising*, with the reason (the view has hardly
     changed, pure rotation, too little texture), and there is no odometry. From then on the pose of the camera's
-    optical frame comes at every frame, and `status` says what it rests on, as VisualOdometry's does. A lost camera
+    optical frame comes at every frame, and `status` names its basis, as VisualOdometry's does. A lost camera
     looks for its view among the keyframes; after `give_up` it begins a new map where the prediction puts it.
 
-    One camera sees no scale. Without `scale` and `depth` the poses are in a unit of the map's own (about the depth of
-    the first view), and the message says so: its frame is `unscaled_frame`, the variances of its position are infinite,
+    One camera sees no scale. Without `scale` and `depth` the poses are in an arbitrary unit (about the depth of the
+    first view), and the message shows it: its frame is `unscaled_frame`, the variances of its position are infinite,
     and it has no linear velocity. Two inputs give metres, each alone or both together:
 
     - `scale`, an odometry in metres of anything rigidly attached, over the ways between keyframes. Wheels are the
@@ -43,11 +43,11 @@ class MonoVisualOdometry(Operator):
     - `depth`, an image in metres every now and then, over the points of the map that it shows: the median of what their
       depths are by what they are in the map. It may be of another camera and another rate, and need not cover the view.
 
-    The first that tells brings the map to metres and the path to `odometry_frame`, which begins where the map did;
-    from then on the scale is a state with a variance that grows from keyframe to keyframe, and what it is corrected by
-    moves the map about the camera, so that no pose jumps. Depth that contradicts a known scale is left out, until five
-    images in succession do so alike; the way so far then counts as wrong by that factor. `status` tells how well the
-    scale is known and what became of each depth image, and the covariance of the position holds what is left.
+    The first that gives a scale brings the map to metres and the path to `odometry_frame`, which begins where the map
+    did; from then on the scale is a state with a variance that grows from keyframe to keyframe, and its corrections
+    move the map about the camera, so that no pose jumps. Depth that contradicts a known scale is left out, until five
+    images in succession do so alike; the way so far then counts as wrong by that factor. `status` gives the uncertainty
+    of the scale and the use of each depth image, and the covariance of the position holds what is left.
 
     Methods: Mur-Artal et al., "ORB-SLAM", 2015 (initialisation); Strasdat et al., "Scale drift-aware large scale
     monocular SLAM", 2010.
@@ -187,7 +187,7 @@ def _camera_by(odometry: Odometry, image: Image, extrinsics: Transforms | None) 
     T = odometry.matrix()
     if extrinsics is None and odometry.child_frame != image.frame:
         raise ValueError(
-            f"scale poses {odometry.child_frame!r}, and without extrinsics nothing says where {image.frame!r} is on it"
+            f"scale poses {odometry.child_frame!r}, and extrinsics are needed for the place of {image.frame!r} on it"
         )
     if not np.isfinite(T).all():
         return None
@@ -200,7 +200,7 @@ def _camera_by(odometry: Odometry, image: Image, extrinsics: Transforms | None) 
 def _metric(
     depth: DepthImage, depth_info: CameraInfo | None, image_info: CameraInfo, extrinsics: Transforms | None
 ) -> MetricDepth:
-    """Returns a depth image with its place beside the camera. Raises ValueError where nothing tells that."""
+    """Returns a depth image with its place beside the camera. Raises ValueError if that place is unknown."""
     if depth_info is None:
         raise ValueError("depth is connected, but not depth_info, without which its pixels have no rays")
     check_calibration("depth", depth, depth_info)

@@ -32,7 +32,7 @@ PERSISTENT = 5  # images in succession that contradict it alike are believed
 
 
 class RangingUse(StrEnum):
-    """Says what became of a depth image."""
+    """Outcomes of a depth image."""
 
     FOUND = "gives the scale"
     TAKEN = "agrees"
@@ -91,7 +91,7 @@ def ranged(
     memory: RangingMemory,
     config: RangingConfig,
 ) -> Ranged:
-    """Returns what a depth image says of the scale of points (N, 3) that the camera sees from a pose in their unit.
+    """Returns the scale, by a depth image, of points (N, 3) that the camera sees from a pose in their unit.
 
     Without a pose, or where the image shows nothing, the scale stays what it is, as it does where the depth disagrees
     with itself, or with a known scale; but several in succession that contradict that alike are believed.

@@ -12,7 +12,7 @@ from dataflow.messages.geometry import invert
 from operators.geometry.se3 import Matrix
 from operators.odometry.mono.map import View
 
-FEWEST_METRES = 0.08  # that the reference must have come before it tells anything
+FEWEST_METRES = 0.08  # that the reference must have moved before it is used
 WANDER = 0.01  # share by which the map's scale may go wrong from keyframe to keyframe
 ROUGH = 0.01  # metres that the reference may be off over any way
 LARGEST = 1.3  # factor by which one correction may change a known scale

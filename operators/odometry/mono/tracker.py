@@ -2,7 +2,7 @@
 
 Corners are tracked by Lucas-Kanade from frame to frame. Two views of them give the first points; the pose then comes by
 RANSAC PnP from the points, and keyframes triangulate new ones and are adjusted together. One camera sees no scale: the
-map has a unit of its own until another odometry tells how far the camera came, or a depth image how far points are.
+map has an arbitrary unit until another odometry gives the camera's motion in metres, or a depth image distances.
 """
 
 from dataclasses import dataclass, field, replace
@@ -79,7 +79,7 @@ class MonoOdometry:
 
         `T_reference` (4, 4), metres, is where another odometry has the camera, in any frame that does not jump.
         `depth` is of this stamp, or of one after the last frame's; its camera's K_color is that of the image as given.
-        One that was given before says nothing new. Raises ValueError for a wrong shape or type, a size that changed, or
+        One that was given before is ignored. Raises ValueError for a wrong shape or type, a size that changed, or
         a stamp that does not increase.
         """
         frame = self._look(image, stamp, T_reference)

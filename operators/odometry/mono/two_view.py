@@ -25,7 +25,7 @@ SHARP = 0.3  # share of the corners that must become points
 
 
 class Unsolved(StrEnum):
-    """Says why two views do not determine a motion."""
+    """Reasons for which two views do not determine a motion."""
 
     FEW = "too few corners are seen by both views"
     STILL = "the view has hardly changed"
@@ -158,7 +158,7 @@ def _motions(E: Matrix) -> list[Matrix]:
 
 
 def _motions_of_plane(H: Matrix, K: Matrix) -> list[Matrix]:
-    """Each solution with the translation as it stands: its normal tells which side the plane is on."""
+    """Each solution with the translation as it stands: its normal gives the side of the plane."""
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, K)
     found = [(R, t) for R, t in zip(rotations, translations, strict=True) if np.linalg.norm(t) > 1e-6]
     return [_motion(R, np.asarray(t)) for R, t in found]

@@ -52,7 +52,7 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class Freedom:
-    """Says how far a pose may still be off before it is refined: standard deviations, metres and radians."""
+    """Holds the uncertainty of a pose before it is refined: standard deviations, metres and radians."""
 
     translation: float = 1.0
     rotation: float = 1.0
@@ -244,7 +244,7 @@ class Alignment:
 
     @cached_property
     def normals(self) -> tuple[Normal, ...]:
-        """The state of every term; worked out when somebody asks, for a rough pose needs none."""
+        """The state of every term; computed on first access, since a rough pose needs none."""
         return self.last or tuple(term.linearise(self.T_world_camera) for term in self.terms)
 
     @property

@@ -36,7 +36,7 @@ class RgbdCamera:
     T_color_depth: Matrix = field(init=False)
 
     def check_same(self, other: "RgbdCamera") -> None:
-        """Raises ValueError unless another has the same geometry: what was seen through this one says nothing of it."""
+        """Raises ValueError unless another has the same geometry: views are comparable only within one calibration."""
         for name in ("K_color", "K_depth", "T_depth_color"):
             if not np.array_equal(getattr(self, name), getattr(other, name)):
                 raise ValueError(f"the calibration changed ({name} is another): one camera, one calibration")

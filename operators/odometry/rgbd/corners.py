@@ -30,7 +30,7 @@ class Corners:
 
 
 def depths_at(pixels: Pixels, layers: Sequence[Layer], near: float, far: float) -> tuple[Points, NDArray[np.bool_]]:
-    """Returns the points (N, 3) of pixels (N, 2), each by the first layer that knows it, and which are known."""
+    """Returns the points (N, 3) of pixels (N, 2), each by the first layer with depth there, and a mask of the known."""
     points, known = np.zeros((len(pixels), 3)), np.zeros(len(pixels), np.bool_)
     for camera, depth in layers:
         missing = np.flatnonzero(~known)

@@ -40,7 +40,7 @@ class Evidence:
 
     @property
     def certain(self) -> bool:
-        """Tells whether the view is that of this place: what only looks like it differs in shape or in pattern."""
+        """Returns whether the view is that of this place: what only looks like it differs in shape or in pattern."""
         return (
             self.points >= FEWEST
             and self.overlap >= OVERLAP

@@ -15,7 +15,7 @@ from operators.odometry.rgbd.surface import Surface, scaled_intrinsics
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """An image and a depth image, reduced. What a flaw makes useless is zero."""
+    """An image and a depth image, reduced. Pixels that a flaw makes useless are zero."""
 
     stamp: int
     gray: Gray

@@ -58,7 +58,7 @@ class Keyframe:
 
     @property
     def empty(self) -> bool:
-        """Tells whether nothing can be measured against it."""
+        """Returns whether nothing can be measured against it."""
         return len(self.points) < 6 and self.surface.coverage < 0.05
 
 

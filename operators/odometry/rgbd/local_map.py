@@ -12,13 +12,13 @@ from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.surface import Surface
 
 RECENT = 5  # newest keyframes, never forgotten
-EARLIER = 6  # keyframes back, at most, to one that tells what has moved since
+EARLIER = 6  # keyframes back, at most, to one that reveals motion since
 REACH = 0.7  # radians of view change beyond which two views share too little to be compared
 DRIFTED = 0.06  # metres: no view is laid on the surfaces of keyframes that the odometry may have drifted farther from
 
 
 def drifted(a: Keyframe, b: Keyframe) -> bool:
-    """Tells whether the odometry may have drifted far from one keyframe to the other: see DRIFTED."""
+    """Returns whether the odometry may have drifted far from one keyframe to the other: see DRIFTED."""
     return abs(a.place_variance - b.place_variance) >= DRIFTED**2
 
 
@@ -56,7 +56,7 @@ class LocalMap:
         self.keyframes = self.elsewhere
 
     def join(self, known: Keyframe, T_known_newest: Matrix) -> None:
-        """Moves the newest segment rigidly to where one of its motions in an older segment's world says it is."""
+        """Moves the newest segment rigidly as given by one of its motions in an older segment's world."""
         segment = self.newest.segment
         self.keyframes = [
             replace(

@@ -34,8 +34,8 @@ class Movers:
     ) -> "Movers":
         """Compares points (N, 3) of a view, on whose grid of a shape (h, w) K projects, with reference surfaces.
 
-        A tile moves where most of its points lie nearer than any of the references allows: an old one tells what
-        moves slowly. What lies farther was hidden by something that has left, and stands.
+        A tile moves where most of its points lie nearer than any of the references allows: an old one reveals
+        slow motion. Points that lie farther were hidden by something that has left, and are static.
         """
         rows, columns = _tiles(shape)
         tile = _tile_of(points, K, (rows, columns))

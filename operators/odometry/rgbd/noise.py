@@ -1,4 +1,4 @@
-"""Says how noisy a camera's measurements are, learnt from the residuals of the frames so far."""
+"""Noise of a camera's measurements, learnt from the residuals of the frames so far."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ MEDIAN_OF_ONE = 0.455  # of one
 class Noise:
     """Standard deviations: of a feature track, working pixels, and of a depth as a share of what was declared.
 
-    A gate of three sigmas tells what moves from what stands only where sigma is that of this camera: tracks of a
+    A gate of three sigmas separates moving from static points only if sigma is that of this camera: tracks of a
     registered camera err by 0.2 pixels, those of an unregistered one by several.
     """
 

@@ -28,7 +28,7 @@ def camera_of(image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transf
 
 
 def same(known: Calibration | None, given: Calibration) -> bool:
-    """Tells whether these are the very messages that are known, so that nothing has to be compared."""
+    """Returns whether these are the very messages that are known, so that nothing has to be compared."""
     return known is not None and all(a is b for a, b in zip(known, given, strict=True))
 
 
@@ -36,7 +36,7 @@ class VisualOdometry(Operator):
     """Tracks an RGB-D camera by its features and its depth; the first frame's depth camera is the origin.
 
     The pose is that of the depth camera's optical frame, at every frame, also while nothing can be measured:
-    then it follows the motion so far and its covariance grows. `status` says at every frame what the pose rests on:
+    then it follows the motion so far and its covariance grows. `status` names at every frame the basis of the pose:
     tracking, relocalised, predicted or lost, and why. A lost camera looks for its view among the keyframes; where it
     sees something that is not among them for longer than `patience`, it begins a new map at the predicted pose, and
     joins it to the old one when that is seen again. An image that is black or repeats the last one is not used. The

@@ -40,7 +40,7 @@ class StereoRig:
             raise ValueError(f"StereoRig.baseline must be positive metres, got {self.baseline}")
 
     def check_same(self, other: "StereoRig") -> None:
-        """Raises ValueError unless another has the same geometry: what was seen through this one says nothing of it."""
+        """Raises ValueError unless another has the same geometry: views are comparable only within one calibration."""
         if not np.array_equal(self.K, other.K) or self.baseline != other.baseline:
             raise ValueError("the calibration changed (K or the baseline is another): one rig, one calibration")
 
@@ -73,7 +73,7 @@ class StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Says who saw what where: frames (S,) and points (S,) by index, sightings (S, 3) in pixels."""
+    """Holds observations: frames (S,) and points (S,) by index, sightings (S, 3) in pixels."""
 
     frames: NDArray[np.int64]
     points: NDArray[np.int64]

@@ -35,7 +35,7 @@ class StereoMap:
         return [k for k in self.keyframes if k.segment != self.segment]
 
     def due(self, T_world_camera: Matrix, distance: float) -> bool:
-        """Tells whether a view differs from the newest keyframe's by an angle in radians, or that of the baseline."""
+        """Returns whether a view differs from the newest keyframe's by an angle in radians, or that of the baseline."""
         newest = self.keyframes[-1] if self.keyframes else None
         return newest is None or view_distance(newest.T_world_camera, T_world_camera, TYPICAL * self.unit) > distance
 
@@ -47,12 +47,12 @@ class StereoMap:
         return replace(self, keyframes=tuple(kept))
 
     def begun_anew(self, stamp: int) -> StereoMap:
-        """Says that the next keyframe's place among the others is unknown since a stamp."""
+        """Marks the next keyframe's place among the others as unknown since a stamp."""
         return replace(self, apart_since=stamp, recalls=0)
 
     def placed(self, known: StereoKeyframe, T_known_newest: Matrix | None) -> StereoMap:
-        """Moves the newest segment rigidly to where one of its motions into a keyframe's world says that it is; without
-        such a motion, forgets it."""
+        """Moves the newest segment rigidly as given by one of its motions into a keyframe's world; without such a
+        motion, forgets it."""
         if known.segment == self.segment:
             return replace(self, recalls=0)
         kept = [k if k.segment != self.segment else _moved(k, known, T_known_newest) for k in self.keyframes]

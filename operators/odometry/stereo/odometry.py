@@ -20,7 +20,7 @@ from operators.odometry.stereo.tracker import StereoOdometry, StereoState
 class StereoVisualOdometry(Operator):
     """Tracks a rectified stereo pair by its corners; the first left camera is the origin.
 
-    The pose is that of the left camera's optical frame, at every frame; `status` says what it rests on, as
+    The pose is that of the left camera's optical frame, at every frame; `status` names its basis, as
     VisualOdometry's does. The images must be rectified: rows of the two correspond. A constant error of the
     disparities, as an imperfect rectification leaves it, is estimated on the way.
 

@@ -14,7 +14,7 @@ Watches = tuple[Watch, Watch]
 
 @dataclass(frozen=True, eq=False)
 class StereoPair:
-    """A rectified pair in grey at a stamp; `flaw` says why it is not used, where it is not."""
+    """A rectified pair in grey at a stamp; `flaw` is the reason if it is not used."""
 
     stamp: int
     left: Gray

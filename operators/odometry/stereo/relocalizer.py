@@ -1,8 +1,8 @@
-"""Finds the view of a lost stereo camera among pairs that were kept, by what finds that of an RGB-D camera.
+"""Finds the view of a lost stereo camera among pairs that were kept, by the search of an RGB-D camera.
 
-Pairs are kept reduced, and their dense depth and features are made when a lost camera first asks for them. What finds
-a view, and judges it, is made for rooms: distances that agree do so within centimetres. In a street they cannot, and
-need not, so everything is brought to a scene whose things are typically `TYPICAL` away.
+Pairs are kept reduced, and their dense depth and features are made when a lost camera first asks for them. The
+search, and its judgement of a view, is made for rooms: distances that agree do so within centimetres. In a street they
+cannot, and need not, so everything is brought to a scene whose things are typically `TYPICAL` away.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class StereoRelocalizer:
             yield FoundAgain(T, covariance, fit.inliers, by)
 
     def believed(self, view: StereoKeyframe, known: Sequence[StereoKeyframe], unit: float) -> bool:
-        """Tells whether shape and brightness of what a view and keyframes of its segment see make sure of its pose."""
+        """Returns whether shape and brightness in a view and keyframes of its segment confirm its pose."""
         frame = self._frame(view, unit)
         if frame.depth_flaw is not None:
             return False

@@ -14,7 +14,7 @@ class StereoOdometryConfig:
     iterations: int = 4
     sigma: float = 0.3  # of a sighting, pixels
     row_error: float = 1.5  # pixels by which a match may leave its row
-    min_disparity: float = 1.0  # pixels: farther points tell nothing of translation
+    min_disparity: float = 1.0  # pixels: farther points do not constrain translation
     acceleration: float = 5.0  # m/s²
     angular_acceleration: float = 2.0  # rad/s²
     decay_s: float = 1.0  # of the velocity while nothing is measured

@@ -183,7 +183,7 @@ class StereoOdometry:
 
     @property
     def _lost(self) -> bool:
-        """Tells whether nothing was measured for longer than the patience."""
+        """Returns whether nothing was measured for longer than the patience."""
         assert self._state.motion is not None
         return self._state.motion.blind_s > self.config.patience_s
 
@@ -228,7 +228,7 @@ class StereoOdometry:
         return None
 
     def _supersedes(self, found: FoundAgain, agree: Mask) -> bool:
-        """Returns whether a pose that was found says more than the corners that agree on another."""
+        """Returns whether a pose that was found has more support than the corners that agree on another."""
         elsewhere = found.keyframe.segment != self._state.map.segment
         return elsewhere or found.features > int(np.count_nonzero(agree))
 

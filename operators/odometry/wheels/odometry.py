@@ -77,7 +77,7 @@ class WheelOdometry(Operator):
         self._begin()
 
     def process(self, wheels: WheelTicks | JointState) -> dict[str, Any]:
-        """Raises ValueError where a wheel is missing, or nothing tells its radius or resolution."""
+        """Raises ValueError where a wheel is missing, or its radius or resolution is unspecified."""
         now = reading(wheels, (self.left, self.right), self.radius, self.ticks_per_turn)
         if self._drive is None:
             noise = DriveNoise(self.slip, self.scale_error, self.track_error, now.step)

@@ -30,7 +30,7 @@ def reading(
     message: WheelTicks | JointState, sides: tuple[Sequence[str], Sequence[str]], radius: float | None,
     ticks_per_turn: float | None,
 ) -> Reading:  # fmt: skip
-    """Returns what a message tells of both sides, each the mean of its wheels.
+    """Returns a message's reading of both sides, each the mean of its wheels.
 
     The message's own radii and resolution go before `radius` (metres) and `ticks_per_turn`. Raises ValueError where a
     wheel or one of them is missing.

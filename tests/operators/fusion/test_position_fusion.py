@@ -110,7 +110,7 @@ def test_a_camera_that_was_knocked_is_named_and_left_out() -> None:
         texts = dict(zip(status.names, status.messages, strict=True))
         expected = "sensors contradict each other" if status.stamp > 2_000_000_000 else "sensors agree"
         assert texts["fusion"] == expected
-    assert texts["sightings/right"] in ("contradicts the others", "worse than it says")
+    assert texts["sightings/right"] in ("contradicts the others", "covariance too small")
     assert texts["sightings/lidar"] == "used"
 
 

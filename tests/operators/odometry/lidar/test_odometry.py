@@ -173,7 +173,7 @@ def test_a_body_without_extrinsics_is_refused() -> None:
 
 def test_a_bare_corridor_tells_nothing_of_the_way_along_it_and_the_covariance_says_so() -> None:
     played = play(LidarOdometry(), {"cloud": [scan(CORRIDOR, along, k) for k in range(12)]})
-    assert all("nothing tells of motion along (1.00, 0.00" in text for text in texts(played)[2:])
+    assert all("nothing constrains motion along (1.00, 0.00" in text for text in texts(played)[2:])
     last = played["odometry"][-1]
     assert isinstance(last, Odometry)
     assert last.pose_covariance is not None
