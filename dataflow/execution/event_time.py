@@ -6,7 +6,7 @@ from dataflow.execution.admission import EventClock
 from dataflow.sync import NEVER
 
 OWN_CLOCK = 1_000_000_000
-"""A device whose first stamp is farther (ns) from event time has a clock of its own, which then counts."""
+"""A device whose first stamp is farther (ns) from event time has a separate clock, which then counts."""
 
 
 class EventTime:
@@ -28,8 +28,8 @@ class EventTime:
         return 0 if stamp <= self._newest else max(0, stamp - self._clock() - self._shift)
 
     def see(self, stamp: int) -> None:
-        """Takes note of the stamp of a message. The first one tells whether its device has a clock of its own; how far
-        that is off, the message tells that was under way for the shortest time: the first may have been held up."""
+        """Takes note of the stamp of a message. The first one shows whether its device has a separate clock. The offset
+        of that clock is taken from the message with the lowest latency: the first one may have been delayed."""
         own_clock = self._newest == NEVER and abs(stamp - self.now()) > OWN_CLOCK
         if own_clock or (self._shift and stamp - self._clock() > self._shift):
             self._shift = stamp - self._clock()

@@ -1,6 +1,6 @@
-"""Says which operators of a process have something to do: those that woke, and those whose time has come.
+"""Keeps the operators of a process that have something to do: those that woke, and those whose time has come.
 
-A process asks nobody else, so that an operator which is given nothing costs nothing, however many there are.
+A process asks no others, so that an operator which is given nothing costs nothing, however many there are.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ class RecordedRunner(Runner):
                 raise OperatorFailure(self.node.name, when, error) from error
 
     def close(self) -> None:
-        """Closes the operator. What it raises is printed: no record says what it raised in the run."""
+        """Closes the operator. An error is printed: no record holds the error of `close()` in the run."""
         close_quietly(self.operator)
 
     def push(self, stream: str, entry: Entry) -> None:

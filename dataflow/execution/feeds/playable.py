@@ -13,7 +13,7 @@ from dataflow.recording.streams.streams import StreamInfo
 class PlayableStreams(Protocol):
     """Streams of messages by name, read in the order of stamps: a recording, or a bag of another system.
 
-    `metadata`: what the file says of the run that made it, as recordings have it; empty where there was none.
+    `metadata`: the file's description of the run that made it, as recordings have it; empty where there was none.
     """
 
     path: Path

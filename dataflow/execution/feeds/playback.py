@@ -52,7 +52,7 @@ class Playback:
 
     @property
     def holds(self) -> bool:
-        """Tells whether the next step has to wait for somebody to let it pass."""
+        """Returns whether the next step has to wait for a request to let it pass."""
         return self.paused and not self._steps
 
     @property
