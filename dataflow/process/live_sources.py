@@ -1,4 +1,4 @@
-"""The sources of a live run: each is read by a thread of its own, at the pace of the clock; restarted by its policy.
+"""The sources of a live run: each is read by a separate thread, at the pace of the clock; restarted by its policy.
 
 A reader thread only reads, and appends to the inbox what it has read; everything else is done on the main thread. It
 also ends the generator that it reads, so `close()` is never called while `stream()` runs.
@@ -40,13 +40,13 @@ InItsPlace = Callable[[Callable[[Step], None], Step], bool]
 
 
 class Reader:
-    """Reads one source on a thread of its own until the source ends, fails, or is to stop."""
+    """Reads one source on a separate thread until the source ends, fails, or is to stop."""
 
     def __init__(self, owner: LiveSources, runner: SourceRunner, faults: SourceFaults, *, behind: bool) -> None:
         self.runner = runner
         self.unread = Handover()
         self.failure: OperatorFailure | None = None
-        """The failure of the thread, until somebody has dealt with it."""
+        """The failure of the thread, until it has been handled."""
         self.condemned: OperatorFailure | None = None
         """Why what it reads is of no use any more; it stops as soon as it can."""
         self.read_late = self.sent_late = 0.0

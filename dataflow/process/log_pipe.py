@@ -71,7 +71,7 @@ def shown(line: LogLine) -> list[str]:
 
 
 def _whereabouts() -> tuple[str, int | None]:
-    """The operator whose call is under way, as far as this thread tells, and the event time of the call."""
+    """Returns the operator whose call is under way, as far as this thread shows it, and the event time of the call."""
     thread = threading.current_thread()
     if thread.name.startswith(SOURCE_THREAD):
         return thread.name.removeprefix(SOURCE_THREAD), None

@@ -8,7 +8,7 @@ from dataflow.process.log_pipe import log_failure
 
 
 def tell_outlived(channel: Channel, failure: OperatorFailure, pause: float) -> None:
-    """Logs the traceback of a failure, and tells the supervisor that the operator is made anew in `pause` s.
+    """Logs the traceback of a failure, and reports to the supervisor that the operator is made anew in `pause` s.
 
     Raises `ChannelClosed`.
     """
