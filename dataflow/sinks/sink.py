@@ -77,7 +77,7 @@ class StreamSink(Protocol):
     def flush(self) -> None: ...
 
     def close(self, outcome: str) -> Mapping[str, Any]:
-        """Completes the output; `outcome` is "complete" or says why the run ended. Returns what it wrote."""
+        """Completes the output; `outcome` is "complete" or the reason why the run ended. Returns what it wrote."""
 
 
 class SinkFailure(RuntimeError):
@@ -85,7 +85,7 @@ class SinkFailure(RuntimeError):
 
 
 class SinkProcess:
-    """Takes streams until all have ended or the supervisor says so."""
+    """Takes streams until all have ended or the supervisor ends it."""
 
     def __init__(
         self,
@@ -309,7 +309,7 @@ class SinkProcess:
         self.firings_open.update(key for key in keys if key in self._operator_of)
 
     def _drain(self) -> None:
-        """Takes what has arrived: all others have left, or nobody can say whether they have."""
+        """Takes what has arrived: all others have left, or it is unknown whether they have."""
         clock = AwakeClock()
         deadline = clock() + DRAIN_WITHIN
         while not self.inbox.empty() and clock() < deadline:

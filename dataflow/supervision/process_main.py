@@ -165,7 +165,7 @@ def main(descriptor: int, handed: Sequence[int]) -> int:
         code = FAILED
         _hand_over(process)
         _report(channel, error, phase)
-        if await_leave(inbox):  # else the end of the run says it
+        if await_leave(inbox):  # else the end of the run reports it
             log_failure(error)
     facts: Any = {}
     try:

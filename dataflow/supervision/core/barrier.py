@@ -29,7 +29,8 @@ class Barrier:
             run.spawn(process)
 
     def ready(self, process: Supervised, fields: Mapping[str, Any]) -> None:
-        """A process is ready, and says at which stamp its sources begin and how many steps they have, if it knows."""
+        """Takes the report of a process that is ready: the first stamp of its sources, and how many steps they have, if
+        known."""
         status = self.run.status
         first, steps = fields["first"], fields["steps"]
         if first is not None:

@@ -200,7 +200,8 @@ class Core:
             part.said(process, kind, fields)
 
     def _failed(self, process: Supervised, fields: Mapping[str, Any]) -> None:
-        """A process says that one of its operators, or it itself, has failed; it waits to be told to leave."""
+        """Takes the report of a process that one of its operators, or it itself, has failed; it waits to be told to
+        leave."""
         if process.life in (Life.KILLED, Life.FAILED):
             return  # its end is decided
         operator, summary = fields["operator"], fields["summary"]

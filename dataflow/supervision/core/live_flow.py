@@ -11,7 +11,7 @@ from dataflow.sync import NEVER
 class LiveFlow:
     """Follows how far sources have got, and how far that leaves others behind. Stamps and lags are ns of event time.
 
-    A source that stops leaves nobody behind: what is counted against an operator is what its sources have given.
+    A source that stops leaves no operator behind: only messages that its sources have given count against an operator.
     """
 
     def __init__(self, graph: Graph, processes: Iterable[Collection[str]]) -> None:

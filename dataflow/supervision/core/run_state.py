@@ -136,7 +136,8 @@ class RunState:
             self.send(process, kind, replaces=replaces, **fields)
 
     def kill(self, process: Supervised, cause: str = "") -> None:
-        """Kills a process, if there is one that was not killed before; `cause` says why, in words that follow it."""
+        """Kills a process, if there is one that was not killed before; `cause` is the reason, in words that follow its
+        name."""
         if process.take(Step.KILL, self.steady):
             process.cause = cause or process.cause
             self.signal(process, signal.SIGKILL)
