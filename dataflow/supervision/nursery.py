@@ -101,7 +101,7 @@ class Child:
 
     @property
     def dead(self) -> bool:
-        """Whether it has ended, for when no process is left to report that."""
+        """Returns whether it has ended, for when no process is left to report that."""
         return self._pidfd is not None and bool(readable([self._pidfd], 0))
 
     def bury(self) -> int | None:

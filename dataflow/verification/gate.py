@@ -51,7 +51,7 @@ Outcome = Mapping[str, Any]
 
 
 class BaselineError(ValueError):
-    """A baseline file that cannot be read: says what is wrong with it."""
+    """Raised when a baseline file cannot be read; the message names the reason."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ class Heartbeats(Watcher):
                 self._look_for_hang(fields["messages"], fields["bytes"])
 
     def not_reading(self, process: Supervised, seconds: float, *, overflowed: bool) -> None:
-        """Stops a process that reads nothing, like one that sends nothing."""
+        """Treats a process that reads nothing like one that sends nothing."""
         late = seconds > BEAT_WITHIN and not process.is_sink  # a recorder may wait for its disk
         if self.run.under_way and process.life is Life.RUNNING and (late or overflowed):
             self._miss(process, f"has read nothing for {seconds:.1f} s")
