@@ -59,7 +59,7 @@ class AdmissionQueue:
 
     @property
     def holds(self) -> bool:
-        """Tells whether anything waits."""
+        """Returns whether anything waits."""
         return any(self._queues.values())
 
     def take(self) -> tuple[str, Arrival] | None:

@@ -23,7 +23,7 @@ class EventTime:
         return max(self._clock() + self._shift, self._newest)
 
     def until(self, stamp: int) -> int:
-        """Tells how long it takes (ns) until event time is `stamp`; 0 when it is. That passes with the clock, also
+        """Returns how long it takes (ns) until event time is `stamp`; 0 when it is. That passes with the clock, also
         while event time stands still at a stamp that was seen before the clock came there."""
         return 0 if stamp <= self._newest else max(0, stamp - self._clock() - self._shift)
 

@@ -173,7 +173,7 @@ class LiveRunner(OperatorRunner):
         return True
 
     def _admit_next(self) -> bool:
-        """Tells the aligner what the queues hold, else that it need not wait any longer; False when neither is so."""
+        """Passes the content of the queues to the aligner, or that it need not wait; False if neither applies."""
         taken = self.queue.take()
         if taken is None:
             return self._give_up()

@@ -115,5 +115,5 @@ class Runner:
 
     @property
     def restarted(self) -> int:
-        """Tells how often the operator was restarted in this process."""
+        """Returns how often the operator was restarted in this process."""
         return 0

@@ -26,7 +26,7 @@ class Ready:
 
     @property
     def any(self) -> bool:
-        """Tells whether a runner has woken."""
+        """Returns whether a runner has woken."""
         return bool(self._woken)
 
     def add(self, runner: Runner) -> None:

@@ -99,7 +99,7 @@ class OperatorRunner(Runner):
         return self.aligner.take_drops(), self.aligner.take_unlisted()
 
     def has_drops(self) -> bool:
-        """Tells whether anything was dropped since the last record."""
+        """Returns whether anything was dropped since the last record."""
         return self.aligner.has_drops()
 
     def waiting(self) -> tuple[int | None, dict[str, int]]:

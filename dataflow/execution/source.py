@@ -281,7 +281,7 @@ def step_stamp(step: Mapping[str, Message]) -> int:
 
 
 def step_size(step: Mapping[str, Message]) -> tuple[int, int]:
-    """Tells how many messages and bytes a step is."""
+    """Returns how many messages and bytes a step is."""
     size = 0
     for message in step.values():
         for array in message.arrays():

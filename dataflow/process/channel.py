@@ -170,7 +170,7 @@ class QueuedChannel:
 
     @property
     def waiting(self) -> int:
-        """Tells how many messages the process has not taken."""
+        """Returns how many messages the process has not taken."""
         return len(self._queue)
 
     def receive(self) -> Iterator[tuple[str, dict[str, Any]]]:

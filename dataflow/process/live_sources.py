@@ -180,7 +180,7 @@ class LiveSources:
             self._read(runner, behind=self._resumed)
 
     def restarts_of(self, name: str) -> int:
-        """Tells how often a source of this process was restarted here."""
+        """Returns how often a source of this process was restarted here."""
         return self._restarts[name].total if name in self._restarts else 0
 
     def begin_fault(self, kind: str, operator: str, fields: Mapping[str, Any]) -> bool:
@@ -238,7 +238,7 @@ class LiveSources:
         self.backlog.add(runner.last, *admitted)
 
     def tell_backlog(self, messages: int, nbytes: int) -> None:
-        """Tells the supervisor, now and then, that a source drops since so much waits; on any thread."""
+        """Reports to the supervisor, now and then, that a source drops since so much waits; on any thread."""
         now = time.monotonic()
         if now >= self._backlog_due:
             self._backlog_due = now + BACKLOG_EVERY
@@ -246,7 +246,7 @@ class LiveSources:
                 self._channel.send("backlog", messages=messages, bytes=nbytes)
 
     def tell_early(self, operator: str, last: int | None, stamp: int, seconds: float) -> None:
-        """Tells the supervisor that a source waits long for the clock, after a step at `last`; on any thread."""
+        """Reports to the supervisor that a source waits long for the clock, after a step at `last`; on any thread."""
         with contextlib.suppress(ChannelClosed):  # the control thread sees to it
             self._channel.send("early", operator=operator, last=last, stamp=stamp, seconds=seconds)
 
@@ -304,7 +304,7 @@ class LiveSources:
             runner.finish(reason)
 
     def _stop_reading(self) -> None:
-        """Tells all threads to stop, and sources that wait for a device to let go of it; once."""
+        """Commands all threads to stop, and sources that wait for a device to let go of it; once."""
         if self.stopping.is_set():
             return
         self.stopping.set()

@@ -1,4 +1,4 @@
-"""Says what a process logs and prints, line by line with its level, operator and time, on the pipe to its supervisor.
+"""Writes what a process logs and prints, line by line with its level, operator and time, to the pipe to its supervisor.
 
 The pipe also carries what libraries outside of Python write there. So a line of ours is marked: a control character
 that no text has, then JSON; `heard` reads either.

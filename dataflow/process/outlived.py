@@ -1,4 +1,4 @@
-"""Tells of failures that an operator or a process outlives: nothing else would say where they happened."""
+"""Reports failures that an operator or a process outlives: no other output would show where they happened."""
 
 from __future__ import annotations
 

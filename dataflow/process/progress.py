@@ -1,4 +1,4 @@
-"""Tells the supervisor how far the operators of a process are, and at the end what came of them."""
+"""Reports to the supervisor how far the operators of a process are, and at the end what came of them."""
 
 from __future__ import annotations
 

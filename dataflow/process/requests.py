@@ -103,7 +103,7 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(answer))
 
     def _replayed(self) -> dict[str, Any] | None:
-        """Tells from when to when a recording is played, and the stamp that `--start` counts from."""
+        """Returns from when to when a recording is played, and the stamp that `--start` counts from."""
         spans = [span for log in self._feeding.logs if (span := log.span()) is not None]
         if self._config.replay is None or not spans:
             return None
@@ -183,7 +183,7 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(answer))
 
     def _restarts(self) -> dict[str, int]:
-        """Tells how often each operator was restarted, by this process and in the processes before it."""
+        """Returns how often each operator was restarted, by this process and in the processes before it."""
         here = {maker.node.name: self._live.restarts_of(maker.node.name) for maker in self._runners.sources}
         here |= {runner.node.name: runner.restarted for runner in self._runners.operators}
         return {name: self._config.resumed(name).restarts + times for name, times in here.items()}

@@ -99,7 +99,7 @@ def _window(recording: Recording, heads: Mapping[str, bytes], start: int) -> Fir
 def _suffices(
     log: FiringLog, makers: Collection[Maker], stamp: int, stateless: Collection[str], stateful: Collection[str]
 ) -> bool:
-    """Tells whether the window holds a state of every operator that has one, and the makers' records of every message
+    """Returns whether the window holds a state of every operator that has one, and the makers' records of every message
     that is needed from there on."""
     needed: dict[str, tuple[int, int]] = {}
     made: dict[str, tuple[int, int]] = {}

@@ -64,7 +64,7 @@ class FlightSink:
         self._ring.mkdir(0o700)
         self.length = max(flight.keep // PARTS, SHORTEST)
         self.slack = 2 * (graph.record.snapshots or 0) + 2 * self.length
-        """Tells how much more than what is to be kept is there: from a state of every operator on."""
+        """Returns how much more than what is to be kept is there: from a state of every operator on."""
         self._clock = 0
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
@@ -264,7 +264,7 @@ class FlightSink:
     # Keeping
 
     def _is_over(self, wanted: Wanted) -> bool:
-        """Tells whether a span is over, and the firing records of it have had the time to come."""
+        """Returns whether a span is over, and the firing records of it have had the time to come."""
         if self._clock <= wanted.due:
             return False
         wanted.over = wanted.over or time.monotonic()

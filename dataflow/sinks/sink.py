@@ -66,7 +66,7 @@ class StreamSink(Protocol):
         """Something happened to the run: an operator was restarted, a fault was planned."""
 
     def diagnostics(self, message: Diagnostics) -> None:
-        """Tells how every operator fares."""
+        """Returns how every operator fares."""
 
     def log(self, line: LogLine) -> None:
         """An operator has logged or printed something."""
@@ -234,7 +234,7 @@ class SinkProcess:
             self._taken[operator] = stamp
 
     def _report(self, now: float) -> None:
-        """Tells how far it is."""
+        """Returns how far it is."""
         dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
         self._done = min(dynamic, default=FOREVER)
         done = self._reached()

@@ -68,7 +68,7 @@ class Triggers:
 
 
 def _meets(value: Any, trigger: Trigger) -> bool:
-    """Tells whether a field, or any of its elements, meets a condition."""
+    """Returns whether a field, or any of its elements, meets a condition."""
     if trigger.equals is not None:
         return bool(np.any(np.asarray(value) == trigger.equals))
     try:

@@ -142,7 +142,7 @@ class VerifyReport:
         return "within tolerance" if compared.tolerated else "culprit" if compared.own else "downstream"
 
     def repeats(self, operator: str) -> bool | None:
-        """Tells whether a culprit differed twice alike; None where it was not run twice."""
+        """Returns whether a culprit differed twice alike; None where it was not run twice."""
         return self.repeated.get(operator)
 
     def as_json(self) -> dict[str, Any]:

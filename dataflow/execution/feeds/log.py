@@ -41,7 +41,7 @@ class _LoggedStream:
 
     @property
     def is_over(self) -> bool:
-        """Tells whether all its messages were given, as far as that is known before the recording has been read."""
+        """Returns whether all its messages were given, as far as that is known before the recording has been read."""
         return self.promises is None or self.count == len(self.promises) - 1
 
 

@@ -22,7 +22,7 @@ class PlayableStreams(Protocol):
 
     @property
     def torn(self) -> bool:
-        """Tells whether the file has no proper end."""
+        """Returns whether the file has no proper end."""
 
     def messages(
         self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None

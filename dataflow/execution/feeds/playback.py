@@ -57,7 +57,7 @@ class Playback:
 
     @property
     def stepping(self) -> bool:
-        """Tells whether the next step was asked for, so that it does not wait for the clock."""
+        """Returns whether the next step was asked for, so that it does not wait for the clock."""
         return self.paused and self._steps > 0
 
     def passed(self) -> None:

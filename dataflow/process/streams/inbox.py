@@ -90,7 +90,7 @@ class Inbox:
         return self._items.popleft()
 
     def empty(self) -> bool:
-        """Tells whether there is nothing, in the rings either."""
+        """Returns whether there is nothing, in the rings either."""
         items = self._items
         for ring in self._incoming:
             if ring.arrived():

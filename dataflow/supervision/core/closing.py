@@ -89,7 +89,7 @@ class Closing:
 
     @property
     def _has_run(self) -> bool:
-        """Tells whether sources were released, so that there may be something to drain and to write."""
+        """Returns whether sources were released, so that there may be something to drain and to write."""
         return self.run.release is not None
 
     def _leaving(self, *, sinks: bool) -> list[Supervised]:

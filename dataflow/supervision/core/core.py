@@ -262,7 +262,7 @@ class Core:
 
 
 def _decides(event: Event) -> bool:
-    """Tells whether a run may go on at once because of this event: a process has reached what others wait for."""
+    """Returns whether a run may go on at once because of this event: a process has reached what others wait for."""
     match event:
         case Said(_, "ready" | "seen" | "ended" | "closed", _) | Died():
             return True

@@ -28,12 +28,12 @@ class LiveFlow:
             self._last[source] = stamp
 
     def lag(self, source: str, done: int) -> int:
-        """Tells how far one that has done everything up to `done` is behind a source."""
+        """Returns how far one that has done everything up to `done` is behind a source."""
         last = self._last.get(source)
         return 0 if last is None else max(0, last - max(done, self._first[source] - 1))
 
     def lags(self, operator: str, done: int) -> tuple[int, int]:
-        """Tells how far an operator is behind the last and the foremost of its sources."""
+        """Returns how far an operator is behind the last and the foremost of its sources."""
         found = [self.lag(source, done) for source in self.upstream[operator]]
         return min(found, default=0), max(found, default=0)
 

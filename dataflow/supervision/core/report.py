@@ -119,5 +119,5 @@ class RunFailed(RuntimeError):
 
     @property
     def internal(self) -> bool:
-        """Tells whether `details` is a traceback of the runtime's own code, which does not concern an operator."""
+        """Returns whether `details` is a traceback of the runtime's own code, which does not concern an operator."""
         return self.operator is None and self.details.startswith("Traceback")

@@ -70,7 +70,7 @@ class RunState:
 
     @property
     def under_way(self) -> bool:
-        """Tells whether sources are released and nothing is being closed yet."""
+        """Returns whether sources are released and nothing is being closed yet."""
         return self._phase in (Phase.RUNNING, Phase.STOPPING)
 
     @property
@@ -147,7 +147,7 @@ class RunState:
             self.command(Signal(process.label, number))
 
     def note(self, text: str) -> None:
-        """Tells the user something, at once and in the report."""
+        """Shows a message to the user, at once and in the report."""
         self.status.notes.append(text)
 
     def tell_recorder(self, kind: str, /, **fields: Any) -> None:
@@ -160,6 +160,6 @@ class RunState:
         self.tell_recorder("event", name="trigger", stamp=self.event_time(), data={"text": text})
 
     def event(self, name: str, text: str, /, **data: Any) -> None:
-        """Tells the user and the recording something that both must know."""
+        """Shows a message to the user and stores it in the recording."""
         self.note(text)
         self.tell_recorder("event", name=name, stamp=self.event_time(), data={"text": text, **data})

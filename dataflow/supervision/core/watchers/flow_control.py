@@ -31,7 +31,7 @@ class Cover(Watcher):
         return done
 
     def cover(self) -> None:
-        """Tells each process with sources what is new for it."""
+        """Sends each process with sources its new bounds."""
         raise NotImplementedError
 
 

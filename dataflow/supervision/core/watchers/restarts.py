@@ -30,7 +30,7 @@ class RestartPolicy(Watcher):
     """No process is started again: the first death ends the run."""
 
     def may_restart(self, process: Supervised) -> bool:
-        """Tells whether the policy of a process allows any restart at all."""
+        """Returns whether the policy of a process allows any restart at all."""
         return False
 
     def grant(self, process: Supervised) -> bool:
