@@ -164,7 +164,7 @@ def _causing_inputs(node: Node, calls: Sequence[FiringRecord], stamps: Mapping[P
 
 
 def _triggers(node: Node, name: str, calls: Sequence[FiringRecord], stamps: Mapping[Place, int]) -> bool:
-    """Tells whether an input has, in every firing, messages of its stamp that no firing had before."""
+    """Returns whether an input has, in every firing, messages of its stamp that no firing had before."""
     seen: set[Place] = set()
     for record in calls:
         for place in _places(record.inputs.get(name)):

@@ -9,9 +9,9 @@ from dataflow.sync import Firing
 
 
 def without_absent(firing: Firing, node: Node, absent: Collection[str]) -> Firing:
-    """Marks the Sampled inputs stale that take an `absent` stream; drops what they hold where the policy says so.
+    """Marks the Sampled inputs stale that take an `absent` stream; drops what they hold where the policy requires it.
 
-    What an input requires, and what comes from several streams, stays.
+    Required inputs, and inputs of several streams, stay.
     """
     ports = node.spec.inputs
     gone = frozenset(

@@ -31,7 +31,7 @@ class AdmissionQueue:
     """Queues in front of the triggers of one operator, one for each stream.
 
     At most `size` messages a stream: of more, policy `newest` drops the oldest and `oldest` the arriving one; `block`
-    drops none, since flow control holds the producer back. What is dropped goes to `log`.
+    drops none, since flow control holds the producer back. Dropped messages go to `log`.
     """
 
     def __init__(self, policy: str, size: int, triggers: Mapping[str, str], log: DropLog) -> None:
@@ -59,7 +59,7 @@ class AdmissionQueue:
 
     @property
     def holds(self) -> bool:
-        """Tells whether anything waits."""
+        """Returns whether anything waits."""
         return any(self._queues.values())
 
     def take(self) -> tuple[str, Arrival] | None:

@@ -6,7 +6,7 @@ from dataflow.execution.admission import EventClock
 from dataflow.sync import NEVER
 
 OWN_CLOCK = 1_000_000_000
-"""A device whose first stamp is farther (ns) from event time has a clock of its own, which then counts."""
+"""A device whose first stamp is farther (ns) from event time has a separate clock, which then counts."""
 
 
 class EventTime:
@@ -23,13 +23,13 @@ class EventTime:
         return max(self._clock() + self._shift, self._newest)
 
     def until(self, stamp: int) -> int:
-        """Tells how long it takes (ns) until event time is `stamp`; 0 when it is. That passes with the clock, also
+        """Returns how long it takes (ns) until event time is `stamp`; 0 when it is. That passes with the clock, also
         while event time stands still at a stamp that was seen before the clock came there."""
         return 0 if stamp <= self._newest else max(0, stamp - self._clock() - self._shift)
 
     def see(self, stamp: int) -> None:
-        """Takes note of the stamp of a message. The first one tells whether its device has a clock of its own; how far
-        that is off, the message tells that was under way for the shortest time: the first may have been held up."""
+        """Takes note of the stamp of a message. The first one shows whether its device has a separate clock. The offset
+        of that clock is taken from the message with the lowest latency: the first one may have been delayed."""
         own_clock = self._newest == NEVER and abs(stamp - self.now()) > OWN_CLOCK
         if own_clock or (self._shift and stamp - self._clock() > self._shift):
             self._shift = stamp - self._clock()

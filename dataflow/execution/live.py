@@ -131,7 +131,7 @@ class LiveRunner(OperatorRunner):
             self._seen[stream] = (incarnation, stamp)
             self._time.see(stamp)
         if self.restarts.pending:
-            self.done = max(self.done, entry.stamp)  # nobody waits for an operator that is away
+            self.done = max(self.done, entry.stamp)  # an operator that is away is not waited for
         if not self.awake:
             self.wake()
         if stream in self.queue.triggers:
@@ -173,7 +173,7 @@ class LiveRunner(OperatorRunner):
         return True
 
     def _admit_next(self) -> bool:
-        """Tells the aligner what the queues hold, else that it need not wait any longer; False when neither is so."""
+        """Passes the content of the queues to the aligner, or that it need not wait; False if neither applies."""
         taken = self.queue.take()
         if taken is None:
             return self._give_up()
@@ -310,7 +310,8 @@ class LiveRunner(OperatorRunner):
         return next(name for name, streams in self.node.inputs.items() if stream in streams)
 
     def _admit(self, stream: str, arrival: Arrival) -> None:
-        """Tells the aligner. What breaks a promise of its stream is refused and counted; a live run goes on."""
+        """Passes an arrival to the aligner. One that breaks a promise of its stream is refused and counted; a live run
+        goes on."""
         self._told = True
         try:
             if isinstance(arrival, Entry):

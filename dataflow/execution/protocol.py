@@ -29,12 +29,12 @@ class Runner:
         self.work = Work()
         """The time of the operator's calls, with checking and sending what came out of them."""
         self.working_since: float | None = None
-        """When the call that is under way began (monotonic seconds), for whoever watches over it."""
+        """When the call that is under way began (monotonic seconds), for the watchdog."""
         self.working_stamp = NEVER
         self.absent: set[str] = set()
         """Streams whose operator is gone at the moment; only a live run asks."""
         self.awake = True
-        """True when it is to be asked for a step; it stays so where nobody asks by `Ready`."""
+        """True when it is to be asked for a step; it stays so in a driver without `Ready`."""
         self.place = 0
         self.wakes_in: list[Runner] = []
         """Its place in the graph and where it puts itself when it wakes (`dataflow.execution.ready`)."""
@@ -115,5 +115,5 @@ class Runner:
 
     @property
     def restarted(self) -> int:
-        """Tells how often the operator was restarted in this process."""
+        """Returns how often the operator was restarted in this process."""
         return 0

@@ -1,6 +1,6 @@
-"""Says which operators of a process have something to do: those that woke, and those whose time has come.
+"""Keeps the operators of a process that have something to do: those that woke, and those whose time has come.
 
-A process asks nobody else, so that an operator which is given nothing costs nothing, however many there are.
+A process asks no others, so that an operator which is given nothing costs nothing, however many there are.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Ready:
 
     @property
     def any(self) -> bool:
-        """Tells whether a runner has woken."""
+        """Returns whether a runner has woken."""
         return bool(self._woken)
 
     def add(self, runner: Runner) -> None:

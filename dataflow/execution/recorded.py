@@ -81,7 +81,7 @@ class RecordedRunner(Runner):
         self.ports.end_statics()
 
     def _take_up(self) -> None:
-        """Tells where re-execution begins in the middle: the last restart, the parameters and the state of that
+        """Returns where re-execution begins in the middle: the last restart, the parameters and the state of that
         moment."""
         changes: dict[str, Any] = {}
         for record in self._before:
@@ -113,7 +113,7 @@ class RecordedRunner(Runner):
                 raise OperatorFailure(self.node.name, when, error) from error
 
     def close(self) -> None:
-        """Closes the operator. What it raises is printed: no record says what it raised in the run."""
+        """Closes the operator. An error is printed: no record holds the error of `close()` in the run."""
         close_quietly(self.operator)
 
     def push(self, stream: str, entry: Entry) -> None:
@@ -216,7 +216,7 @@ class RecordedRunner(Runner):
         self.calls.restore(state, (record.incarnation, record.stamp))
 
     def _is_lost(self, missing: MessageRef | None) -> bool:
-        """Tells whether a message that the next firing needs can no longer come."""
+        """Returns whether a message that the next firing needs can no longer come."""
         if missing is None:
             return not self._open
         passed = self._latest.get(missing.stream, (-1, -1)) > (missing.incarnation, missing.seq)

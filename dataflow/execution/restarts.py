@@ -25,7 +25,7 @@ class Restarts:
         self._last: float | None = None
         self._due = 0.0
         self.pending = False
-        """Tells whether an attempt is to be made, now or later."""
+        """Returns whether an attempt is to be made, now or later."""
 
     def failed(self) -> bool:
         """Notes a failure; False when the policy allows no further attempt."""

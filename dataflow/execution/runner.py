@@ -1,7 +1,7 @@
 """Runs one operator: its aligner decides, `process()` works, what comes out is checked, numbered and recorded.
 
-A runner is single-threaded and knows nothing of processes and keys: messages are pushed in by stream name, and what is
-emitted goes to an `Emitter`. Runs, replays and tests (`dataflow.testing.play`) drive `OperatorRunner`; `LiveRunner` and
+A runner is single-threaded and independent of processes and keys: messages are pushed in by stream name, and emitted
+ones go to an `Emitter`. Runs, replays and tests (`dataflow.testing.play`) drive `OperatorRunner`; `LiveRunner` and
 `RecordedRunner` take its place in a live run and in a re-execution.
 """
 
@@ -31,11 +31,11 @@ MOST_TICKS = 1_000_000
 by a wrong stamp. A live run leaves ticks out instead, and counts them."""
 
 SHORT = 1_000_000
-"""ns: an operator whose calls take less on average does not announce each one by a frontier below its stamp. What it
-emits says the same at once."""
+"""ns: an operator whose calls take less on average does not announce each one by a frontier below its stamp. Its
+messages imply the same frontier at once."""
 
 MOST_DROPPED = 10_000
-"""Stamps that one step may drop before it returns to whoever drives it, who has other things to look at."""
+"""Stamps that one step may drop before it returns to its driver, which has other work."""
 
 
 _NOTHING: Mapping[str, Any] = {}
@@ -99,7 +99,7 @@ class OperatorRunner(Runner):
         return self.aligner.take_drops(), self.aligner.take_unlisted()
 
     def has_drops(self) -> bool:
-        """Tells whether anything was dropped since the last record."""
+        """Returns whether anything was dropped since the last record."""
         return self.aligner.has_drops()
 
     def waiting(self) -> tuple[int | None, dict[str, int]]:

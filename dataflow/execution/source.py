@@ -137,7 +137,7 @@ class SourceRunner:
         return self.emit(step)
 
     def promise(self) -> None:
-        """Every port is known up to the last step, so sparse ports hold nobody up."""
+        """Every port is known up to the last step, so sparse ports delay no consumer."""
         self.ports.promise(self.last)
 
     def emit(self, step: Mapping[str, Message]) -> tuple[int, int]:
@@ -161,7 +161,7 @@ class SourceRunner:
         return step_size(step)
 
     def _take_refused(self) -> dict[str, int]:
-        """Tells how many steps were not sent since the last record that says so, by reason."""
+        """Returns how many steps were not sent since the last record that counts them, by reason."""
         fresh, self._recorded = self.refused - self._recorded, self.refused.copy()
         return dict(fresh)
 
@@ -281,7 +281,7 @@ def step_stamp(step: Mapping[str, Message]) -> int:
 
 
 def step_size(step: Mapping[str, Message]) -> tuple[int, int]:
-    """Tells how many messages and bytes a step is."""
+    """Returns how many messages and bytes a step is."""
     size = 0
     for message in step.values():
         for array in message.arrays():

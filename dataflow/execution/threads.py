@@ -49,7 +49,7 @@ _limit: int | None = None
 
 
 def limit_threads(threads: int) -> None:
-    """Limits the libraries that are loaded and have a switch of their own. Called after the operators' imports."""
+    """Limits loaded libraries that have a separate thread setting. Called after the operators' imports."""
     global _limit
     _limit = threads
     limit_threads_again()

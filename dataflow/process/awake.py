@@ -1,7 +1,7 @@
 """A clock that goes on while its process runs, for everything that is judged by how long it took.
 
-A stopped container, a suspended laptop or a storm of swapping stops who waits together with who is waited for: a clock
-that went on meanwhile is no evidence against anybody.
+A stopped container, a suspended laptop or a storm of swapping stops the waiting process together with the awaited one:
+a clock that went on meanwhile is no evidence against either.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Callable
 LONGEST_STEP = 0.5
 """Seconds that count, at most, between two readings: who uses the clock reads it more often while it runs."""
 LOOK_EVERY = 0.2
-"""Seconds of one wait of whoever waits by such a clock."""
+"""Seconds of a single wait that is timed by such a clock."""
 
 
 class AwakeClock:
-    """Seconds, never going back; a time in which nobody read it counts as `LONGEST_STEP`."""
+    """Seconds, never going back; a longer time between two readings counts as `LONGEST_STEP`."""
 
     def __init__(self, clock: Callable[[], float] | None = None) -> None:
         self._clock = clock or time.monotonic

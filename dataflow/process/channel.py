@@ -1,8 +1,8 @@
 """The control channel between the supervisor and one process: small msgpack messages over a socket pair.
 
 It is a pipe rather than a Zenoh key because its end is the news: when either process dies, however it dies, the other
-one reads end-of-file at once. The two ends differ in one thing: a process waits until what it says is taken
-(`Channel`), the supervisor waits for nobody (`QueuedChannel`).
+one reads end-of-file at once. The two ends differ in one thing: a process waits until its message is taken
+(`Channel`), the supervisor never waits (`QueuedChannel`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dataflow.process.polling import readable
 LONGEST = 1 << 30
 """Bytes of one message, at most."""
 READ_AT_ONCE = 1 << 18
-"""Bytes that one look at a channel takes in, so that one process that says much does not keep the others waiting."""
+"""Bytes that are read from a channel at once, so that one process that sends much does not keep the others waiting."""
 MOST_QUEUED = 64 << 20
 """Bytes that may wait for a process that does not read."""
 
@@ -170,7 +170,7 @@ class QueuedChannel:
 
     @property
     def waiting(self) -> int:
-        """Tells how many messages the process has not taken."""
+        """Returns how many messages the process has not taken."""
         return len(self._queue)
 
     def receive(self) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -58,5 +58,5 @@ class ProcessConfig:
     life: int = 1
 
     def resumed(self, operator: str) -> Resumed:
-        """Tells where an operator had got to in the process before this one."""
+        """Returns where an operator had got to in the process before this one."""
         return Resumed(**(self.resume or {}).get(operator, {}))

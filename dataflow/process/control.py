@@ -1,4 +1,4 @@
-"""Does what the supervisor tells a process of operators, and keeps what it has told."""
+"""Carries out the supervisor's messages to a process of operators, and keeps the state that they set."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Control:
         """The round in which it is asked for its state, until it has answered."""
 
     def obey(self, kind: str, fields: Mapping[str, Any]) -> None:
-        """Does what a message says. Raises `ChannelClosed` when the supervisor is gone."""
+        """Carries out one message. Raises `ChannelClosed` when the supervisor is gone."""
         match kind:
             case "covered":
                 self._window.cover(fields["frontier"])
@@ -93,7 +93,7 @@ class Control:
                 raise ChannelClosed("the supervisor is gone")
 
     def _mark(self, streams: list[str], *, absent: bool) -> None:
-        """Notes for whom takes some streams that nobody makes them at the moment, or that somebody does again."""
+        """Marks these streams, for their consumers, as having no producer, or as having one again."""
         for stream in streams:
             for consumer in self._runners.taking(stream):
                 (consumer.absent.add if absent else consumer.absent.discard)(stream)

@@ -29,7 +29,7 @@ class Feeding:
 
     @property
     def full(self) -> bool:
-        """Tells whether a step waits for room in the window."""
+        """Returns whether a step waits for room in the window."""
         return self._window.full and not self.ended
 
     def play_back(self, log: LogFeed) -> None:

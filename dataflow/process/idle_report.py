@@ -1,4 +1,4 @@
-"""Tells the supervisor where a process of operators stands: when it is asked, and when all its operators have ended."""
+"""Reports the state of a process of operators to the supervisor: when asked, and when all its operators have ended."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dataflow.process.streams.outlet import Outlet
 
 
 class IdleReport:
-    """Knows whether one process has ended, and whether anything is still to come there without news from outside."""
+    """Reports whether one process is finished or idle."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""The sources of a live run: each is read by a thread of its own, at the pace of the clock; restarted by its policy.
+"""The sources of a live run: each is read by a separate thread, at the pace of the clock; restarted by its policy.
 
 A reader thread only reads, and appends to the inbox what it has read; everything else is done on the main thread. It
 also ends the generator that it reads, so `close()` is never called while `stream()` runs.
@@ -40,13 +40,13 @@ InItsPlace = Callable[[Callable[[Step], None], Step], bool]
 
 
 class Reader:
-    """Reads one source on a thread of its own until the source ends, fails, or is to stop."""
+    """Reads one source on a separate thread until the source ends, fails, or is to stop."""
 
     def __init__(self, owner: LiveSources, runner: SourceRunner, faults: SourceFaults, *, behind: bool) -> None:
         self.runner = runner
         self.unread = Handover()
         self.failure: OperatorFailure | None = None
-        """The failure of the thread, until somebody has dealt with it."""
+        """The failure of the thread, until it has been handled."""
         self.condemned: OperatorFailure | None = None
         """Why what it reads is of no use any more; it stops as soon as it can."""
         self.read_late = self.sent_late = 0.0
@@ -180,7 +180,7 @@ class LiveSources:
             self._read(runner, behind=self._resumed)
 
     def restarts_of(self, name: str) -> int:
-        """Tells how often a source of this process was restarted here."""
+        """Returns how often a source of this process was restarted here."""
         return self._restarts[name].total if name in self._restarts else 0
 
     def begin_fault(self, kind: str, operator: str, fields: Mapping[str, Any]) -> bool:
@@ -238,7 +238,7 @@ class LiveSources:
         self.backlog.add(runner.last, *admitted)
 
     def tell_backlog(self, messages: int, nbytes: int) -> None:
-        """Tells the supervisor, now and then, that a source drops since so much waits; on any thread."""
+        """Reports to the supervisor, now and then, that a source drops since so much waits; on any thread."""
         now = time.monotonic()
         if now >= self._backlog_due:
             self._backlog_due = now + BACKLOG_EVERY
@@ -246,7 +246,7 @@ class LiveSources:
                 self._channel.send("backlog", messages=messages, bytes=nbytes)
 
     def tell_early(self, operator: str, last: int | None, stamp: int, seconds: float) -> None:
-        """Tells the supervisor that a source waits long for the clock, after a step at `last`; on any thread."""
+        """Reports to the supervisor that a source waits long for the clock, after a step at `last`; on any thread."""
         with contextlib.suppress(ChannelClosed):  # the control thread sees to it
             self._channel.send("early", operator=operator, last=last, stamp=stamp, seconds=seconds)
 
@@ -304,7 +304,7 @@ class LiveSources:
             runner.finish(reason)
 
     def _stop_reading(self) -> None:
-        """Tells all threads to stop, and sources that wait for a device to let go of it; once."""
+        """Commands all threads to stop, and sources that wait for a device to let go of it; once."""
         if self.stopping.is_set():
             return
         self.stopping.set()

@@ -1,4 +1,4 @@
-"""Says what a process logs and prints, line by line with its level, operator and time, on the pipe to its supervisor.
+"""Writes what a process logs and prints, line by line with its level, operator and time, to the pipe to its supervisor.
 
 The pipe also carries what libraries outside of Python write there. So a line of ours is marked: a control character
 that no text has, then JSON; `heard` reads either.
@@ -71,7 +71,7 @@ def shown(line: LogLine) -> list[str]:
 
 
 def _whereabouts() -> tuple[str, int | None]:
-    """The operator whose call is under way, as far as this thread tells, and the event time of the call."""
+    """Returns the operator whose call is under way, as far as this thread shows it, and the event time of the call."""
     thread = threading.current_thread()
     if thread.name.startswith(SOURCE_THREAD):
         return thread.name.removeprefix(SOURCE_THREAD), None

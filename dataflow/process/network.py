@@ -23,7 +23,7 @@ class Closable(Protocol):
 
 
 def network_config(network: Network, listen: Iterable[str], *, live: bool) -> NetworkConfig:
-    """Returns a process's configuration: its own endpoints, and what the graph says of TLS and other machines."""
+    """Returns a process's configuration: its own endpoints, and the graph's settings for TLS and other machines."""
     settings = {
         "transport/link/tls": dict(network.tls),
         "access_control": dict(network.access_control),
@@ -39,9 +39,9 @@ def network_config(network: Network, listen: Iterable[str], *, live: bool) -> Ne
 
 
 def leave_network(process: str, *parts: Closable) -> None:
-    """Closes parts of a process's place in the network in turn, and says so if `LEAVE_WITHIN` does not suffice.
+    """Closes parts of a process's place in the network in turn, and prints a warning if `LEAVE_WITHIN` is too short.
 
-    All that was to be done is done by then: a neighbour that hangs must not fail the run.
+    All work is done by then: a neighbour that hangs must not fail the run.
     """
 
     def leave() -> None:

@@ -141,7 +141,7 @@ class OperatorProcess:
     # Life
 
     def open(self) -> None:
-        """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
+        """Joins the network, makes the operators and sets them up, then reports to the supervisor as ready."""
         config, graph = self.config, self.graph
         settings = network_config(graph.network, config.listen, live=config.live)
         self.bus = Bus(settings)

@@ -1,4 +1,4 @@
-"""Tells of failures that an operator or a process outlives: nothing else would say where they happened."""
+"""Reports failures that an operator or a process outlives: no other output would show where they happened."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataflow.process.log_pipe import log_failure
 
 
 def tell_outlived(channel: Channel, failure: OperatorFailure, pause: float) -> None:
-    """Logs the traceback of a failure, and tells the supervisor that the operator is made anew in `pause` s.
+    """Logs the traceback of a failure, and reports to the supervisor that the operator is made anew in `pause` s.
 
     Raises `ChannelClosed`.
     """

@@ -1,4 +1,4 @@
-"""Tells which descriptors can be read; of any number, where select(2) knows those below 1,024 only."""
+"""Returns the descriptors that can be read; of any number, where select(2) accepts those below 1,024 only."""
 
 from __future__ import annotations
 

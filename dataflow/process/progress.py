@@ -1,4 +1,4 @@
-"""Tells the supervisor how far the operators of a process are, and at the end what came of them."""
+"""Reports to the supervisor how far the operators of a process are, and at the end what came of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REPORT_EVERY = 0.02
 REPORT_IDLE = 0.01
 """Seconds between two reports of a process that has nothing more to do: others may be waiting for this one."""
 REPORT_LIVE = 0.05
-"""The same in a live run, where sources wait for nobody: every report wakes the supervisor, and that the sources."""
+"""The same in a live run, where sources do not wait: every report wakes the supervisor, and that the sources."""
 COUNT_EVERY = 0.05
 """Seconds between two counts of what operators have done, while there is more to do. Flow control needs none."""
 

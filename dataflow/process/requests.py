@@ -26,7 +26,7 @@ from dataflow.transport.codec import decode
 from dataflow.transport.envelope import DecodeError
 from dataflow.transport.keys import runtime_key
 
-LIVE = "it is a live run: devices and the clock wait for nobody; what runs without --live, and replays, can be paused"
+LIVE = "it is a live run: devices and the clock do not wait; runs without --live, and replays, can be paused"
 
 
 class Requests:
@@ -62,7 +62,7 @@ class Requests:
             bus.serve(runtime_key(namespace, "playback"), _to_inbox(inbox, "", "playback"))
 
     def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
-        """Pauses, resumes, steps, or changes the speed, and tells the supervisor. Raises `ValueError`."""
+        """Pauses, resumes, steps, or changes the speed, and reports it to the supervisor. Raises `ValueError`."""
         if not self._feeding.feeds:
             return
         self._feeding.play(action, steps, speed)
@@ -103,7 +103,7 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(answer))
 
     def _replayed(self) -> dict[str, Any] | None:
-        """Tells from when to when a recording is played, and the stamp that `--start` counts from."""
+        """Returns from when to when a recording is played, and the stamp that `--start` counts from."""
         spans = [span for log in self._feeding.logs if (span := log.span()) is not None]
         if self._config.replay is None or not spans:
             return None
@@ -172,7 +172,7 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(status))
 
     def _answer_trigger(self, query: Any) -> None:
-        """Hands on that somebody wants to keep what was; on Zenoh's thread, so an operator at work holds up nothing."""
+        """Forwards a request to keep the history; on Zenoh's thread, so an operator at work delays nothing."""
         with query:
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
@@ -183,7 +183,7 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(answer))
 
     def _restarts(self) -> dict[str, int]:
-        """Tells how often each operator was restarted, by this process and in the processes before it."""
+        """Returns how often each operator was restarted, by this process and in the processes before it."""
         here = {maker.node.name: self._live.restarts_of(maker.node.name) for maker in self._runners.sources}
         here |= {runner.node.name: runner.restarted for runner in self._runners.operators}
         return {name: self._config.resumed(name).restarts + times for name, times in here.items()}

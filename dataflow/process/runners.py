@@ -73,7 +73,8 @@ class Runners:
 
 
 def give(runner: Runner, stream: str, envelope: Envelope) -> None:
-    """Gives a runner what another process says on a stream. Raises `StreamOrderError` for what contradicts it."""
+    """Gives a runner another process's message or frontier on a stream. Raises `StreamOrderError` for one that
+    contradicts earlier ones."""
     message = envelope.message
     if message is not None:
         runner.push(stream, Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, b"", stream))

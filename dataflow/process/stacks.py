@@ -1,7 +1,7 @@
-"""Says where a process is: what each of its threads is at, written to the pipe of its words.
+"""Writes the stack of each thread of a process to its log pipe.
 
 The supervisor asks by a signal before it gives a process up, and a fault of native code (a segmentation fault, say)
-tells it by itself. Both work while native code keeps the interpreter for itself.
+writes them without a request. Both work while native code keeps the interpreter for itself.
 """
 
 from __future__ import annotations

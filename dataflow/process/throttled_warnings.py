@@ -13,7 +13,7 @@ AGAIN_AFTER = 10.0
 
 
 class ThrottledWarnings:
-    """Prints to stderr, but never waits for whoever reads it."""
+    """Prints to stderr, but never waits for the reader."""
 
     def __init__(self, clock: Callable[[], float] | None = None, printing: Callable[[str], bool] | None = None) -> None:
         self._clock, self._print = clock or time.monotonic, printing or print_without_waiting
@@ -21,7 +21,7 @@ class ThrottledWarnings:
         self._unprinted: Counter[str] = Counter()
 
     def say(self, about: str, text: str) -> None:
-        """Complains about something, such as a stream; `text` says all that the reader should know."""
+        """Prints a warning about something, such as a stream; `text` is the whole warning."""
         now = self._clock()
         more = self._unprinted[about]
         line = f"{text} ({more} more like it before)" if more else text
@@ -33,7 +33,7 @@ class ThrottledWarnings:
 
 
 def print_without_waiting(line: str) -> bool:
-    """Prints a line to stderr; False when nobody reads it at the moment."""
+    """Prints a line to stderr; False when it is not being read at the moment."""
     try:
         room = select.poll()
         room.register(sys.stderr, select.POLLOUT)

@@ -1,6 +1,6 @@
-"""The watchdog of a process: tells the supervisor a few times a second that the process lives, how much memory it
-takes, and whether a firing takes longer than its operator's deadline. It runs on a thread of its own, since the main
-one may hang.
+"""The watchdog of a process: reports to the supervisor a few times a second that the process lives, how much memory it
+takes, and whether a firing takes longer than its operator's deadline. It runs on a separate thread, since the main one
+may hang.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The supervisor makes the memory (a memfd), hands it down at the fork, and reads it only after the process has died: a
 record costs no system call and does not pass through the supervisor. Two segments are written in turn. Each begins with
-a checkpoint (where every operator had got to), so the older one may be overwritten: what remains still says where each
-operator is, and holds at least one segment's worth of records. A frame counts once its segment's length includes it,
+a checkpoint (where every operator had got to), so the older one may be overwritten: the rest still holds the position
+of each operator, and at least one segment's worth of records. A frame counts once its segment's length includes it,
 and the length is written last; so a kill at any instruction leaves whole frames.
 """
 
@@ -86,7 +86,7 @@ class BlackBox:
         self._append(_RECORD, data)
 
     def note(self, record: FiringRecord) -> None:
-        """Notes where an operator has got to by a record that is kept: the next checkpoint says so."""
+        """Notes an operator's position by a record that is kept, for the next checkpoint."""
         self._reached[record.operator].take(record, self._ports[record.operator])
 
     def kept(self, operator: str) -> list[FiringRecord]:

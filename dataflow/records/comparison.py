@@ -30,13 +30,13 @@ class Verification:
     is unavailable; `lost_records` are missing between others, so the firings that follow them in their incarnation
     cannot be repeated either. `unknown` firings follow the beginning of a part of a recording in which the operator's
     state there is not known. `beyond` of the unverifiable ones wait for a message after the last one of its stream.
-    `unaccounted` messages were made by no record, `unfinished` says that the records end before the run did: records
-    are lost. `cut` says that the recording itself ends before the run did, and before this operator; `after_cut` are
-    then the messages without a record. `not_stored` messages were made again, but are not in the recording.
-    `tainted` is the index of the first firing that was given anything other than recorded, `own_fault` says that the
-    first difference came before; `states` of the differences are in snapshots, not in messages.
+    `unaccounted` messages were made by no record. `unfinished`: the records end before the run did, so records are
+    lost. `cut`: the recording itself ends before the run did, and before this operator; `after_cut` are then the
+    messages without a record. `not_stored` messages were made again, but are not in the recording.
+    `tainted` is the index of the first firing that was given anything other than recorded; `own_fault`: the
+    first difference came before that; `states` of the differences are in snapshots, not in messages.
     `wrote` names the first message that the operator has written into, which others may be given too.
-    `began` says from where it was repeated: "start", "snapshot" (its recorded state) or "stateless".
+    `began` is the state from which it was repeated: "start", "snapshot" (its recorded state) or "stateless".
     """
 
     operator: str

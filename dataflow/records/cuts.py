@@ -74,7 +74,7 @@ def taken_by(record: FiringRecord) -> Taken | None:
 
 
 def is_known(record: FiringRecord) -> bool:
-    """Tells whether a record holds the operator's state."""
+    """Returns whether a record holds the operator's state."""
     return record.kind in ("snapshot", "cut") and "state" in record.detail
 
 

@@ -35,7 +35,7 @@ WITHHELD = -1
 
 
 class FiringRecordError(ValueError):
-    """A batch of firing records that cannot be written or read: says what is wrong with it."""
+    """Raised when a batch of firing records cannot be written or read; the message names the reason."""
 
 
 @dataclass(slots=True)
@@ -49,8 +49,8 @@ class Emission:
 
 @dataclass(slots=True)
 class FiringRecord:
-    """One call of an operator. Nobody changes a record; it is not frozen since that would make it cost four times as
-    much, and one is made for every firing.
+    """One call of an operator. A record is never changed; the class is not frozen since that would make a record cost
+    four times as much, and one is made for every firing.
 
     `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were
     given, by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those
@@ -137,8 +137,8 @@ def encode_batch(records: list[FiringRecord], *, last: bool = False) -> bytes:
 
 
 def encode_single(record: FiringRecord) -> bytes:
-    """The same as `encode_batch([record])`, made for a record that is like the one before it: what says whose it is was
-    packed then."""
+    """Returns the same as `encode_batch([record])`, optimised for a record like the one before it: the header that
+    identifies its operator is already packed."""
     streams: list[str] = []
     refs: list[tuple[int, int, int, int]] = []
     for ref in record.inputs.values():

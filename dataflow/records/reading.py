@@ -27,7 +27,7 @@ class Maker(Protocol):
 
 
 class FiringLog:
-    """The firing records of many operators: as batches until somebody asks for them."""
+    """The firing records of many operators: as batches until they are requested."""
 
     def __init__(
         self, batches: Mapping[str, Sequence[bytes]], origin: str, begins: Mapping[str, int] | None = None

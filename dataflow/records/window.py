@@ -1,6 +1,6 @@
 """The firing records that the end of a recording needs: a run of days is not read to verify its last minute.
 
-What lies before is left out as from a recording that was cut: a `cut` record stands for it (`dataflow.records.cuts`).
+Earlier records are left out as from a recording that was cut: a `cut` record replaces them (`dataflow.records.cuts`).
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _window(recording: Recording, heads: Mapping[str, bytes], start: int) -> Fir
         try:
             before, after = decode_batch(head), decode_batch(found[0])
         except FiringRecordError:
-            return None  # whoever reads all of it names the batch that is damaged
+            return None  # a reader of the whole file names the damaged batch
         last, first = before.records[-1], after.records[0]
         if before.incarnation or after.incarnation or before.records[0].index:
             return None
@@ -99,7 +99,7 @@ def _window(recording: Recording, heads: Mapping[str, bytes], start: int) -> Fir
 def _suffices(
     log: FiringLog, makers: Collection[Maker], stamp: int, stateless: Collection[str], stateful: Collection[str]
 ) -> bool:
-    """Tells whether the window holds a state of every operator that has one, and the makers' records of every message
+    """Returns whether the window holds a state of every operator that has one, and the makers' records of every message
     that is needed from there on."""
     needed: dict[str, tuple[int, int]] = {}
     made: dict[str, tuple[int, int]] = {}

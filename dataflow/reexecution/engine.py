@@ -48,7 +48,7 @@ class Watcher(Protocol):
 
 
 class Unwatched:
-    """The watcher of a re-execution that nobody looks at."""
+    """The watcher of an unobserved re-execution."""
 
     def begins(self, phase: str, operator: str) -> None:
         """Takes no notice."""
@@ -60,7 +60,7 @@ class Unwatched:
 @dataclass(frozen=True, slots=True)
 class Feeding:
     """Holds what is re-executed and what is read: operators in graph order, the recorded streams that feed them, and
-    those that are read besides and feed nobody."""
+    those that are read besides and feed no operator."""
 
     operators: tuple[str, ...]
     streams: tuple[str, ...]
@@ -277,13 +277,13 @@ def _until(records: Iterable[FiringRecord], end: int | None) -> Iterator[FiringR
 
 
 def _nowhere(stream: str, entry: Entry) -> None:
-    """Takes a message that nobody asked for."""
+    """Discards a message without consumers."""
 
 
 class _Outlet:
     """Hands messages to `take` and to the operators that take them, unless those of that stream are fed otherwise.
 
-    Whoever was given something is noted in `ready`.
+    Operators that were given something are noted in `ready`.
     """
 
     def __init__(

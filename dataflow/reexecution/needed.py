@@ -24,7 +24,7 @@ class NeededStreams:
 
     @property
     def torn(self) -> bool:
-        """Tells whether the file has no proper end."""
+        """Returns whether the file has no proper end."""
         return self._recording.torn
 
     def messages(

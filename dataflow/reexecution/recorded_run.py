@@ -24,7 +24,7 @@ _PROCESS = "process of "
 
 
 class ReplayError(ValueError):
-    """A recording that cannot drive a graph: says which stream is missing and what would help."""
+    """Raised when a recording cannot drive a graph; the message names the missing stream and a remedy."""
 
 
 class NotRecorded(ReplayError):
@@ -36,7 +36,7 @@ class NotRecorded(ReplayError):
 
 
 def recorded_graph(recording: PlayableStreams) -> Graph:
-    """Returns the graph that made a recording, without its network: a recording opens no port and calls nobody.
+    """Returns the graph that made a recording, without its network: a recording opens no port and no connection.
 
     Its operators are imported. Raises `ReplayError` when the recording does not hold a graph, `GraphError`.
     """
@@ -84,7 +84,7 @@ def _missing(node: Node, found: type[Operator] | NotFound) -> str:
 
 
 def isolated(graph: Graph) -> Graph:
-    """Returns a graph whose processes can only be reached from this machine, whatever its `network:` section says."""
+    """Returns a graph whose processes can only be reached from this machine, regardless of its `network:` section."""
     return replace(graph, network=Network(shared_memory=graph.network.shared_memory))
 
 
@@ -160,7 +160,7 @@ def check_type(recording: PlayableStreams, graph: Graph, stream: str) -> None:
 
 
 def final_stamps(recording: PlayableStreams, streams: Iterable[str]) -> dict[str, int]:
-    """The stamps that streams ended with in the recorded run, where the recording says so.
+    """Returns the stamps that streams ended with in the recorded run, where the recording holds them.
 
     Raises `RecordingError` where it cannot be read.
     """
@@ -177,7 +177,7 @@ def final_stamps(recording: PlayableStreams, streams: Iterable[str]) -> dict[str
 
 
 def processes_of(recording: Recording) -> dict[str, str]:
-    """Returns the process in which each operator ran, by operator, where the recording says so."""
+    """Returns the process in which each operator ran, by operator, where the recording holds it."""
     facts = recording.metadata.get(RUN, {})
     return {fact.removeprefix(_PROCESS): label for fact, label in facts.items() if fact.startswith(_PROCESS)}
 

@@ -26,8 +26,8 @@ class WarmStart:
 
 
 def fresh_because(recording: Recording, graph: Graph, node: Node, stamp: int) -> str | None:
-    """Tells why an operator must begin with fresh state at `stamp`, in words; None where its recorded state can be had
-    again."""
+    """Returns why an operator must begin with fresh state at `stamp`, in words; None where its recorded state is
+    available."""
     if node.operator.stateless:
         return None
     try:
@@ -70,7 +70,7 @@ def warm_start(path: Path, graph: Graph, node: Node, stamp: int) -> WarmStart | 
 
 
 def _is_unknown(records: Iterable[FiringRecord], stamp: int) -> bool:
-    """Tells whether records were left out, and no state was recorded between there and `stamp`."""
+    """Returns whether records were left out, and no state was recorded between there and `stamp`."""
     unknown = False
     for record in records:
         if record.stamp > stamp and record.kind in CALLS:

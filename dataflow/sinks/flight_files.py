@@ -37,9 +37,9 @@ class Segment:
 
 
 class FlightFiles:
-    """Deletes files and joins others, on a thread of its own, one after the other.
+    """Deletes files and joins others, on a separate thread, one after the other.
 
-    What deleted files said of operators is folded into a few records each.
+    The records of operators in deleted files are folded into a few each.
     """
 
     def __init__(self, graph: Graph, mode: int) -> None:
@@ -72,7 +72,7 @@ class FlightFiles:
                 log = FiringLog.read(recording)
                 for operator in log.operators:
                     self._prologue[operator] = folded([*self._prologue.get(operator, ()), *log.of(operator)])
-        except RecordingError as error:  # what follows it is not known then, which verification says
+        except RecordingError as error:  # what follows is then unknown, as verification reports
             print(f"flight recorder: {error}", flush=True)
         finally:
             segment.path.unlink(missing_ok=True)

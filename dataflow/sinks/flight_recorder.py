@@ -1,7 +1,7 @@
 """The flight recorder: the last seconds of a run in a ring of files; what a trigger asks for is kept.
 
-Each file of the ring is a recording of some seconds, with the newest message of every stream in front. What a deleted
-file said of operators that still matters (their parameters, how often they were set up) is folded into a few records.
+Each file of the ring is a recording of some seconds, with the newest message of every stream in front. Records of
+operators in a deleted file that still matter (their parameters, how often they were set up) are folded into a few.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Wanted:
 
 
 class FlightSink:
-    """Takes everything, keeps little. What is kept is joined on a thread of its own, so that nothing waits for it."""
+    """Takes everything, keeps little. Kept files are joined on a separate thread, so that nothing waits for it."""
 
     def __init__(self, folder: Path, graph: Graph, streams: list[str], options: Mapping[str, Any]) -> None:
         flight = graph.record.flight
@@ -64,7 +64,7 @@ class FlightSink:
         self._ring.mkdir(0o700)
         self.length = max(flight.keep // PARTS, SHORTEST)
         self.slack = 2 * (graph.record.snapshots or 0) + 2 * self.length
-        """Tells how much more than what is to be kept is there: from a state of every operator on."""
+        """Returns how much more than what is to be kept is there: from a state of every operator on."""
         self._clock = 0
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
@@ -110,7 +110,7 @@ class FlightSink:
         self._store(lambda sink: sink.end(stream, final_stamp, reason))
 
     def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
-        """Takes an event: a restart, or somebody who asks to keep what was."""
+        """Takes an event: a restart, or a request to keep the history."""
         self._store(lambda sink: sink.event(name, stamp, data))
         for reason in self._triggers.event(name, data):
             self._trigger(reason, stamp)
@@ -241,7 +241,7 @@ class FlightSink:
         self._given.clear()
 
     def _forget(self) -> None:
-        """Deletes the files that nobody can ask for any more."""
+        """Deletes the files that can no longer be requested."""
         start = self._clock - self.flight.keep
         if self._wanted is not None:
             start = min(start, self._wanted.start)
@@ -252,7 +252,7 @@ class FlightSink:
             self._work.forget(self._segments.popleft())
 
     def _is_full(self) -> bool:
-        """Tells whether the ring takes more of the disk than it may; says so once."""
+        """Returns whether the ring exceeds its size limit; prints a warning the first time."""
         most = self.flight.disk
         if most is None or self.ring_bytes <= most:
             return False
@@ -264,7 +264,7 @@ class FlightSink:
     # Keeping
 
     def _is_over(self, wanted: Wanted) -> bool:
-        """Tells whether a span is over, and the firing records of it have had the time to come."""
+        """Returns whether a span is over, and the firing records of it have had the time to come."""
         if self._clock <= wanted.due:
             return False
         wanted.over = wanted.over or time.monotonic()

@@ -7,7 +7,7 @@ from dataflow.sinks.sink import SinkProcess
 
 
 class LiveSinkProcess(SinkProcess):
-    """As `SinkProcess`, beside devices that wait for nobody."""
+    """As `SinkProcess`, beside devices that do not wait."""
 
     def open(self) -> None:
         super().open()

@@ -30,7 +30,7 @@ class Lost:
 
     @property
     def any(self) -> bool:
-        """Tells whether anything is lost."""
+        """Returns whether anything is lost."""
         return bool(self.messages) or self.firings > 0 or bool(self.spans)
 
     def because(self, reason: str) -> bool:
@@ -67,7 +67,7 @@ class Outage:
         self._due = now + self._pause
 
     def over(self) -> bool:
-        """Tells whether it is time for a try, and the disk has room."""
+        """Returns whether it is time for a try, and the disk has room."""
         return self._clock() >= self._due and self._has_room()
 
     def _has_room(self) -> bool:

@@ -74,7 +74,7 @@ class RecorderSink:
         self.writer.write(stream, message, seq=seq, incarnation=incarnation)
 
     def firings(self, operator: str, stamp: int, payload: bytes, calls: int = 0) -> None:
-        """Stores a batch of firing records, which tells of `calls` calls.
+        """Stores a batch of firing records, which holds `calls` calls.
 
         `setup()` has no stamp; its record is stored at the stamp of the first message, so that viewers of the file
         show no long nothing before it."""

@@ -66,7 +66,7 @@ class StreamSink(Protocol):
         """Something happened to the run: an operator was restarted, a fault was planned."""
 
     def diagnostics(self, message: Diagnostics) -> None:
-        """Tells how every operator fares."""
+        """Returns how every operator fares."""
 
     def log(self, line: LogLine) -> None:
         """An operator has logged or printed something."""
@@ -77,7 +77,7 @@ class StreamSink(Protocol):
     def flush(self) -> None: ...
 
     def close(self, outcome: str) -> Mapping[str, Any]:
-        """Completes the output; `outcome` is "complete" or says why the run ended. Returns what it wrote."""
+        """Completes the output; `outcome` is "complete" or the reason why the run ended. Returns what it wrote."""
 
 
 class SinkFailure(RuntimeError):
@@ -85,7 +85,7 @@ class SinkFailure(RuntimeError):
 
 
 class SinkProcess:
-    """Takes streams until all have ended or the supervisor says so."""
+    """Takes streams until all have ended or the supervisor ends it."""
 
     def __init__(
         self,
@@ -234,7 +234,7 @@ class SinkProcess:
             self._taken[operator] = stamp
 
     def _report(self, now: float) -> None:
-        """Tells how far it is."""
+        """Returns how far it is."""
         dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
         self._done = min(dynamic, default=FOREVER)
         done = self._reached()
@@ -309,7 +309,7 @@ class SinkProcess:
         self.firings_open.update(key for key in keys if key in self._operator_of)
 
     def _drain(self) -> None:
-        """Takes what has arrived: all others have left, or nobody can say whether they have."""
+        """Takes what has arrived: all others have left, or it is unknown whether they have."""
         clock = AwakeClock()
         deadline = clock() + DRAIN_WITHIN
         while not self.inbox.empty() and clock() < deadline:

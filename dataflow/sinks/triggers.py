@@ -34,7 +34,7 @@ class Triggers:
                 yield {"what": f"{stream} {trigger.field} {_condition(trigger)}", "stream": stream}
 
     def event(self, name: str, data: Mapping[str, Any]) -> Iterator[Reason]:
-        """The reasons that an event gives: somebody who asks, an operator that failed and was started again."""
+        """Yields the reasons that an event gives: a request, or an operator that failed and was started again."""
         if name == "trigger":
             yield {"what": data.get("text") or "asked for"}
         elif name == "restart" and self._raises:
@@ -68,7 +68,7 @@ class Triggers:
 
 
 def _meets(value: Any, trigger: Trigger) -> bool:
-    """Tells whether a field, or any of its elements, meets a condition."""
+    """Returns whether a field, or any of its elements, meets a condition."""
     if trigger.equals is not None:
         return bool(np.any(np.asarray(value) == trigger.equals))
     try:

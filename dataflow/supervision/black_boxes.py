@@ -36,7 +36,7 @@ class Boxes:
             os.close(box)
 
     def close(self) -> None:
-        """Lets go of the boxes that nobody has read."""
+        """Releases the boxes that have not been read."""
         for box in self._boxes.values():
             os.close(box)
         self._boxes.clear()

@@ -1,4 +1,4 @@
-"""Prints what processes say, on a thread of its own: a terminal that was stopped must not stop those who speak."""
+"""Prints the output of processes on a separate thread: a stopped terminal must not stop the processes."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class EarlyNursery:
         return nursery
 
     def close(self) -> None:
-        """Ends the nursery if nobody has taken it."""
+        """Ends the nursery if it has not been taken."""
         if self._nursery is not None:
             self._nursery.close()
             self._nursery = None
@@ -39,7 +39,7 @@ class EarlyNursery:
 
 @contextlib.contextmanager
 def early_nursery() -> Iterator[EarlyNursery]:
-    """Starts a nursery for a graph whose operators are given one thread each, as they are unless it says otherwise."""
+    """Starts a nursery for a graph whose operators are given one thread each, the default."""
     early = EarlyNursery()
     try:
         yield early

@@ -101,7 +101,7 @@ class Child:
 
     @property
     def dead(self) -> bool:
-        """Tells whether it has ended, for when nobody is left to tell."""
+        """Returns whether it has ended, for when no process is left to report that."""
         return self._pidfd is not None and bool(readable([self._pidfd], 0))
 
     def bury(self) -> int | None:
@@ -114,7 +114,7 @@ class Child:
         try:
             os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
             with contextlib.suppress(ProcessLookupError, PermissionError):  # nothing is left of it
-                os.killpg(self.pid, signal.SIGKILL)  # it is not waited for yet: nobody else has its number
+                os.killpg(self.pid, signal.SIGKILL)  # it is not waited for yet: no other process has its number
             found = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
         except ChildProcessError:
             return None
@@ -225,7 +225,7 @@ class Nursery:
         return child
 
     def receive(self) -> list[End | Leftovers]:
-        """Takes in what the nursery says. Raises `NurseryFailed` when it is gone."""
+        """Takes in the nursery's messages. Raises `NurseryFailed` when it is gone."""
         try:
             data, pidfds, _, _ = socket.recv_fds(self._socket, 65536, 16)
         except BlockingIOError:

@@ -2,10 +2,11 @@
 
 Starting Python and importing the runtime takes half a second a process; forking takes milliseconds. The nursery is
 single-threaded, holds no session and no model, and runs with the environment that operators need (thread counts, hash
-seed). It ends when the supervisor does, and tells it how its children ended.
+seed). It ends when the supervisor does, and reports to it how its children ended.
 
-What operators start must end with their process, also what has left its process group or session: each operators'
-process is a subreaper (prctl(2)), which inherits such a descendant when its parent ends, as the nursery does in turn.
+Processes that operators start must end with their process, also if they have left its process group or session: each
+operators' process is a subreaper (prctl(2)), which inherits such a descendant when its parent ends, as the nursery does
+in turn.
 """
 
 from __future__ import annotations
@@ -120,8 +121,8 @@ def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: in
     """Buries a process and everything that its operators have started."""
     pid = children.pop(pidfd)
     os.close(pidfd)
-    with contextlib.suppress(ProcessLookupError, PermissionError):  # it is no group of its own yet
-        os.killpg(pid, signal.SIGKILL)  # before it is waited for: until then nobody else can have its number
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # it does not lead a group yet
+        os.killpg(pid, signal.SIGKILL)  # before it is waited for: until then no other process can have its number
     left = _end_orphans({pid, *children.values()}, pid)
     _, status = os.waitpid(pid, 0)
     if connection is not None:
@@ -138,7 +139,7 @@ def _end_orphans(known: set[int], group: int) -> list[str]:
         for pid in orphans:
             name = _name_outside(pid, group)
             with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)  # our own child, not waited for yet: nobody else has its number
+                os.kill(pid, signal.SIGKILL)  # our own child, not waited for yet: no other has its number
             if not _await_death(pid):
                 known.add(pid)
             if name:

@@ -87,7 +87,7 @@ class RunPlan:
 
     @property
     def keeps_records(self) -> bool:
-        """Tells whether anybody takes the operators' firing records."""
+        """Returns whether the operators' firing records are taken by a sink."""
         return self.record is not None or self.flight is not None
 
 

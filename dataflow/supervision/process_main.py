@@ -109,7 +109,7 @@ def _hand_over(process: Any) -> None:
 
 
 def _report(channel: Channel, error: BaseException, phase: str) -> None:
-    """Tells the supervisor what failed, and in which phase of this process, if it is still there."""
+    """Reports to the supervisor what failed, and in which phase of this process, if it is still there."""
     operator = getattr(error, "operator", None)
     text = cut(getattr(error, "traceback", None) or "".join(traceback.format_exception(error)), MOST_OF_A_TRACEBACK)
     summary = cut(getattr(error, "summary", None) or f"{type(error).__name__}: {error}")
@@ -165,7 +165,7 @@ def main(descriptor: int, handed: Sequence[int]) -> int:
         code = FAILED
         _hand_over(process)
         _report(channel, error, phase)
-        if await_leave(inbox):  # else the end of the run says it
+        if await_leave(inbox):  # else the end of the run reports it
             log_failure(error)
     facts: Any = {}
     try:

@@ -20,7 +20,7 @@ def plan_replay(
     start: float | None = None,
     end: float | None = None,
 ) -> LogPlan:
-    """Tells which recorded streams stand in for which operators: the sources, or those that `replaced` names.
+    """Returns which recorded streams stand in for which operators: the sources, or those that `replaced` names.
 
     `start`, `end`: seconds from the recording's first message, or from where it was cut: then it begins there, with the
     states that operators had. Raises `ReplayError`.

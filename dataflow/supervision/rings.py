@@ -19,7 +19,7 @@ Pairs = Mapping[tuple[str, str], tuple[str, ...]]
 def pairs_of(graph: Graph, processes: Mapping[str, ProcessPlan]) -> dict[tuple[str, str], tuple[str, ...]]:
     """Returns which processes are linked: the recorder and the like first.
 
-    A process sends in this order. What it was killed over after that is recorded, whoever else has taken it.
+    A process sends in this order: if it is killed between two sends, each message that another process has is recorded.
     """
     found = {}
     for consumer, process in sorted(processes.items(), key=lambda each: each[1].sink is None):

@@ -67,7 +67,7 @@ def _takes(node: Node, streams: set[str]) -> bool:
 
 
 def _simulated(node: Node) -> bool:
-    """Returns whether the class of a source says so; a recording may name one that cannot be imported here."""
+    """Returns whether the class of a source is marked so; a recording may name one that cannot be imported here."""
     try:
         return bool(getattr(node.operator, "simulated", False))
     except OperatorImportError:

@@ -37,7 +37,7 @@ TICK = 0.05
 PAUSE = 1.0
 """Seconds for which the supervisor did not run, at once, that are worth saying."""
 NOT_READING_AFTER = 1.0
-"""Seconds for which a process may leave what was sent to it, before the core hears of it."""
+"""Seconds for which a process may leave what was sent to it, before the core is notified."""
 
 
 class Supervisor:

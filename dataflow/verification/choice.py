@@ -104,7 +104,7 @@ def require_ports(recording: Recording, graph: Graph, log: FiringLog, operators:
 
 
 def accountable(recording: Recording, graph: Graph, log: FiringLog, name: str) -> bool:
-    """Tells whether the records of a node can be held against its streams.
+    """Returns whether the records of a node can be held against its streams.
 
     Not where another operator made them (with another graph), nor where a replay did of a stream whose clock had
     jumped: its records count one incarnation, its messages several.

@@ -44,7 +44,7 @@ class OutputDifference:
 
     @staticmethod
     def from_wire(values: Mapping[str, Any]) -> OutputDifference:
-        """From the values of `asdict` after a way that knows only lists."""
+        """Restores a difference from the values of `asdict` after an encoding without tuples."""
         fields = tuple(
             FieldDifference(**{**f, "index": None if f["index"] is None else tuple(f["index"])})
             for f in values["fields"]

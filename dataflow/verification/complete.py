@@ -53,7 +53,7 @@ class Completion:
 
     @property
     def stored(self) -> bool:
-        """Tells whether there is a file: everything that was made again is as recorded."""
+        """Returns whether there is a file: everything that was made again is as recorded."""
         return not any(v.first for v in self.operators)
 
     @property

@@ -1,4 +1,4 @@
-"""The errors by which a verification says what is wrong with what it was given, rather than with this program."""
+"""The errors of a verification that are due to its input rather than to this program."""
 
 from __future__ import annotations
 

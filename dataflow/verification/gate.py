@@ -51,7 +51,7 @@ Outcome = Mapping[str, Any]
 
 
 class BaselineError(ValueError):
-    """A baseline file that cannot be read: says what is wrong with it."""
+    """Raised when a baseline file cannot be read; the message names the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +329,7 @@ def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | No
 
 
 def _led_astray(operator: str, unexpected: Collection[str], producers: Mapping[str, frozenset[str]]) -> bool:
-    """Tells whether an operator depends on an unexpected one that does not in turn depend on it."""
+    """Returns whether an operator depends on an unexpected one that does not in turn depend on it."""
     return any(
         other != operator and operator not in _upstream(other, producers)
         for other in _upstream(operator, producers) & set(unexpected)

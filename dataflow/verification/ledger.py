@@ -25,12 +25,12 @@ COMPLETE = "complete"
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """The messages of one node, as its recording tells of them.
+    """The messages of one node, by the account of its recording.
 
     `unaccounted` were stored, or taken by another operator, and no firing record made them; `not_stored` were made by a
     record and are not in a stream that was recorded. `lost` calls follow a gap in the records. `finished`: the last
-    call is that of `finish()`. What may follow it is no call: a parameter that was changed, the `setup()` of a process
-    that was restarted when the node had ended.
+    call is that of `finish()`. Records that may follow it are no calls: a parameter that was changed, the `setup()` of
+    a process that was restarted when the node had ended.
     """
 
     unaccounted: int
@@ -41,11 +41,11 @@ class Account:
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """The accounts of nodes, and whether the recording tells of its run to the end.
+    """The accounts of nodes, and whether the recording covers its run to the end.
 
     `ended` is False for a file without a proper end (`torn`) and for a run that failed or was interrupted. Records are
-    stored before messages: what a torn file lacks may have followed, what another lacks was never sent. `part`: the
-    file is a part of a recording, cut out of it.
+    stored before messages: messages that a torn file lacks may have followed, those that an intact file lacks were
+    never sent. `part`: the file is a part of a recording, cut out of it.
     """
 
     accounts: Mapping[str, Account]

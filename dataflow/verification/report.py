@@ -1,4 +1,4 @@
-"""The report of a verification: what was re-executed and compared, and what that says of the recording."""
+"""The report of a verification: what was re-executed and compared, and the verdict on the recording."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ class VerifyReport:
     `comparisons` hold, for the operators that differ, how their messages compare with the recorded ones; `repeated`,
     for culprits that were run twice, whether they differed alike. `digests` are (messages, stream digest) of what was
     made here, by stream; `outputs` the streams of each operator, `producers` the nodes that it takes from.
-    `start`: seconds into the recording, where it began there. `torn`: the recording has no proper end, so what is
-    verified is what had been stored. `part`: the recording is a part of another, cut out of it. `work` tells how long
-    each operator worked, `reading` the CPU seconds for which that worker read the recording that read most of it.
-    `absent` are operators whose code is not here, and why: what they made is taken from the recording.
+    `start`: seconds into the recording, where it began there. `torn`: the recording has no proper end, so only
+    its stored part is verified. `part`: the recording is a part of another, cut out of it. `work` is how long each
+    operator worked, `reading` the CPU seconds for which that worker read the recording that read most of it.
+    `absent` are operators whose code is not here, and why: their messages are taken from the recording.
     `shared` are operators that make what was recorded, but not always in one process with those named; `mates` are, by
     operator, those that ran in its process.
     """
@@ -142,7 +142,7 @@ class VerifyReport:
         return "within tolerance" if compared.tolerated else "culprit" if compared.own else "downstream"
 
     def repeats(self, operator: str) -> bool | None:
-        """Tells whether a culprit differed twice alike; None where it was not run twice."""
+        """Returns whether a culprit differed twice alike; None where it was not run twice."""
         return self.repeated.get(operator)
 
     def as_json(self) -> dict[str, Any]:

@@ -36,7 +36,7 @@ Try = Callable[[Sequence[Trial]], Sequence[Answer]]
 class Retrial:
     """The outcome for culprits that were tried again.
 
-    `repeated` tells whether they differed alike both times, in the process that they had. `instead` are the answers
+    `repeated`: whether they differed alike both times, in the process that they had. `instead` are the answers
     that count for operators rather than those of the first trial. `shared` names, by operator that makes what was
     recorded, those that share its process where it does not, or where alone it does. `wrote`: the messages that
     operators wrote into, by operator.

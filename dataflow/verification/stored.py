@@ -36,7 +36,7 @@ class StoredStream:
 
     @staticmethod
     def from_wire(values: Mapping[str, Any]) -> StoredStream:
-        """From the values of `to_wire` after a way that knows only lists."""
+        """Restores an object from the values of `to_wire` after an encoding without tuples."""
         first = {name: tuple(values[name]) for name in values if name.startswith("first") and values[name] is not None}
         return StoredStream(**{**values, **first})
 

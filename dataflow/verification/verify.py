@@ -48,7 +48,7 @@ Attempt = Callable[[Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]], list[A
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """Holds what is to be verified, and what the recording says of it: all that was read before any worker starts.
+    """Holds what is to be verified, with its data from the recording: all that was read before any worker starts.
 
     `unfed`: operators that cannot be repeated, by the stream that they need and the recording does not hold;
     `placed`: the process in which each ran.
@@ -179,7 +179,7 @@ def _prepare(
         chosen = with_makers(held, played, chosen_operators(played, first, only))
         unfed = {} if first or only else unfed_operators(recording, played, chosen, incomplete)
         if unfed.keys() >= chosen:
-            plan_feeding(recording, played, sorted(chosen), incomplete=incomplete)  # says what is missing
+            plan_feeding(recording, played, sorted(chosen), incomplete=incomplete)  # raises, and names what is missing
         chosen -= unfed.keys()
         operators = tuple(name for name in played.nodes if name in chosen)
         require_records(recording, log, operators)
@@ -306,7 +306,7 @@ def _report(
 
 
 def _answer_of_each(answers: Sequence[Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
-    """By operator, the answer that tells of it: of those of several workers the first in which it differs, if any."""
+    """Returns, by operator, the answer about it: of those of several workers the first in which it differs, if any."""
     of: dict[str, Mapping[str, Any]] = {}
     for answer in answers:
         for name, verification in answer["operators"].items():

@@ -165,5 +165,5 @@ def test_a_live_run_cannot_be_paused_and_says_why() -> None:
 
     report = run(graph, placement="one_process", live=True, controls=steered(steer))
 
-    assert "it is a live run: devices and the clock wait for nobody" in told[0]
+    assert "it is a live run: devices and the clock do not wait" in told[0]
     assert report.interrupted

@@ -248,7 +248,7 @@ def stopped_for_a_while(consumer: str) -> Play:
     assert covered(play, 500)[1] == 100  # its backlog still counts
 
     play.wait(3.2)
-    assert "process 'sum' gave no sign of life for 3.0 s; nobody waits for it" in play.core.status.notes
+    assert "process 'sum' gave no sign of life for 3.0 s; it is no longer waited for" in play.core.status.notes
     play.tell(play.progress("other", {"other": 900}))
     assert covered(play, 900)[1] == 900
 

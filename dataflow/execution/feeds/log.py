@@ -41,7 +41,7 @@ class _LoggedStream:
 
     @property
     def is_over(self) -> bool:
-        """Tells whether all its messages were given, as far as that is known before the recording has been read."""
+        """Returns whether all its messages were given, as far as that is known before the recording has been read."""
         return self.promises is None or self.count == len(self.promises) - 1
 
 
@@ -66,7 +66,7 @@ class LogFeed:
         end: int | None = None,
         numbered: Callable[[Iterable[Recorded]], Iterable[Recorded]] = iter,
     ) -> None:
-        """`numbered` gives the messages their numbers; they keep those that were recorded unless it says otherwise."""
+        """`numbered` gives the messages their numbers; by default they keep the recorded ones."""
         self.recording, self.emitter = recording, emitter
         self._ports, self._start = ports, start
         self._records = {node: FiringLog(node, emitter) for node in sorted(set(streams.values()))}
@@ -181,7 +181,7 @@ class LogFeed:
         return len(step), nbytes
 
     def promise(self) -> None:
-        """Every stream of a log is known up to the last stamp that was read, so sparse streams hold nobody up."""
+        """Every stream of a log is known up to the last stamp that was read, so sparse streams delay no consumer."""
         self._end_before(self.last)
         for state in self._streams.values():
             if not state.ended and state.promised < (frontier := state.may_promise(self.last)):

@@ -11,8 +11,8 @@ from dataflow.recording import Recorded
 def gapless(messages: Iterable[Recorded]) -> Iterator[Recorded]:
     """Numbers the messages of each stream without the gaps that a recording may have.
 
-    A gap tells a process that messages were lost on their way to it; what a recording lacks was never sent. The first
-    message of a stream keeps its number, another incarnation begins with 0.
+    A gap means to a process that messages were lost on their way to it, but messages that a recording lacks were never
+    sent. The first message of a stream keeps its number, another incarnation begins with 0.
     """
     due: dict[str, tuple[int, int]] = {}
     for item in messages:

@@ -13,7 +13,7 @@ from dataflow.recording.streams.streams import StreamInfo
 class PlayableStreams(Protocol):
     """Streams of messages by name, read in the order of stamps: a recording, or a bag of another system.
 
-    `metadata`: what the file says of the run that made it, as recordings have it; empty where there was none.
+    `metadata`: the file's description of the run that made it, as recordings have it; empty where there was none.
     """
 
     path: Path
@@ -22,7 +22,7 @@ class PlayableStreams(Protocol):
 
     @property
     def torn(self) -> bool:
-        """Tells whether the file has no proper end."""
+        """Returns whether the file has no proper end."""
 
     def messages(
         self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None

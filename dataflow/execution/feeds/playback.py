@@ -52,12 +52,12 @@ class Playback:
 
     @property
     def holds(self) -> bool:
-        """Tells whether the next step has to wait for somebody to let it pass."""
+        """Returns whether the next step has to wait for a request to let it pass."""
         return self.paused and not self._steps
 
     @property
     def stepping(self) -> bool:
-        """Tells whether the next step was asked for, so that it does not wait for the clock."""
+        """Returns whether the next step was asked for, so that it does not wait for the clock."""
         return self.paused and self._steps > 0
 
     def passed(self) -> None:

@@ -1,4 +1,4 @@
-"""Seeds numpy's global generator when somebody draws from it, not before: seeding costs as much as a small firing.
+"""Seeds numpy's global generator at the first draw, not before: seeding costs as much as a small firing.
 
 `numpy.random` draws under the lock of its bit generator. The one that is put in here is numpy's own, with a lock that
 seeds it first where a seed is pending; so whatever refers to the global generator, and however it was imported, draws
@@ -71,8 +71,8 @@ _WORDS = (ctypes.c_uint32 * (_STATE_WORDS + 1)).from_address(_GENERATOR.ctypes.s
 
 
 def seed_lazily(seed: SupportsInt) -> None:
-    """Seeds the global generator, as `numpy.random.seed` does, with the low 32 bits of `seed`, as soon as anybody asks
-    something of it."""
+    """Seeds the global generator, as `numpy.random.seed` does, with the low 32 bits of `seed`, at the next access
+    to it."""
     if mtrand._rand._bit_generator is _GENERATOR:
         _GENERATOR.lock.pending = seed
     elif type(mtrand._rand._bit_generator) is np.random.MT19937:
@@ -108,7 +108,7 @@ def give_back(held: Held) -> None:
 def peek() -> tuple[object, ...]:
     """Returns a value that differs after a draw, and does not seed the generator.
 
-    While a seed is pending that is a number, since whoever draws settles it; copying the state takes 30 µs.
+    While a seed is pending the value is a number, since a draw settles the seed; copying the state takes 30 µs.
     """
     lock = _GENERATOR.lock
     settled = lock.settled

@@ -1,10 +1,10 @@
-"""Seeds Python's global generator when somebody draws from it, not before: seeding costs more than a small firing.
+"""Seeds Python's global generator at the first draw, not before: seeding costs more than a small firing.
 
-Until then the generator has another class, whose methods seed it first. Its methods written in Python, also those that
-somebody has bound (`from random import shuffle`), go through the ones that are overridden here. `random.random` and
+Until then the generator has another class, whose methods seed it first. Its methods written in Python, also those
+already bound elsewhere (`from random import shuffle`), go through the overridden ones. `random.random` and
 `random.getrandbits` are in C and bound when `random` is imported: their names in the module are replaced meanwhile, and
-where somebody else refers to them (`from random import random`), which their reference counts tell, the generator is
-seeded at once, as it would be without this module. What is drawn is the same either way.
+where other modules refer to them (`from random import random`), as their reference counts show, the generator is
+seeded at once, as it would be without this module. Draws are the same either way.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _STATE = _State()
 
 
 def seed_lazily(seed: SupportsInt) -> None:
-    """Seeds the global generator, as `random.seed(seed)` does, as soon as anybody asks something of it."""
+    """Seeds the global generator, as `random.seed(seed)` does, at the next access to it."""
     if _GENERATOR.__class__ is _Pending:
         _STATE.seed = seed
         return
@@ -53,7 +53,7 @@ def _change_class(to: type[random.Random]) -> None:
 def peek() -> tuple[object, ...]:
     """Returns a value that differs after a draw, and does not seed the generator.
 
-    While a seed is pending that is a number, since whoever draws settles it; copying the state takes 10 µs.
+    While a seed is pending the value is a number, since a draw settles the seed; copying the state takes 10 µs.
     """
     if _GENERATOR.__class__ is _Pending:
         return (_STATE.settled,)

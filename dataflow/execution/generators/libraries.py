@@ -1,4 +1,4 @@
-"""Seeds the generators of the libraries that have some of their own, as far as they are loaded."""
+"""Seeds the generators of loaded libraries that have separate ones."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Follows the modules that a call of an operator loads: whether another one has loaded them before must not matter.
 
 A library with a generator is seeded as soon as it is loaded, with the seed of the call, and gets the thread limits of
-those that were loaded before. What a module draws from the global generators of Python and numpy while it is loaded, or
-how it seeds them, is taken back.
+those that were loaded before. If a module draws from the global generators of Python and numpy while it is loaded, or
+seeds them, their state is restored.
 """
 
 from __future__ import annotations

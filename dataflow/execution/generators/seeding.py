@@ -30,7 +30,7 @@ def version_of(run_facts: Mapping[str, str]) -> int:
     """The version by which a recorded run was seeded. Raises ValueError for one that this code does not know."""
     version = int(run_facts.get(FACT, "1"))
     if not 1 <= version <= VERSION:
-        raise ValueError(f"the run's generators were seeded by version {version}; this code knows 1 to {VERSION}")
+        raise ValueError(f"the run's generators were seeded by version {version}; this code supports 1 to {VERSION}")
     return version
 
 
@@ -46,7 +46,7 @@ def change_seed(graph_seed: int, operator: str, what: str, incarnation: int, sta
 
 
 class FiringSeed:
-    """The seed of a firing, made from (graph seed, operator, stamp) when somebody asks for it as an integer."""
+    """The seed of a firing, made from (graph seed, operator, stamp) when it is converted to an integer."""
 
     __slots__ = ("_of", "_stamp")
 

@@ -1,9 +1,9 @@
 """Finds a live source that draws from the global random generators beside operators in the same process.
 
-A live source is read by a thread of its own, while operators run on the main one. The global generators of `random`,
+A live source is read by a separate thread, while operators run on the main one. The global generators of `random`,
 numpy and torch are one for all threads: what the source draws, a firing that is under way does not get. No lock helps,
-since a source mostly waits for its device inside `stream()`. So such a source is refused, as soon as it draws while no
-operator is at work, where nobody else can have drawn. (OpenCV has a generator for each thread.)
+since a source mostly waits for its device inside `stream()`. So such a source is refused as soon as it draws while no
+operator is at work, when nothing else can have drawn. (OpenCV has a generator for each thread.)
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Tripwire:
         if not same and self._work.begun == self._begun:
             raise SharedGenerators(
                 f"{source} draws from the global random generators (of random, numpy or torch) while operators fire in "
-                "the same process, whose results would change: draw from self.rng, or give the source a process of "
-                "its own (process: or --place)"
+                "the same process, whose results would change: draw from self.rng, or run the source in a "
+                "separate process (process: or --place)"
             )
 
 

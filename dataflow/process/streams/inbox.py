@@ -1,8 +1,8 @@
 """The inbox of a process: what its threads put there, and what arrives through its rings.
 
-One thread takes, any may put. Whoever waits here waits for one eventfd: the writers of the rings, the readers of the
-rings that this process writes to (when they were full and have room again) and its own threads all wake it by that.
-What wakes is that the eventfd is written to (an edge), so nobody reads it.
+One thread takes, any may put. A thread that waits here waits for one eventfd: the writers of the rings, the readers of
+the rings that this process writes to (when they were full and have room again) and its own threads all wake it by that.
+The write to the eventfd wakes (an edge), so the eventfd is never read.
 
 The thread that takes has the *turn*: it alone touches what the process has. While it waits for want of anything to do,
 another thread may have the turn for a moment, and do what it would else have to wake that one for.
@@ -26,7 +26,7 @@ Item = tuple[Any, ...]
 class Inbox:
     """A queue that also takes in rings. `wake`: the eventfd that was handed down; without one, its own.
 
-    Whoever makes it has the turn.
+    The thread that makes it has the turn.
     """
 
     def __init__(self, wake: int | None = None, incoming: Sequence[Incoming] = ()) -> None:
@@ -90,7 +90,7 @@ class Inbox:
         return self._items.popleft()
 
     def empty(self) -> bool:
-        """Tells whether there is nothing, in the rings either."""
+        """Returns whether there is nothing, in the rings either."""
         items = self._items
         for ring in self._incoming:
             if ring.arrived():

@@ -42,7 +42,7 @@ class LossTold(NoLoss):
         self._channel = channel
 
     def lost(self, stream: str, first: int, following: int) -> None:
-        """Tells the supervisor."""
+        """Reports to the supervisor."""
         self._channel.send("gap", stream=stream, first=first, following=following)
 
     def damaged(self, stream: str, how: str) -> None:

@@ -176,12 +176,12 @@ class Outlet:
         self._fanout.close()
 
     def _listened(self, stream: str) -> StreamPublisher | None:
-        """Returns the publisher of a stream to which somebody outside the run subscribes."""
+        """Returns the publisher of a stream that has subscribers outside the run."""
         publisher = self._publishers.get(stream)
         return publisher if publisher is not None and publisher.matched else None
 
     def _send(self, stream: str, envelope: Envelope, *, droppable: bool = True) -> None:
-        """Sends to every process that takes a stream, and over the network if anybody there subscribes to it."""
+        """Sends to every process that takes a stream, and over the network if it has subscribers there."""
         if self._held is not None:
             self._held.append((stream, envelope, droppable))
             return
@@ -235,7 +235,7 @@ class Outlet:
             network.taps.offer(stream, envelope)
 
     def _is_taken(self, stream: str) -> bool:
-        """Tells whether anybody outside this process takes a stream; before `release` somebody still may."""
+        """Returns whether a stream has consumers outside this process; before `release` there may still be some."""
         return self._held is not None or stream in self._fanout.takers or self._listened(stream) is not None
 
     def frontier(self, stream: str, frontier: int) -> None:
@@ -261,7 +261,7 @@ class Outlet:
         return Envelope(kind, stream, incarnation, seq, stamp, reason=reason)
 
     def record(self, record: FiringRecord) -> None:
-        """Keeps a record where it survives this process, ahead of the messages of its firing. What else is done with
+        """Keeps a record where it survives this process, ahead of the messages of its firing. Other work on
         the record of a firing follows its first message, which need not wait for that."""
         if self._unnoted is not None:
             self._note_last()

@@ -19,7 +19,7 @@ class Pace:
 
     @property
     def held(self) -> bool:
-        """Tells whether steps wait for the clock."""
+        """Returns whether steps wait for the clock."""
         return self._began is not None
 
     def due_in(self, stamp: int) -> float:

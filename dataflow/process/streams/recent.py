@@ -18,7 +18,7 @@ OVER = 10.0
 
 
 class RecentFirings:
-    """A firing costs an append to a queue of bounded length; all else is done only when somebody asks.
+    """A firing costs an append to a queue of bounded length; all else is done only on request.
 
     Drops and details, which may be large, are not kept.
     """

@@ -29,7 +29,8 @@ class Barrier:
             run.spawn(process)
 
     def ready(self, process: Supervised, fields: Mapping[str, Any]) -> None:
-        """A process is ready, and says at which stamp its sources begin and how many steps they have, if it knows."""
+        """Takes the report of a process that is ready: the first stamp of its sources, and how many steps they have, if
+        known."""
         status = self.run.status
         first, steps = fields["first"], fields["steps"]
         if first is not None:
@@ -59,7 +60,7 @@ class Barrier:
         return False
 
     def _missing(self, process: Supervised) -> bool:
-        """Tells whether a process is not ready, or does not see all of its edges."""
+        """Returns whether a process is not ready, or does not see all of its edges."""
         return process.life is not Life.PROBING or bool(process.unseen)
 
     def _probe(self, process: Supervised) -> None:
@@ -86,7 +87,7 @@ def _late(processes: Iterable[Supervised]) -> list[Supervised]:
 
 
 def expect_probes(run: RunState, process: Supervised) -> None:
-    """Tells the consumers of a process that took another's place that its streams are to be proven again."""
+    """Notifies the consumers of a process that took another's place that its streams are to be proven again."""
     tell_consumers(run, process, absent=False)
     made = set(process.plan.publish)
     for other in run.processes.values():
@@ -95,7 +96,7 @@ def expect_probes(run: RunState, process: Supervised) -> None:
 
 
 def tell_consumers(run: RunState, process: Supervised, *, absent: bool) -> None:
-    """Tells who takes a process's streams that it is away, or that it is to be heard again."""
+    """Notifies the consumers of a process that it is away, or that it is to be heard again."""
     made = set(process.plan.publish)
     for other in run.processes.values():
         taken = made & run.takes(other)

@@ -1,8 +1,8 @@
-"""The end of a run: first the processes with operators leave, then the recorder and the like, then nobody is left.
+"""The end of a run: first the processes with operators leave, then the recorder and the like, then none is left.
 
-A run that is stopped while it starts has nothing to drain: whoever is still busy with starting is killed soon, which is
+A run that is stopped while it starts has nothing to drain: a process that is still starting is killed soon, which is
 no failure. The sinks leave last: processes hand over firing records when they leave, and a sink is told how the run
-ended only when nothing can go wrong with the others any more. Every step is bounded; who is late is killed.
+ended only when nothing can go wrong with the others any more. Every step is bounded; a process that is late is killed.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Closing:
 
     @property
     def over(self) -> bool:
-        """Tells whether nobody is left; one that does not even die of a SIGKILL is not waited for."""
+        """Returns whether no process is left; one that does not even die of a SIGKILL is not waited for."""
         left = [p for p in self.run.processes.values() if p.reachable]
         return all(p.life is Life.KILLED and self.run.steady - p.since > LEAVE_TIMEOUT for p in left)
 
@@ -89,7 +89,7 @@ class Closing:
 
     @property
     def _has_run(self) -> bool:
-        """Tells whether sources were released, so that there may be something to drain and to write."""
+        """Returns whether sources were released, so that there may be something to drain and to write."""
         return self.run.release is not None
 
     def _leaving(self, *, sinks: bool) -> list[Supervised]:

@@ -200,7 +200,8 @@ class Core:
             part.said(process, kind, fields)
 
     def _failed(self, process: Supervised, fields: Mapping[str, Any]) -> None:
-        """A process says that one of its operators, or it itself, has failed; it waits to be told to leave."""
+        """Takes the report of a process that one of its operators, or it itself, has failed; it waits to be told to
+        leave."""
         if process.life in (Life.KILLED, Life.FAILED):
             return  # its end is decided
         operator, summary = fields["operator"], fields["summary"]
@@ -261,7 +262,7 @@ class Core:
 
 
 def _decides(event: Event) -> bool:
-    """Tells whether a run may go on at once because of this event: a process has reached what others wait for."""
+    """Returns whether a run may go on at once because of this event: a process has reached what others wait for."""
     match event:
         case Said(_, "ready" | "seen" | "ended" | "closed", _) | Died():
             return True

@@ -11,7 +11,7 @@ from dataflow.sync import NEVER
 class LiveFlow:
     """Follows how far sources have got, and how far that leaves others behind. Stamps and lags are ns of event time.
 
-    A source that stops leaves nobody behind: what is counted against an operator is what its sources have given.
+    A source that stops leaves no operator behind: only messages that its sources have given count against an operator.
     """
 
     def __init__(self, graph: Graph, processes: Iterable[Collection[str]]) -> None:
@@ -28,12 +28,12 @@ class LiveFlow:
             self._last[source] = stamp
 
     def lag(self, source: str, done: int) -> int:
-        """Tells how far one that has done everything up to `done` is behind a source."""
+        """Returns how far one that has done everything up to `done` is behind a source."""
         last = self._last.get(source)
         return 0 if last is None else max(0, last - max(done, self._first[source] - 1))
 
     def lags(self, operator: str, done: int) -> tuple[int, int]:
-        """Tells how far an operator is behind the last and the foremost of its sources."""
+        """Returns how far an operator is behind the last and the foremost of its sources."""
         found = [self.lag(source, done) for source in self.upstream[operator]]
         return min(found, default=0), max(found, default=0)
 

@@ -14,7 +14,7 @@ AT_ONCE = 200
 
 
 class LogKeeper:
-    """Queues lines until the next look. What is said between the looks of a second can be more than is recorded."""
+    """Queues lines until the next look. Processes can print more between the looks of a second than is recorded."""
 
     def __init__(self, run: RunState) -> None:
         self._run = run

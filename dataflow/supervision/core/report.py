@@ -63,7 +63,7 @@ class Status:
     paused: bool = False
     """Sources, or the recording in their place, wait until they are let go on."""
     speed: float | None = None
-    """Event time against the clock, as it was last asked for while it runs; None: nobody has, or as fast as it goes."""
+    """Event time against the clock, as last requested while it runs; None: never requested, or as fast as it goes."""
 
     @property
     def covered(self) -> int:
@@ -119,5 +119,5 @@ class RunFailed(RuntimeError):
 
     @property
     def internal(self) -> bool:
-        """Tells whether `details` is a traceback of the runtime's own code, which says nothing about an operator."""
+        """Returns whether `details` is a traceback of the runtime's own code, which does not concern an operator."""
         return self.operator is None and self.details.startswith("Traceback")

@@ -70,7 +70,7 @@ class RunState:
 
     @property
     def under_way(self) -> bool:
-        """Tells whether sources are released and nothing is being closed yet."""
+        """Returns whether sources are released and nothing is being closed yet."""
         return self._phase in (Phase.RUNNING, Phase.STOPPING)
 
     @property
@@ -136,7 +136,8 @@ class RunState:
             self.send(process, kind, replaces=replaces, **fields)
 
     def kill(self, process: Supervised, cause: str = "") -> None:
-        """Kills a process, if there is one that was not killed before; `cause` says why, in words that follow it."""
+        """Kills a process, if there is one that was not killed before; `cause` is the reason, in words that follow its
+        name."""
         if process.take(Step.KILL, self.steady):
             process.cause = cause or process.cause
             self.signal(process, signal.SIGKILL)
@@ -146,7 +147,7 @@ class RunState:
             self.command(Signal(process.label, number))
 
     def note(self, text: str) -> None:
-        """Tells the user something, at once and in the report."""
+        """Shows a message to the user, at once and in the report."""
         self.status.notes.append(text)
 
     def tell_recorder(self, kind: str, /, **fields: Any) -> None:
@@ -159,6 +160,6 @@ class RunState:
         self.tell_recorder("event", name="trigger", stamp=self.event_time(), data={"text": text})
 
     def event(self, name: str, text: str, /, **data: Any) -> None:
-        """Tells the user and the recording something that both must know."""
+        """Shows a message to the user and stores it in the recording."""
         self.note(text)
         self.tell_recorder("event", name=name, stamp=self.event_time(), data={"text": text, **data})

@@ -12,7 +12,7 @@ _CALL: Final = "dataflow/execution/calls.py"
 """File in which the engine calls an operator: what lies outside of it is the same for all."""
 _UNSAID: Final = ("<frozen importlib", "<frozen runpy")
 _LISTENER: Final = ("dataflow/supervision/process_main.py", "_listen")
-"""The thread that waits for what the supervisor says: every process has it, and it is never what is late."""
+"""The thread that waits for the supervisor's messages: every process has it, and it is never the late one."""
 
 
 def shortened(lines: Iterable[str]) -> list[str]:

@@ -55,7 +55,7 @@ class Supervised:
 
     @property
     def life_number(self) -> int:
-        """Tells which process in this place it is; the first is 1."""
+        """Returns which process in this place it is; the first is 1."""
         return self.attempt + 1
 
     @property

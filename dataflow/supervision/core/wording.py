@@ -6,7 +6,7 @@ import signal
 
 
 def how_it_ended(code: int | None) -> str:
-    """Returns what an exit code says of a process."""
+    """Returns the meaning of a process's exit code."""
     if code is None:
         return "ended in a way that is not known"
     if code >= 0:

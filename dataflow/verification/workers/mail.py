@@ -1,6 +1,6 @@
 """Letters between a process and its workers: plain values and firing records, in anonymous files.
 
-Nobody waits for a reader here, as with a socket: a worker that hangs holds up nobody.
+A writer does not wait for a reader here, as with a socket: a worker that hangs delays no other process.
 """
 
 from __future__ import annotations

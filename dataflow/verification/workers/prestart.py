@@ -1,4 +1,4 @@
-"""Worker processes that wait for their calls: started by whoever has calls, or before that is known.
+"""Worker processes that wait for their calls: started by the caller, or before the calls are known.
 
 Next to nothing is imported here, so that a command can start them before it imports what it needs itself.
 """
@@ -45,7 +45,7 @@ class Started:
         self.pid = self._process.pid
 
     def hear(self) -> bool:
-        """Waits until it tells its number; False when it has ended before."""
+        """Waits until it reports its process id; returns False when it has ended before."""
         try:
             _, fields = self.channel.receive()
         except ChannelClosed:
@@ -57,7 +57,7 @@ class Started:
         """Ends the process, if it still runs, with everything that its operators have started."""
         if self.pid:
             with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.pid, signal.SIGKILL)  # not waited for yet: nobody else has its number
+                os.killpg(self.pid, signal.SIGKILL)  # not waited for yet: no other has its number
             if self._process is not None:
                 self._process.wait(timeout=LEAVE_WITHIN)
             else:
@@ -111,7 +111,7 @@ class EarlyWorkers:
         self._maker: subprocess.Popen[bytes] | None = None
         if not _adopts(True):
             return
-        with contextlib.suppress(OSError):  # whoever needs one will try again, and say why it cannot be
+        with contextlib.suppress(OSError):  # a caller that needs one tries again, and reports the error
             self._waiting = [Started() for _ in range(count)]
             if count == 1:
                 self._waiting[0].spawn(1)
@@ -122,7 +122,7 @@ class EarlyWorkers:
         """Has them import modules that they will need, found as they are found here."""
         fields = {"modules": sorted(modules), "environment": as_bytes(environment(1))}
         for worker in self._waiting:
-            with contextlib.suppress(ChannelClosed):  # it has died: whoever takes it sees that
+            with contextlib.suppress(ChannelClosed):  # it has died: `take` finds that
                 worker.channel.send("import", **fields)
 
     def take(self, threads: int) -> Started | None:
@@ -131,13 +131,13 @@ class EarlyWorkers:
         if not self._waiting or any(self._environment[name] != wanted[name] for name in THREADS):
             return None
         worker = self._waiting.pop(0)
-        if not worker.hear():  # whoever starts another one hears why
+        if not worker.hear():  # the caller that starts another one gets the error
             worker.end()
             return None
         return worker
 
     def close(self) -> None:
-        """Ends those that nobody has taken."""
+        """Ends those that have not been taken."""
         if self._maker is not None:
             self._maker.kill()
             self._maker.wait(timeout=LEAVE_WITHIN)

@@ -1,4 +1,4 @@
-"""Calls functions in worker processes of their own, side by side, and watches over them.
+"""Calls functions in separate worker processes, side by side, and watches over them.
 
 No network is involved: a worker has a socket pair to its parent and memory that both share. Whatever a worker does,
 the wait for it is bounded, and it does not outlive the call.
@@ -53,7 +53,7 @@ def call_workers(
     locate: Locate = lambda call, operator, repeated: "a firing",
     watch: Watch | None = None,
 ) -> list[Any]:
-    """The answers to `calls`, each from a process of its own.
+    """Returns the answers to `calls`, each from a separate process.
 
     `threads`: of numerical libraries, as in a run. `early`: workers that were started before, to be taken first.
     `stall_timeout`: seconds allowed without a step of a worker. `watch` is given the status a few times a second.

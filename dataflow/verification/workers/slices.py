@@ -20,7 +20,7 @@ from dataflow.records.reading import FiringLog, whole
 from dataflow.supervision.core.report import OperatorCounts
 
 LEAST_NS = 300_000_000
-"""Work that is worth a slice of its own."""
+"""Work (ns) that is worth a separate slice."""
 
 Share = tuple[int, int]
 """Part and work (ns)."""

@@ -35,7 +35,7 @@ Slot = tuple[int, ...]
 
 
 def main(slots: Sequence[Slot]) -> int:
-    """Imports what verification needs, and serves one parent's slot; of several, each in a process of its own, which
+    """Imports what verification needs, and serves one parent's slot; of several, each in a separate process, which
     becomes a child of that parent. Returns the exit code."""
     _end_with_parent()
     faulthandler.enable()
@@ -56,7 +56,7 @@ def _end_with_parent() -> None:
 
 
 def _serve_apart(slot: Slot, slots: Sequence[Slot], parent: int) -> int:
-    """Serves in a process that was just forked, in a group of its own, once it is a child of `parent`."""
+    """Serves in a process that was just forked, in a separate process group, once it is a child of `parent`."""
     os.setpgid(0, 0)
     for descriptor in slot[3:]:
         os.dup2(descriptor, 1)
@@ -106,7 +106,7 @@ def serve(slot: Slot) -> int:
 
 
 def _import(fields: Mapping[str, Any]) -> None:
-    """Imports modules that a call will need; whatever is wrong with one, the call that needs it says so."""
+    """Imports modules that a call will need; an error in one is reported by the call that needs it."""
     take_over(fields["environment"])
     for module in fields["modules"]:
         with contextlib.suppress(Exception, SystemExit):
@@ -114,7 +114,7 @@ def _import(fields: Mapping[str, Any]) -> None:
 
 
 def _end_with(channel: Channel) -> None:
-    """Ends this process, and what its operators have started, when the parent is gone: it never says anything more."""
+    """Ends this process, and what its operators have started, when the parent is gone: it sends nothing more."""
     try:
         while True:
             channel.receive()

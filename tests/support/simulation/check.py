@@ -94,7 +94,7 @@ def _plan(scenario: Scenario, graph: Graph, path: Path) -> RunPlan:
 
 def _check_pauses(outcome: Outcome) -> None:
     """A pause of the supervisor, alone or with others, is no evidence against any process."""
-    blamed = [line for line in _notes(outcome) if "nobody waits for it" in line or "started again" in line]
+    blamed = [line for line in _notes(outcome) if "no longer waited for" in line or "started again" in line]
     if outcome.killed or blamed:
         raise Violation(f"a pause killed or blamed {sorted(outcome.killed)}: {'; '.join(blamed)}")
 

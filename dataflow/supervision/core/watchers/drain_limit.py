@@ -10,7 +10,7 @@ from dataflow.sync import FOREVER, NEVER
 
 
 class DrainLimit(Watcher):
-    """Ends a run that has not drained in time, and says what it still owed."""
+    """Ends a run that has not drained in time, and reports what it still owed."""
 
     def __init__(self, run: RunState) -> None:
         super().__init__(run)

@@ -1,6 +1,6 @@
-"""Flow control: tells the processes with sources how far everything is done, so that room in their windows comes free.
+"""Flow control: reports to the processes with sources how far all work is done, so that their windows regain room.
 
-Only the latest news counts, so it replaces what a process has not read yet.
+Only the latest report counts, so it replaces one that a process has not read yet.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Cover(Watcher):
         return done
 
     def cover(self) -> None:
-        """Tells each process with sources what is new for it."""
+        """Sends each process with sources its new bounds."""
         raise NotImplementedError
 
 
@@ -62,11 +62,11 @@ class LosslessCover(Cover):
 
 
 class LiveCover(Cover):
-    """Says how far those are behind for whom sources wait (the window), and how far anybody is (the backlog).
+    """Computes how far the operators that sources wait for are behind (the window), and how far any is (the backlog).
 
     An operator does not count while its process is away or gives no sign of life. A new process owes nothing of what
-    was given before it. One that is heard again begins its backlog anew, too, where its queue bounds what it has to
-    take in; with `queue: block` nothing else does, so sources drop until it has caught up.
+    was given before it. One that gives signs of life again begins its backlog anew, too, where its queue bounds what
+    it has to take in; with `queue: block` nothing else does, so sources drop until it has caught up.
     """
 
     def __init__(self, run: RunState) -> None:

@@ -48,7 +48,7 @@ class Heartbeats(Watcher):
                 self._look_for_hang(fields["messages"], fields["bytes"])
 
     def not_reading(self, process: Supervised, seconds: float, *, overflowed: bool) -> None:
-        """One that reads nothing is stopped, like one that says nothing."""
+        """Treats a process that reads nothing like one that sends nothing."""
         late = seconds > BEAT_WITHIN and not process.is_sink  # a recorder may wait for its disk
         if self.run.under_way and process.life is Life.RUNNING and (late or overflowed):
             self._miss(process, f"has read nothing for {seconds:.1f} s")
@@ -64,7 +64,7 @@ class Heartbeats(Watcher):
             self.run.kill(process, cause)
         elif not process.silent and not process.is_sink:
             process.silent = True
-            text = f"{process.describe()} {cause}; nobody waits for it"
+            text = f"{process.describe()} {cause}; it is no longer waited for"
             self.run.event("silent", text, operators=list(process.nodes))
             self._cover.cover()
 

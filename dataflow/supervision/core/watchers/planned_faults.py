@@ -1,4 +1,4 @@
-"""Faults on purpose: does to processes what a fault plan says, or tells them to do it to themselves."""
+"""Injects the faults of a fault plan into processes, or commands them to inject these themselves."""
 
 from __future__ import annotations
 

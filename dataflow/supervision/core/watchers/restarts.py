@@ -30,7 +30,7 @@ class RestartPolicy(Watcher):
     """No process is started again: the first death ends the run."""
 
     def may_restart(self, process: Supervised) -> bool:
-        """Tells whether the policy of a process allows any restart at all."""
+        """Returns whether the policy of a process allows any restart at all."""
         return False
 
     def grant(self, process: Supervised) -> bool:
@@ -102,7 +102,7 @@ class LiveRestarts(RestartPolicy):
         )
 
     def _tell_producers(self, process: Supervised) -> None:
-        """Tells those that a process takes from that what they send is for nobody now."""
+        """Notifies the producers of a process that it no longer takes their messages."""
         for label, producer in self.run.processes.items():
             consumers = [consumer for maker, consumer in self._pairs if maker == label]
             if process.label in consumers:
@@ -124,7 +124,7 @@ class LiveRestarts(RestartPolicy):
         attempts.begun()
         process.take(Step.RESTART, self.run.steady)
         process.renew()
-        if self.run.release is None:  # nobody has heard of the one before
+        if self.run.release is None:  # the one before is unknown to the others
             self._remains.forget(process.nodes)
             process.begins = {}
             self.run.spawn(process)

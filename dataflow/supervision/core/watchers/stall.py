@@ -15,13 +15,13 @@ from dataflow.supervision.core.watchers.watcher import Watcher
 from dataflow.supervision.core.wording import how_long
 
 PING_AFTER = 1.0
-"""Seconds after which a process that says nothing is asked for a sign of life."""
+"""Seconds after which a process that sends nothing is asked for a sign of life."""
 NO_ROUND = 0
 """The number of a question that is no round of the proof of quiescence."""
 
 
 class StallWatch(Watcher):
-    """Ends a run in which nobody has made progress for `stall_timeout` seconds."""
+    """Ends a run in which no process has made progress for `stall_timeout` seconds."""
 
     def __init__(self, run: RunState, quiescence: Quiescence) -> None:
         super().__init__(run)
