@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import traceback
 from functools import cache
-from importlib.metadata import PackageNotFoundError, requires
 
 DISTRIBUTION = "robot-dataflow"
 _OF_MODULES = {
@@ -45,6 +44,8 @@ def _distribution(module: str) -> str:
 
 @cache
 def _extras() -> dict[str, tuple[str, ...]]:
+    from importlib.metadata import PackageNotFoundError, requires  # a command that lacks nothing need not load it
+
     try:
         declared = requires(DISTRIBUTION) or []
     except PackageNotFoundError:

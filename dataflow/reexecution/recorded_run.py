@@ -61,7 +61,7 @@ def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
         if graph is None:
             raise
         absent = {name: why for name, node in graph.nodes.items() if (why := _missing(node, found[name]))}
-        if not absent:
+        if not absent or absent.keys() >= {name for name, node in graph.nodes.items() if not node.external}:
             raise
     nodes = {
         name: replace(node, external=True)

@@ -14,7 +14,7 @@ import dataflow
 from dataflow.api.names import StreamNameError
 from dataflow.messages import Imu, Message
 from dataflow.recording import RecordingError
-from dataflow.recording.streams.streams import reader
+from dataflow.recording.streams import reader
 
 
 @pytest.mark.parametrize("name", ["r1/robot/imu", "/r1/robot/imu", "robot/imu", "imu", "**/imu", "robot/im$*"])

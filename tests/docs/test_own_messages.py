@@ -18,7 +18,7 @@ from dataflow.messages import base as registry
 from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording
 from dataflow.recording.layout import DIGESTS
-from dataflow.recording.streams.streams import diff
+from dataflow.recording.streams.diff import diff
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.run import replay, run

@@ -77,7 +77,9 @@ def test_bag_replayed_in_this_process_is_recorded_and_verified(graph: Path, bag:
     loaded, file = load_graph(graph), tmp_path / "out.mcap"
     outputs = Outputs(file, None, None, False, False)
     options = {"placement": "one_process", "record": file}
-    replay_bag(bag, loaded, MAPS, "auto", None, None, outputs, options, began=0.0, json=False, quiet=True)
+    replay_bag(
+        bag, loaded, MAPS, "auto", None, None, outputs, options, began=0.0, json=False, quiet=True, verbose=False
+    )
 
     with Recording(file) as made:
         assert made.metadata["dataflow:bag"]["clock"] == "header: when it was measured"

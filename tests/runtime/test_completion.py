@@ -10,7 +10,7 @@ import pytest
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.layout import RESERVED_METADATA
-from dataflow.recording.streams.streams import diff
+from dataflow.recording.streams.diff import diff
 from dataflow.records.firing import decode_batch
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.run import replay as replay_recording

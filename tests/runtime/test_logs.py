@@ -13,7 +13,7 @@ from dataflow.cli.main import app
 from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_text
 from dataflow.recording import LogLine, Recording
-from dataflow.recording.streams.streams import diff
+from dataflow.recording.streams.diff import diff
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.run import replay
 from dataflow.supervision.supervisor import Supervisor

@@ -150,7 +150,7 @@ def test_facts_that_differ_from_the_recording_are_named_with_both_values(
 def test_the_facts_hold_the_threads_of_the_processes_and_the_gpus_of_the_driver(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from dataflow.recording.streams.streams import facts
+    from dataflow.recording.streams import facts
 
     with Recording(recorded) as recording:
         assert recording.metadata["threads"]["OMP_NUM_THREADS"] == "1"

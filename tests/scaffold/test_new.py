@@ -40,7 +40,7 @@ def test_a_project_passes_its_own_tests(tmp_path: Path) -> None:
     assert "pytest && dataflow run graphs/my_robot.yaml" in told
     readme = (project / "README.md").read_text(encoding="utf-8")
     assert [line.partition("#")[0].split()[-1] for line in readme.splitlines() if "pip" in line] == [
-        "PATH/TO/robot-dataflow",
+        '"PATH/TO/robot-dataflow[all]"',
         '".[dev]"',
     ]
     for kind in KINDS:

@@ -73,7 +73,7 @@ def digests(results: list[PerceptionResult]) -> dict[str, list[bytes]]:
 def test_the_results_are_those_of_the_graph_and_the_recording_verifies(room: Room, tmp_path: Path) -> None:
     graph, handed = tmp_path / "graph.mcap", tmp_path / "handed.mcap"
     dataflow.replay(DEMO, graph=REPOSITORY / "graphs" / "perception.yaml", end=END, record=graph)
-    with room.system(ALL, record=handed) as system:
+    with room.system(ALL, record=handed, labels="simulator") as system:
         made = digests([system.process(stamp, **step) for stamp, step in room.given(*ALL)])
 
     streams = dataflow.open(graph)
