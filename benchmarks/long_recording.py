@@ -170,7 +170,7 @@ class Block:
         for place in self._places:
             there = position + place - self.POSITION + length * np.arange(size)
             put(indexes, self._indexes, struct.pack("<Q", place), there)
-        flat = memoryview(rows.reshape(-1))
+        flat = rows.reshape(-1).data
         for begin, end, at in self._sums:
             sums = [zlib.crc32(flat[row + begin : row + end]) for row in range(0, size * length, length)]
             rows[:, at : at + 4] = np.array(sums, np.uint32).view(np.uint8).reshape(size, 4)

@@ -204,7 +204,6 @@ def test_a_run_that_failed_while_it_started_says_so(kept: Path, tmp_path: Path) 
     assert (
         "the recorded run ended before operator 'look' began (its outcome: failed: operator 'look' failed in setup()"
         in one.error
-        in one.error
     )
     assert not one.internal
 
