@@ -1,6 +1,6 @@
 """Scene graphs for people: of hundreds of relations the few that are worth telling, as data and in words.
 
-What a node is follows from ids, relations and activities, not from the names of classes: ids up to 0 are places (room,
+The kind of a node follows from ids, relations and activities, not from names of classes: ids up to 0 are places (room,
 floor, walls, table tops) and the robot itself, as SceneGraphBuilder numbers them; agents are the nodes that act.
 """
 

@@ -47,7 +47,7 @@ class $Class(Operator):
 ''')
 
 OPERATOR_TEST = Template('''\
-"""$Title measures what it says."""
+"""Tests of $Title."""
 
 import numpy as np
 import pytest
