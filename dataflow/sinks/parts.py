@@ -59,7 +59,10 @@ class PartsSink:
         self._before = life - 1
         self._earlier: dict[Path, int] = {}
         """Parts of the recorders before, and their sizes."""
-        self._numbered = self._storage.splitting.splits or life > 1
+        self._splits = self._storage.splitting.splits
+        self._numbered = self._splits or life > 1
+        self._continues = self._splits or self._storage.on_failure == "go_on"
+        """Whether a part may follow, which needs what the records before it add up to."""
         self._static = {stream for stream in streams if graph.streams[stream].static}
         self._statics: dict[str, tuple[Message, int, int]] = {}
         self._folded: dict[str, list[FiringRecord]] = {}
@@ -75,10 +78,10 @@ class PartsSink:
         self._after_gap = False
         self._outage = Outage(path.parent)
         self.lost = Lost()
-        if options["overwrite"] and self._storage.splitting.splits and life == 1:
+        if options["overwrite"] and self._splits and life == 1:
             for old in parts_of(path):
                 old.unlink()
-        elif life > 1 and self._storage.splitting.splits:
+        elif life > 1 and self._splits:
             self._earlier = {file: file.stat().st_size for file in parts_of(path)}
         self._current: Part | None = self._open(None)
 
@@ -92,13 +95,14 @@ class PartsSink:
         elif message.stamp > self._clock:
             self._clock = message.stamp
             self._begun = self._begun or self._clock
-            if self._current is not None and self._storage.splitting.due(
-                self._current.sink.writer.saved_bytes, self._clock - self._begun
-            ):
+            if self._current is not None and self._splits and self._is_full(self._current):
                 self._split(self._clock)
-        part = self._part_at(message.stamp)
+        part = self._current if self._full is None else self._part_at(message.stamp)
         if part is not None:
-            self._store(part, lambda: part.sink.message(stream, message, seq, incarnation))
+            try:
+                part.sink.message(stream, message, seq, incarnation)
+            except RecordingError as error:
+                self._failed(part, error)
 
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Stores firing records; those of calls before the current part in the one before, while it is open."""
@@ -175,6 +179,9 @@ class PartsSink:
 
     def _open_parts(self) -> Iterator[Part]:
         yield from [part for part in (self._full, self._current) if part is not None]
+
+    def _is_full(self, part: Part) -> bool:
+        return self._storage.splitting.due(part.sink.writer.saved_bytes, self._clock - self._begun)
 
     def _part_at(self, stamp: int) -> Part | None:
         current = self._current
@@ -302,7 +309,8 @@ class PartsSink:
                     told = partial(part.sink.firings, operator, part.start or 0, encode_batch(before))
                     self._store(part, told)
             self._store(part, lambda: part.sink.firings(operator, records[-1].stamp, payload, calls=calls))
-        self._folded[operator] = folded([*self._folded.get(operator, ()), *records])
+        if self._continues:
+            self._folded[operator] = folded([*self._folded.get(operator, ()), *records])
 
     # Failures
 
@@ -311,21 +319,25 @@ class PartsSink:
         try:
             act()
         except RecordingError as error:
-            if self._storage.on_failure != "go_on":
-                raise
-            if not part.sink.writer.failed:  # it refuses this one thing alone
-                if self.lost.because(str(error)):
-                    print(f"not recorded: {error}", flush=True)
-            elif part in self._open_parts():
-                was_current = part is self._current
-                self._full = None if part is self._full else self._full
-                self._current = None if was_current else self._current
-                self._abandon(part)
-                if was_current:
-                    self._refused(error)
-            else:
-                self._abandon(part)
-                self.lost.because(str(error))
+            self._failed(part, error)
+
+    def _failed(self, part: Part, error: RecordingError) -> None:
+        """Ends the run with a refusal, or goes on without what was refused."""
+        if self._storage.on_failure != "go_on":
+            raise error
+        if not part.sink.writer.failed:  # it refuses this one thing alone
+            if self.lost.because(str(error)):
+                print(f"not recorded: {error}", flush=True)
+        elif part in self._open_parts():
+            was_current = part is self._current
+            self._full = None if part is self._full else self._full
+            self._current = None if was_current else self._current
+            self._abandon(part)
+            if was_current:
+                self._refused(error)
+        else:
+            self._abandon(part)
+            self.lost.because(str(error))
 
     def _refused(self, error: RecordingError) -> None:
         """Nothing is recorded from here on, until the disk takes something again."""
