@@ -1,4 +1,4 @@
-"""Values that cannot be: units that a driver has mixed up, clocks that are years apart, marks that pass for data."""
+"""Checks recorded values for plausibility: mixed-up units, clocks years apart, sentinel values in place of data."""
 
 from __future__ import annotations
 

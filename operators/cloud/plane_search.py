@@ -1,4 +1,4 @@
-"""Planes along and across gravity in a cloud, by random sampling with a known direction of up.
+"""Searches planes along and across gravity in a cloud, by random sampling with a known direction of up.
 
 The up direction leaves one number open for a level plane and two for an upright one, so a sample is one point or two:
 few trials find every plane, and the noise of normals only decides who may vote. Fischler and Bolles, "Random sample

@@ -1,4 +1,4 @@
-"""ROS 2 bags: a folder with one MCAP file and the metadata that rosbag2 wants."""
+"""Writes ROS 2 bags: a folder with one MCAP file and the metadata of rosbag2."""
 
 from __future__ import annotations
 
