@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
 from typing import Any, SupportsInt
 
 from dataflow.execution.generators.loading import LOADS
@@ -12,9 +11,12 @@ from dataflow.execution.generators.loading import LOADS
 def seed_libraries(seed: SupportsInt) -> None:
     """Seeds the libraries that are loaded; one that is just being loaded by another thread is left out."""
     modules = sys.modules
-    for name, library in _LIBRARIES.items():
-        if (module := modules.get(name)) is not None:
-            library(module, seed)
+    if (torch := modules.get("torch")) is not None:
+        _seed_torch(torch, seed)
+    if (cv2 := modules.get("cv2")) is not None:
+        _seed_cv2(cv2, seed)
+    if (open3d := modules.get("open3d")) is not None:
+        _seed_open3d(open3d, seed)
 
 
 def _seed_torch(torch: Any, seed: SupportsInt) -> None:
@@ -51,10 +53,3 @@ def _seed_cv2(cv2: Any, seed: SupportsInt) -> None:
 def _seed_open3d(open3d: Any, seed: SupportsInt) -> None:
     if (utility := getattr(open3d, "utility", None)) is not None:
         utility.random.seed(int(seed) & 0x7FFFFFFF)
-
-
-_LIBRARIES: Mapping[str, Callable[[Any, SupportsInt], None]] = {
-    "torch": _seed_torch,
-    "cv2": _seed_cv2,
-    "open3d": _seed_open3d,
-}

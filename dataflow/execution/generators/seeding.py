@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
+from threading import get_ident
 from typing import Final, SupportsInt
 
 import xxhash
@@ -68,7 +68,7 @@ def seed_generators(seed: SupportsInt, version: int = VERSION) -> None:
     lazy_numpy.seed_lazily(seed)
     seed_libraries(seed)
     if version >= 3:
-        LOADS.seed, LOADS.thread = seed, threading.get_ident()
+        LOADS.seed, LOADS.thread = seed, get_ident()
 
 
 LOADS.follow(seed_libraries)
