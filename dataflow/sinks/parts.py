@@ -62,7 +62,7 @@ class PartsSink:
         self._splits = self._storage.splitting.splits
         self._numbered = self._splits or life > 1
         self._continues = self._splits or self._storage.on_failure == "go_on"
-        """Whether a part may follow, which needs what the records before it add up to."""
+        """True where a part may follow: it needs the sum of the records before it."""
         self._static = {stream for stream in streams if graph.streams[stream].static}
         self._statics: dict[str, tuple[Message, int, int]] = {}
         self._folded: dict[str, list[FiringRecord]] = {}
