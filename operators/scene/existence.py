@@ -73,7 +73,7 @@ def log_odds(entries: Mapping[int, tuple[int, Answers]]) -> dict[int, float]:
         return {}
     scores = np.sum([row for _, a in entries.values() for row in a.given.values()], axis=0)
     below = np.cumsum(scores) / max(float(np.sum(scores)), 1e-9)
-    low, high = (int(np.searchsorted(below, q)) + 1 for q in _THIRDS)
+    low, high = (int(np.searchsorted(below, q)) for q in _THIRDS)
     counts = np.array([answers.counts(class_id, (low, high)) for class_id, answers in entries.values()])
     real, false, share = _REAL, _FALSE, _SHARE
     odds = np.zeros(len(counts))
