@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from _pytest.mark.expression import Expression
 
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("repeatable")
@@ -20,6 +22,16 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPEN
     os.environ.setdefault(name, "1")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+TESTS = REPOSITORY / "tests"
+ROOMS = {
+    "docs": ("docs", "scaffold"),
+    "network": ("client", "foxglove", "transport"),
+    "process": (
+        "analysis", "api", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
+        "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",
+    ),
+}  # fmt: skip
+"""Folders of tests by marker; a test anywhere else is a `unit` test."""
 sys.path += [str(REPOSITORY / "tests" / "support"), str(REPOSITORY / "tools")]
 
 
@@ -35,7 +47,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     """
     whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
     worker = hasattr(config, "workerinput")  # which would divide its part again, and so on without end
-    chosen = config.option.keyword or config.option.markexpr or config.option.usepdb or config.option.collectonly
+    chosen = config.option.keyword or config.option.usepdb or config.option.collectonly
     if (
         whole
         and not worker
@@ -45,6 +57,25 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     ):
         config.option.numprocesses = len(os.sched_getaffinity(0))
         config.option.dist = "worksteal"
+
+
+def marker_of(path: Path) -> str:
+    """Returns the marker of the tests in a file or folder, by the room that it lies in."""
+    inside = path.relative_to(TESTS)
+    return next((name for name, rooms in ROOMS.items() if any(inside.is_relative_to(room) for room in rooms)), "unit")
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    item.add_marker(marker_of(item.path))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leaves out files of which `-m` selects no test, before they import anything."""
+    named = set(re.findall(r"\w+", config.option.markexpr)) - {"and", "or", "not"}
+    if collection_path.suffix != ".py" or not named or not named <= {"unit", *ROOMS}:
+        return None
+    wanted = Expression.compile(config.option.markexpr).evaluate(lambda name, **_: name == marker_of(collection_path))
+    return None if wanted else True
 
 
 @pytest.fixture(scope="session", autouse=True)
