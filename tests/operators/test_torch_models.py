@@ -9,7 +9,7 @@ import pytest
 
 from operators.torch_models import Runner
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch")
 
 

@@ -29,7 +29,7 @@ from operators.detection.nms import intersection_over_union
 from operators.learning.augmentation import NONE, Variation, fitted, tensor_of, warp
 from operators.weights import NetworkFileError, open_network, open_second, shipped
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.detection.custom.loss import Truth, assign, complete_iou, decode_maps, detection_loss
     from operators.detection.custom.network import STRIDES, GridDetector

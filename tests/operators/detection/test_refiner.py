@@ -30,7 +30,7 @@ from operators.training.options import ImageTraining
 from operators.training.refining import add_second
 from operators.weights import NetworkFileError, open_network
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.detection.custom.network import STRIDES, GridDetector
     from operators.detection.custom.refiner_training import RefinerTask, astray, matched

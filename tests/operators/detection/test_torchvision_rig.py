@@ -20,7 +20,7 @@ from dataflow.testing import play
 from operators.detection import TorchvisionDetector, TorchvisionRigDetector
 from operators.segmentation import TorchvisionRigSegmenter, TorchvisionSegmenter
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="needs the extra [torch]")
     models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
 

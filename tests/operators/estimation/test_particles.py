@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
 import pytest
-from filterpy.monte_carlo import systematic_resample
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -22,6 +22,9 @@ from operators.estimation.particles import (
     systematic,
     wrapped,
 )
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    from filterpy.monte_carlo import systematic_resample
 
 WEIGHTS = arrays(np.float64, st.integers(1, 40), elements=st.floats(0.001, 1.0)).map(lambda w: w / w.sum())
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     from torch import Tensor, nn
 

@@ -14,7 +14,7 @@ from operators.segmentation.dataset import read_segmentation_data
 from operators.simulator.classes import CLASSES, THINGS
 from operators.weights import open_network, read_facts, shipped, trained_in_simulation
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     from torch import nn
 

@@ -23,7 +23,7 @@ from operators.training.options import ImageTraining
 from operators.training.refining import add_second
 from operators.weights import NetworkFileError, open_network
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.learning.export import attach_second, export_network, without_second
     from operators.learning.files import TrainingFileError

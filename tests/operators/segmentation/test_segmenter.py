@@ -21,7 +21,7 @@ from operators.segmentation.dataset import VOID, read_segmentation_data
 from operators.segmentation.score import class_iou, confusion, mean_iou
 from operators.weights import NetworkFileError
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.learning.export import export_network
     from operators.learning.loop import Settings, train

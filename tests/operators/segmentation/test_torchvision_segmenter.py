@@ -13,7 +13,7 @@ from dataflow.messages import Image, SegmentationMap
 from dataflow.testing import play
 from operators.segmentation import TorchvisionSegmenter
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="needs the extra [torch]")
     models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
 

@@ -17,7 +17,7 @@ from operators.segmentation.dataset import VOID, read_segmentation_data
 from operators.simulator.classes import CLASSES
 from operators.training import simulated_worlds
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.learning.backbone import SmallResNet
     from operators.learning.loop import Settings, train

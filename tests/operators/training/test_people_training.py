@@ -25,7 +25,7 @@ from operators.training.made_worlds import worlds
 from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, write_episodes
 from operators.weights import NetworkFileError, trained_in_simulation
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.learning.balance import class_weights
     from operators.recognition.posture_training import PostureTask, mirrored

@@ -18,7 +18,7 @@ from operators.segmentation import Segmenter
 from operators.segmentation.dataset import read_segmentation_data
 from operators.weights import NetworkFileError, open_network, read_facts
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.learning.loop import Settings, train
     from operators.training.pair import PairTask

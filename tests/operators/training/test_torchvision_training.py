@@ -20,7 +20,7 @@ from operators.segmentation import TorchvisionSegmenter
 from operators.torch_models import family_of, new_model
 from operators.training.commands import train
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     pytest.importorskip("torchvision", reason="needs the extra [torch]")
     from operators.learning.files import TrainingFileError, load_safely

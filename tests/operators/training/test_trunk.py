@@ -16,7 +16,7 @@ from operators.detection.custom.folder import read_detection_data
 from operators.segmentation.dataset import read_segmentation_data
 from operators.weights import Network, open_network, read_facts
 
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/operators/conftest.py)
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.learning.files import TrainingFileError
     from operators.learning.loop import Settings, train
