@@ -121,6 +121,17 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (detections, {"width": 0}, r"Detections2D\.width must be above zero, got 0"),
     (detections, {"height": -1}, r"Detections2D\.height must be above zero, got -1"),
     (detections, {"visible": [0.1, 1.1]}, r"Detections2D\.visible\[1\]"),
+    (
+        detections,
+        {"masks": np.zeros((2, 480, 79), np.uint8)},
+        r"Detections2D\.masks must have shape \(N, 480, 80\), the bits of 640x480 pixels, got \(2, 480, 79\)",
+    ),
+    (detections, {"masks": np.zeros((1, 480, 80), np.uint8)}, r"masks has N=1, but boxes has N=2"),
+    (
+        detections,
+        {"width": 15, "height": 1, "masks": np.full((2, 1, 2), 255, np.uint8)},
+        r"Detections2D\.masks must be 0 in the 1 bits beyond column 14",
+    ),
     (boxes, {"orientations": [[0, 0, 0, 1.01]]}, r"Boxes3D\.orientations\[0\] must be a unit quaternion"),
     (boxes, {"orientations": [[NAN, 0, 0, 1]]}, r"Boxes3D\.orientations\[0\]"),
     (boxes, {"sizes": [[1, -1, 1]]}, r"Boxes3D\.sizes\[0, 1\] must lie in \[0, inf\], got -1\.0"),

@@ -209,7 +209,7 @@ def test_a_camera_view_shows_its_overlays_and_the_world_does_not() -> None:
     assert contents("camera/image", root) == [
         "+ /r/camera/image",
         "+ /r/camera/image/scale/**",
-        "+ /r/detector/boxes/overlay",
+        "+ /r/detector/boxes/overlay/**",
     ]
     assert "+ /r/odometry/pose/space/**" in contents("World", root)
     assert not any("detector" in line for line in contents("World", root))
