@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import fcntl
+import gc
 import os
 import re
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -59,6 +62,17 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         config.option.dist = "worksteal"
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Spares the garbage collector what collection makes: it all stays until the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
 def marker_of(path: Path) -> str:
     """Returns the marker of the tests in a file or folder, by the room that it lies in."""
     inside = path.relative_to(TESTS)
@@ -84,6 +98,38 @@ def _running_graphs_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iter
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("runtime")))
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _late_imports(request: pytest.FixtureRequest) -> None:
+    """Imports what a module of tests names under `if TYPE_CHECKING:` when its first test runs: torch takes seconds.
+
+    Nothing of that is imported when tests are collected, and where an extra is not installed the tests are skipped.
+    """
+    source = request.path.read_text(encoding="utf-8")
+    for node in ast.parse(source).body if "TYPE_CHECKING" in source else ():
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            exec(compile(ast.Module(node.body, []), request.path, "exec"), vars(request.module))
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Makes files that tests only read, once for all workers: `once(name, make)` is a folder that `make` filled."""
+    session = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        session = session.parent
+
+    def folder_of(name: str, make: Callable[[Path], object]) -> Path:
+        folder = session / f"once_{name}"
+        with folder.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not folder.with_suffix(".made").exists():
+                folder.mkdir(exist_ok=True)
+                make(folder)
+                folder.with_suffix(".made").touch()
+        return folder
+
+    return folder_of
 
 
 @pytest.fixture(scope="session")

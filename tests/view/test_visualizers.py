@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import permutations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import rerun as rr
 from example_messages import example
-from rrd_rows import Row, at, rows
 from scipy.spatial.transform import Rotation
 
 from dataflow import messages
@@ -40,9 +39,14 @@ from dataflow.messages import (
     scalar,
 )
 from dataflow.messages.declaration import Declaration, generic_type
-from dataflow.view import SceneState, ViewOptions, colors, visualize
-from dataflow.view.drawing import roles_of
 from dataflow.view.layout import layout
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    import rerun as rr
+    from rrd_rows import Row, at, rows
+
+    from dataflow.view import SceneState, ViewOptions, colors, visualize
+    from dataflow.view.drawing import roles_of
 
 TYPES = [
     value
