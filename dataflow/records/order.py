@@ -62,7 +62,7 @@ class Outliner:
 
     @property
     def in_order(self) -> bool:
-        """Returns whether all records so far are in order."""
+        """Returns whether all records so far are in order, until `done`."""
         return not self._runs
 
     def take(self, number: int, record: FiringRecord) -> None:
@@ -78,7 +78,13 @@ class Outliner:
 
     def _rise(self, record: FiringRecord) -> None:
         newest = self._newest
-        for stream, at, _ in emitted(record, self._outputs):
+        if record.kind == "cut":
+            sent = [(stream, at) for stream, at, _ in emitted(record, self._outputs)]
+        else:
+            life = record.incarnation
+            made = zip(self._outputs, record.outputs)  # noqa: B905 - a failed call has none
+            sent = [(stream, (life, e.seq)) for stream, e in made if e is not None and e.seq >= 0]
+        for stream, at in sent:
             if at <= newest[stream]:
                 self._scattered.add(stream)
             newest[stream] = at

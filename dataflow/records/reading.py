@@ -8,9 +8,12 @@ from itertools import islice
 from typing import Any, Protocol
 
 from dataflow.recording import Recording, RecordingError
-from dataflow.records.firing import CALLS, FiringRecord, FiringRecordError, decode_batch
+from dataflow.records.firing import CALLS, KINDS, FiringRecord, FiringRecordError, decode_rows, unpack_batch
 from dataflow.records.order import Outline, Outliner, Place, emitted, in_order
 from dataflow.sync import InputRef, MessageRef
+
+_BEHIND = (2**63, 0)
+_CUT = KINDS.index("cut")
 
 
 class Maker(Protocol):
@@ -106,8 +109,10 @@ class FiringLog:
 
         Raises `RecordingError` for a batch that is none, with the file and the operator.
         """
+        watch, origin = self.watch, self._origin
         for payload in self.batches(operator, first, end):
-            yield from self.decoded(operator, payload)
+            watch()
+            yield from _decoded(payload, operator, origin)
 
     def of(self, operator: str) -> tuple[FiringRecord, ...]:
         """All records of one operator in memory, in the order of the file: some hundred bytes each."""
@@ -129,15 +134,34 @@ class FiringLog:
 
     def ordered(self, maker: Maker) -> Iterator[FiringRecord]:
         """The records of `maker` by (incarnation, index), each once."""
-        return in_order(self.outline(maker).runs, partial(self.records, maker.name))
+        runs = self.outline(maker).runs
+        if len(runs) == 1:
+            return self.records(maker.name, 0, runs[0].end)
+        return in_order(runs, partial(self.records, maker.name))
 
     def emissions(self, maker: Maker, stream: str) -> Iterator[tuple[Place, bytes]]:
         """(place, digest) of what `maker` sent on a stream, by its records, in the order of the places."""
-        outputs = tuple(maker.outputs.values())
-        scattered = stream in self.outline(maker).scattered
-        records = self.records(maker.name) if scattered else self.ordered(maker)
+        outline, outputs = self.outline(maker), tuple(maker.outputs.values())
+        if stream not in outline.scattered and len(outline.runs) == 1:
+            return self._sent(maker.name, outputs, stream)
+        records = self.records(maker.name) if stream in outline.scattered else self.ordered(maker)
         told = ((place, digest) for r in records for name, place, digest in emitted(r, outputs) if name == stream)
-        return iter(sorted(dict(told).items())) if scattered else told
+        return iter(sorted(dict(told).items())) if stream in outline.scattered else told
+
+    def _sent(self, operator: str, outputs: Sequence[str], stream: str) -> Iterator[tuple[Place, bytes]]:
+        """(place, digest) of what was sent on a stream, in the order of the file. Decodes no more than that."""
+        port = outputs.index(stream)
+        for payload in self.batches(operator):
+            self.watch()
+            batch = unpack_batch(payload)
+            if any(row[0] == _CUT for row in batch.rows):
+                for record in decode_rows(batch):
+                    yield from ((at, digest) for name, at, digest in emitted(record, outputs) if name == stream)
+                continue
+            for row in batch.rows:
+                made = row[6][port] if port < len(row[6]) else None
+                if made is not None and made[0] >= 0:
+                    yield (batch.incarnation, made[0]), made[2]
 
     def digests(self, makers: Iterable[Maker], streams: Collection[str]) -> Digests:
         """Returns what `makers` sent on `streams`, by their records: to be asked for in the order of each stream."""
@@ -179,29 +203,28 @@ def recorded_firings(recording: Recording, operator: str) -> Iterator[FiringReco
 
 def _decoded(payload: bytes, operator: str, origin: str) -> tuple[FiringRecord, ...]:
     try:
-        batch = decode_batch(payload)
+        batch = unpack_batch(payload)
+        records = decode_rows(batch)
     except FiringRecordError as error:
         raise RecordingError(f"{origin}: firing records of operator {operator!r} are damaged: {error}") from error
     if batch.operator != operator:
         raise RecordingError(
             f"{origin}: a batch of firing records of operator {batch.operator!r} is filed under {operator!r}"
         )
-    return batch.records
+    return records
 
 
-def first_places(ref: InputRef) -> Iterator[tuple[str, tuple[int, int]]]:
+def first_places(ref: InputRef) -> Sequence[tuple[str, tuple[int, int]]]:
     """(stream, (incarnation, number)) of the first message that a reference names on each stream."""
     match ref:
         case None:
-            return
+            return ()
         case MessageRef():
-            yield ref.stream, (ref.incarnation, ref.seq)
+            return ((ref.stream, (ref.incarnation, ref.seq)),)
         case tuple():
-            for run in ref:
-                yield run.stream, (run.incarnation, run.first_seq)
+            return [(run.stream, (run.incarnation, run.first_seq)) for run in ref]
         case _:
-            for one in ref.values():
-                yield one.stream, (one.incarnation, one.seq)
+            return [(one.stream, (one.incarnation, one.seq)) for one in ref.values()]
 
 
 def note_taken(needed: dict[str, tuple[int, int]], record: FiringRecord) -> None:
@@ -209,8 +232,7 @@ def note_taken(needed: dict[str, tuple[int, int]], record: FiringRecord) -> None
     lies before the one that is noted."""
     for ref in record.inputs.values():
         for stream, place in first_places(ref):
-            known = needed.get(stream)
-            if known is None or place < known:
+            if place < needed.get(stream, _BEHIND):
                 needed[stream] = place
 
 

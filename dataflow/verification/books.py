@@ -24,14 +24,31 @@ class Places:
     def __init__(self) -> None:
         self._pages: dict[Place, int] = {}
         """(incarnation, number without its last bits) → a bit for each number."""
+        self._life = self._begin = self._end = 0
+        """The messages that were added last, from one number to before another: they are not among the pages yet."""
 
     def add(self, incarnation: int, seq: int) -> None:
         """Adds a message."""
-        page = incarnation, seq >> _BITS
-        self._pages[page] = self._pages.get(page, 0) | 1 << (seq & _LAST)
+        if incarnation == self._life:
+            if seq == self._end:
+                self._end += 1
+                return
+            if self._begin <= seq < self._end:
+                return
+        self._settle()
+        self._life, self._begin, self._end = incarnation, seq, seq + 1
+
+    def _settle(self) -> None:
+        while self._begin < self._end:
+            page = self._begin >> _BITS
+            end = min(self._end, (page + 1) << _BITS)
+            bits = ((1 << (end - self._begin)) - 1) << (self._begin & _LAST)
+            self._pages[self._life, page] = self._pages.get((self._life, page), 0) | bits
+            self._begin = end
 
     def counts(self) -> Mapping[int, int]:
         """Returns the number of messages by incarnation."""
+        self._settle()
         found = Counter[int]()
         for (incarnation, _), bits in self._pages.items():
             found[incarnation] += bits.bit_count()
@@ -39,6 +56,8 @@ class Places:
 
     def beyond(self, others: Places, since: Place | None = None) -> int:
         """Returns how many of them are not among `others`, all or those from a place on."""
+        self._settle()
+        others._settle()
         first = None if since is None else (since[0], since[1] >> _BITS)
         found = 0
         for page, bits in self._pages.items():
@@ -94,7 +113,7 @@ class Book:
         self._take_outputs(record)
 
     def _take_outputs(self, record: FiringRecord) -> None:
-        counted = self._begin is None or record.index >= self._begin or record.kind == "setup"
+        counts = self.counts(record)
         for stream, emission in zip(self._outputs, record.outputs, strict=False):  # a failed call has none
             if emission is None:
                 continue
@@ -103,16 +122,15 @@ class Book:
                 continue
             self.sent[stream] += 1
             self.digests[stream].update(emission.digest)
-            if counted:
+            if counts:
                 self.made[stream].add(record.incarnation, emission.seq)
                 if self._begin is not None and record.kind != "setup":
                     self.since.setdefault(stream, emission)
-        if not counted:
+        if not counts:
             return
-        if record.kind == "cut":
-            for held in held_by(record):
-                if held.stream in self.made:
-                    self.made[held.stream].add(*held.place)
+        for held in held_by(record) if record.kind == "cut" else ():
+            if held.stream in self.made:
+                self.made[held.stream].add(*held.place)
         place = (record.incarnation, record.index)
         if place > self._last:
             self._last = place
@@ -136,12 +154,11 @@ class Book:
         elif known is not None:
             self.lost += record.kind in CALLS
 
-    def done(self, ordered: Iterator[FiringRecord]) -> None:
+    def follow_anew(self, ordered: Iterator[FiringRecord]) -> None:
         """Goes through the records in the order of the calls, where the file has them otherwise."""
-        if not self.outliner.in_order:
-            self._start_order()
-            for record in ordered:
-                self._follow(record)
+        self._start_order()
+        for record in ordered:
+            self._follow(record)
 
 
 class Books:
@@ -169,8 +186,10 @@ class Books:
             numbers[name] += 1
         for name, book in self._books.items():
             if name not in self._errors:
+                in_order = book.outliner.in_order
                 log.outlined(graph.nodes[name], book.outliner)
-                book.done(log.ordered(graph.nodes[name]))
+                if not in_order:
+                    book.follow_anew(log.ordered(graph.nodes[name]))
 
     def _take_inputs(self, inputs: Mapping[str, InputRef]) -> None:
         for ref in inputs.values():

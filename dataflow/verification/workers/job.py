@@ -61,6 +61,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         until = [work.runners[name].result for name in request["until"]]
         results = work.run(until=lambda: bool(until) and all(result.first is not None for result in until))
         compared = comparer.close(results)
+        stored = [check.result().to_wire() for check in checks.values()]
     slices = request["slices"]
     counts = {
         name: [r.firings, r.ports.emitted, 0, r.work.cpu_ns, r.done, r.work.wall_ns] for name, r in work.runners.items()
@@ -69,7 +70,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         "operators": {name: result.to_wire() for name, result in results.items() if name not in slices},
         "slices": {name: {"operator": results[name].to_wire(), "work": counts[name]} for name in slices},
         "comparisons": {name: asdict(comparison) for name, comparison in compared.items() if name not in slices},
-        "stored": [check.result().to_wire() for check in checks.values()],
+        "stored": stored,
         "digests": {
             state.stream: [state.digest.count, state.digest.hexdigest()]
             for name, runner in work.runners.items()
