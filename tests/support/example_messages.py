@@ -175,7 +175,8 @@ def _compressed_image(values: Values, rng: Rng) -> None:
 
 
 def _compressed_video(values: Values, rng: Rng) -> None:
-    values["data"] = np.frombuffer(b"\0\0\0\1" + rng.bytes(int(rng.integers(1, 40))), np.uint8)
+    delimiter = {"h264": b"\0\0\0\1\x09", "h265": b"\0\0\0\1\x46\1"}[values["format"]]
+    values["data"] = np.frombuffer(delimiter + rng.bytes(int(rng.integers(1, 40))), np.uint8)
 
 
 def _compressed_depth(values: Values, rng: Rng) -> None:

@@ -89,9 +89,7 @@ def ffmpeg_packet(message: Any, stamp: int) -> CompressedVideo:
     """ffmpeg_image_transport_msgs/FFMPEGPacket; its size, time and flags stand in the packet itself."""
     data = np.asarray(message.data, np.uint8)
     _ = message.width, message.height, message.flags, message.is_bigendian
-    return CompressedVideo(
-        stamp=stamp, frame=message.header.frame_id, format=video_format(message.encoding), data=data
-    )
+    return CompressedVideo(stamp=stamp, frame=message.header.frame_id, format=video_format(message.encoding), data=data)
 
 
 def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> CompressedDepth:
