@@ -11,6 +11,7 @@ from dataflow.messages import (
     Boxes3D,
     CameraInfo,
     CompressedImage,
+    CompressedVideo,
     Detections2D,
     Diagnostics,
     Image,
@@ -46,6 +47,8 @@ _READINGS = ("Temperature", "FluidPressure", "Illuminance", "RelativeHumidity")
 CONVERSIONS: dict[str, tuple[type[Message], Convert]] = {
     "sensor_msgs/msg/Image": (Image, images.image),
     "sensor_msgs/msg/CompressedImage": (CompressedImage, images.compressed_image),
+    "foxglove_msgs/msg/CompressedVideo": (CompressedVideo, images.compressed_video),
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": (CompressedVideo, images.ffmpeg_packet),
     "sensor_msgs/msg/CameraInfo": (CameraInfo, images.camera_info),
     "sensor_msgs/msg/PointCloud2": (PointCloud, clouds.point_cloud),
     "sensor_msgs/msg/Imu": (Imu, sensors.imu),
