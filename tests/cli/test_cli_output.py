@@ -261,6 +261,12 @@ def printed(report: RunReport, width: int = 200) -> list[str]:
     return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 
 
+def test_findings_stand_among_the_first_lines() -> None:
+    summaries = {"check": {"pairs": 9, "finding": "the camera is displaced by 2 cm"}, "odometry": {"frames": 9}}
+    lines = printed(replace(lossy_report(), summaries=summaries))
+    assert "found   check: the camera is displaced by 2 cm" in lines[:4]
+
+
 def test_what_matters_comes_first_and_the_rest_is_asked_for() -> None:
     wrote = {"path": "out/a_000.mcap", "parts": ["out/a_000.mcap", "out/a_001.mcap"], "messages": 9, "bytes": 5_000_000}
     report = replace(lossy_report(), files={"@recorder": wrote}, sources=("camera",))

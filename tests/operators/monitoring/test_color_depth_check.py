@@ -112,7 +112,7 @@ def finding(operator: ColorDepthCheck, known: Transforms) -> tuple[str, list[Tra
 
 
 def boards(seed: int, shift: Callable[[float], float]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Returns an image of boards near and far, moved to the right by `shift(depth)` pixels, and points on their rims."""
+    """Returns an image of boards near and far, moved right by `shift(depth)` pixels, and points on their rims."""
     rng, width, height = np.random.default_rng(seed), 640, 480
     image, points = np.full((height, width), 40, np.uint8), []
     for depth in (3.0, 3.0, 3.0, 1.0, 1.0, 1.0):
