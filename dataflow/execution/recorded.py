@@ -28,6 +28,16 @@ from dataflow.records.reading import Digests, beginning, needed_from, whole
 from dataflow.sync import FOREVER, NEVER, Entry, Firing, MessageRef, RecordedAligner
 
 
+class Watcher:
+    """Is told what re-execution is about to do, and what it has done. Called for every step: it must be cheap."""
+
+    def begins(self, phase: str, operator: str) -> None:
+        """`phase`: setup, fire, read or close; `operator`: whose turn it is, empty for read."""
+
+    def stepped(self, runner: RecordedRunner) -> None:
+        """A runner has made a firing, or has ended."""
+
+
 class RecordedRunner(Runner):
     """One operator, re-executed by its `records`. `inputs` are the digests of what it was given; `seeding` is the
     version by which the recorded run seeded its generators; `begin` the stamp from which it is to be repeated. `guard`
@@ -45,9 +55,11 @@ class RecordedRunner(Runner):
         seeding: int = VERSION,
         guard: MemoryGuard | None = None,
         begin: int | None = None,
+        watcher: Watcher | None = None,
     ) -> None:
         super().__init__(node, node.make(), emitter)
         self._guard, self._watched = guard or MemoryGuard(), FOREVER if guard is not None else WATCHED
+        self._watcher = watcher or Watcher()
         self.calls = Calls(node, self.operator, seed, version=seeding)
         self.judge = Judge(node.name, tuple(self.ports.states), inputs)
         kept, lost = whole(records)
@@ -63,7 +75,7 @@ class RecordedRunner(Runner):
         self._position = 0
         self._changed: dict[str, Any] = {}
         self._latest: dict[str, tuple[int, int]] = {}
-        self._open = {s for streams in node.inputs.values() for s in streams}
+        self._open = set(node.taken)
 
     @property
     def result(self) -> Verification:
@@ -72,6 +84,7 @@ class RecordedRunner(Runner):
 
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
+        self._watcher.begins("setup", self.node.name)
         statics = self.calls.setup()
         if self._setup_record is not None:
             self.judge.files(self._setup_record, self.operator.files)
@@ -114,23 +127,35 @@ class RecordedRunner(Runner):
 
     def close(self) -> None:
         """Closes the operator. An error is printed: no record holds the error of `close()` in the run."""
+        self._watcher.begins("close", self.node.name)
         close_quietly(self.operator)
 
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
         if self._position < len(self._records) and not self.ended:
             self.aligner.push(stream, entry)
+        self.wake()
 
     def advance(self, stream: str, frontier: int) -> None:
         """Recorded firings wait for messages, not for promises."""
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self._open.discard(stream)
+        self.wake()
 
     def step(self) -> bool:
         """Makes the next recorded firing once its messages are there; ends when it cannot come any more."""
         if self.ended:
             return False
+        self._watcher.begins("fire", self.node.name)
+        worked = self._make_next()
+        if worked:
+            self.wake()
+            self._watcher.stepped(self)
+        self._watcher.begins("read", "")
+        return worked
+
+    def _make_next(self) -> bool:
         self._repeat_changes()
         firing = self.aligner.poll()
         if firing is None:
@@ -170,7 +195,7 @@ class RecordedRunner(Runner):
 
     def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
         """A fresh operator, with the parameters as they were last set; its static messages."""
-        self.close()
+        close_quietly(self.operator)
         self.operator = self.calls.operator = self.node.make()
         self._change(self._changed, incarnation)
         return self.calls.setup()
