@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from dataflow.execution.recorded import RecordedRunner
+from dataflow.execution.recorded import RecordedRunner, Watcher
 
 PHASES = ("start", "setup", "fire", "read", "close")
 _HEAD = 3
@@ -37,7 +37,7 @@ class Place(NamedTuple):
     operator: str
 
 
-class Board:
+class Board(Watcher):
     """The shared memory of one worker and its parent: who opens it by its descriptor sees what the other wrote.
 
     Integers of 64 bits: phase, operator, steps, then `Counts` of each operator. A parent that reads while the worker
