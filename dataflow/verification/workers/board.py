@@ -62,7 +62,7 @@ class Board(Watcher):
         cells[2] += 1
 
     def goes_on(self) -> None:
-        """Counts a step of what is long and made of small parts, such as reading firing records."""
+        """Counts a step of what may take long before the first one, such as opening a recording."""
         self._cells[2] += 1
 
     def stepped(self, runner: RecordedRunner) -> None:
