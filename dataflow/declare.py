@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import sys
 import types
@@ -30,6 +31,7 @@ class Declaration:
         self.inputs: dict[str, InputPort] = {}
         self.outputs: dict[str, OutputPort] = {}
         self.parameters: dict[str, Any] = {}
+        self.state: Any = None
         for name, hint in self._annotations(local).items():
             self._attribute(name, hint)
         self._refuse_untyped()
@@ -74,10 +76,11 @@ class Declaration:
             if above in (*self.bases, object):
                 continue
             namespace = vars(sys.modules[above.__module__]) if above.__module__ in sys.modules else {}
+            nested = {name: value for name, value in vars(above).items() if isinstance(value, type)}
             try:
                 hints |= {
                     name: typing._eval_type(  # type: ignore[attr-defined]
-                        typing.ForwardRef(a, is_class=True) if isinstance(a, str) else a, namespace, dict(local)
+                        typing.ForwardRef(a, is_class=True) if isinstance(a, str) else a, namespace, {**local, **nested}
                     )
                     for name, a in inspect.get_annotations(above).items()
                 }
@@ -91,6 +94,9 @@ class Declaration:
         origin = typing.get_origin(hint) or hint
         value = getattr(self.cls, name, None)
         if origin is ClassVar:
+            return
+        if name == "state" and dataclasses.is_dataclass(origin):
+            self.state = origin
             return
         if origin not in _PORTS:
             if isinstance(value, (In, Sampled, Batch, Out)):

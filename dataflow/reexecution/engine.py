@@ -7,8 +7,9 @@ Verification, the completion of thin recordings and replays that begin in the mi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 from dataflow.execution.feeds.log import LogFeed
@@ -19,7 +20,8 @@ from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
-from dataflow.records.reading import FiringLog, beginning, needed_from, whole
+from dataflow.records.reading import FiringLog
+from dataflow.records.repetition import Repetition
 from dataflow.reexecution.needed import NeededStreams, first_needed
 from dataflow.reexecution.recorded_run import NotRecorded, check_type, final_stamps, seeding_of
 from dataflow.sync import Entry
@@ -131,9 +133,9 @@ class Recomputation:
         self._ready: dict[str, RecordedRunner] = {}
         consumers: dict[str, list[RecordedRunner]] = {}
         ends = {name: slices[name][1] if name in slices else end for name in feeding.operators}
-        self.records = {name: list(_until(log.of(name), ends[name])) for name in feeding.operators}
+        records = {n: partial(_until, partial(log.ordered, graph.nodes[n]), ends[n]) for n in feeding.operators}
         outlet = _Outlet(consumers, self._ready, self._fed, made, ended)
-        begins = {} if begin is None else _begins(graph, self.records, self._fed, begin)
+        begins = {} if begin is None else _begins(graph, records, self._fed, begin)
         begins |= {name: first for name, (first, _) in slices.items() if first is not None}
         nodes = [graph.nodes[name] for name in feeding.operators]
         taken = {stream for node in nodes for stream in _streams_into(node)}
@@ -143,7 +145,7 @@ class Recomputation:
                 node,
                 outlet,
                 static=frozenset(name for name, stream in graph.streams.items() if stream.static),
-                records=self.records[node.name],
+                records=records[node.name],
                 inputs=inputs,
                 seed=graph.seed,
                 seeding=seeding_of(recording),
@@ -238,7 +240,7 @@ def _streams_into(node: Node) -> set[str]:
 
 
 def _begins(
-    graph: Graph, records: Mapping[str, Sequence[FiringRecord]], fed: frozenset[str], begin: int
+    graph: Graph, records: Mapping[str, Callable[[], Iterable[FiringRecord]]], fed: frozenset[str], begin: int
 ) -> dict[str, int]:
     """From which stamp on each operator is to be repeated: `begin`, or before what those need that take its messages,
     where the recording does not hold them."""
@@ -246,13 +248,12 @@ def _begins(
     moved = list(records)
     while moved:
         node = graph.nodes[moved.pop()]
-        kept, _ = whole(records[node.name])
-        repeated = beginning(kept, begins[node.name], stateless=node.operator.stateless)[1]
-        for stream, place in needed_from(repeated).items():
+        repeated = Repetition(records[node.name], begin=begins[node.name], stateless=node.operator.stateless)
+        for stream, place in repeated.needed.items():
             maker = graph.streams[stream].node
             if stream in fed or maker not in begins:
                 continue
-            made = _stamp_of(records[maker], list(graph.nodes[maker].outputs.values()).index(stream), place)
+            made = _stamp_of(records[maker](), list(graph.nodes[maker].outputs.values()).index(stream), place)
             if made is not None and made <= begins[maker]:
                 begins[maker] = made - 1
                 moved.append(maker)
@@ -268,9 +269,9 @@ def _stamp_of(records: Iterable[FiringRecord], port: int, place: tuple[int, int]
     return None
 
 
-def _until(records: Iterable[FiringRecord], end: int | None) -> Iterator[FiringRecord]:
+def _until(records: Callable[[], Iterable[FiringRecord]], end: int | None) -> Iterator[FiringRecord]:
     """The records before the first call at or after the stamp `end`."""
-    for record in records:
+    for record in records():
         if end is not None and record.kind in CALLS and record.stamp >= end:
             return
         yield record

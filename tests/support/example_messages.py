@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.messages import pack_masks
 from dataflow.messages.base import ArrayField, Message, ScalarField
 
 M = TypeVar("M", bound=Message)
@@ -239,6 +240,10 @@ def _named(*parallel_to: str) -> Callable[[Values, Rng], None]:
 def _detections(values: Values, rng: Rng) -> None:
     _boxes(values, rng)
     _classes(values, rng)
+    if values["masks"] is not None:
+        width, height = (int(extent) for extent in rng.integers(1, 20, 2))
+        pixels = rng.integers(0, 2, (len(values["boxes"]), height, width)).astype(bool)
+        values.update(width=width, height=height, masks=pack_masks(pixels))
 
 
 def _segmentation_map(values: Values, rng: Rng) -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import permutations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import rerun as rr
 from example_messages import example
 from made_video import PERIOD, clip, decoded
-from rrd_rows import Row, at, rows
 from scipy.spatial.transform import Rotation
 
 from dataflow import messages
@@ -38,12 +37,18 @@ from dataflow.messages import (
     Tracks,
     Transforms,
     array,
+    pack_masks,
     scalar,
 )
 from dataflow.messages.declaration import Declaration, generic_type
-from dataflow.view import SceneState, ViewOptions, colors, visualize
-from dataflow.view.drawing import roles_of
 from dataflow.view.layout import layout
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    import rerun as rr
+    from rrd_rows import Row, at, rows
+
+    from dataflow.view import SceneState, ViewOptions, colors, visualize
+    from dataflow.view.drawing import roles_of
 
 TYPES = [
     value
@@ -193,6 +198,21 @@ def test_detections_lie_in_the_plane_of_their_camera(tmp_path: Path) -> None:
     assert at(found, "/detector/boxes/overlay", "CoordinateFrame:frame")[0].values == plane.values
     assert at(found, "/detector/boxes/overlay", "Boxes2D:centers")[0].values == [[20.0, 30.0]]
     assert at(found, "/detector/boxes/overlay", "Boxes2D:labels")[0].values == ["chair 0.75"]
+
+
+def test_masks_are_a_layer_that_goes_when_a_message_has_none(tmp_path: Path) -> None:
+    pixels = np.zeros((1, 48, 64), bool)
+    pixels[0, 20:40, 10:30] = True
+    masked = Detections2D(
+        stamp=STAMP, frame="optical", width=64, height=48, boxes=[[10, 20, 30, 40]], scores=[0.75], class_ids=[1],
+        masks=pack_masks(pixels),
+    )  # fmt: skip
+    found = draw(tmp_path, ("d/x", masked), ("d/x", masked.replace(stamp=STAMP + 1, masks=None)))
+    (layer,) = at(found, "/d/x/overlay/masks", "Image:buffer")
+    alpha = np.array(layer.values, np.uint8).reshape(48, 64, 4)[..., 3]
+    np.testing.assert_array_equal(alpha > 0, pixels[0])
+    (cleared,) = at(found, "/d/x/overlay/masks", "Clear:is_recursive")
+    assert cleared.stamp == STAMP + 1
 
 
 def test_a_class_has_one_colour_whatever_its_number(tmp_path: Path) -> None:

@@ -249,7 +249,7 @@ _NO_PLACE: dict[type[Message], tuple[str, ...]] = {
     NavSatFix: ("satellites",),
     RangeReading: ("variance",),
     ParticleSet: ("weights",),
-    Detections2D: ("visible", "pixel_counts"),
+    Detections2D: ("visible", "pixel_counts", "masks"),
     Boxes3D: ("velocities", "covariances", "visible", "point_counts"),
 }
 """Fields that the ROS type of a message has no place for."""

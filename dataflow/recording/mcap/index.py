@@ -1,6 +1,6 @@
 """Finds every message of an MCAP file, from its index or, for torn and foreign files without one, by a pass.
 
-The index takes 24 bytes of memory a message, whatever the messages hold; of a file of many chunks it takes some 50
+The index takes 24 bytes of memory a message, whatever the messages hold; of a long file it takes some 50
 bytes a chunk, and where their messages lie is read as it is needed.
 """
 

@@ -142,9 +142,12 @@ class Recording:
             yield record
             del record
 
-    def firings(self, operator: str | None = None, start: int | None = None) -> Iterator[tuple[str, bytes]]:
+    def firings(
+        self, operator: str | None = None, start: int | None = None, *, skip: int = 0
+    ) -> Iterator[tuple[str, bytes]]:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order: all of them,
-        or those with log times from `start` (ns) on, which are those of a batch's last record.
+        or those with log times from `start` (ns) on, which are those of a batch's last record, without the first
+        `skip`.
 
         One pass: they lie in separate chunks, without the messages of streams (in older recordings among them).
         """
@@ -153,7 +156,7 @@ class Recording:
             for c in self._channels_of(Kind.FIRINGS)
             if operator is None or c.metadata.get("operator", "") == operator
         }
-        for raw in self._in_file_order(list(channels), start):
+        for raw in self._in_file_order(list(channels), start, skip=skip):
             yield channels[raw.channel], bytes(raw.data)
 
     def firing_batches(self) -> Mapping[str, int]:
@@ -300,12 +303,15 @@ class Recording:
         return ((ordered[i], row) for i, row in merged(cursors))
 
     def _in_file_order(
-        self, channels: list[int], start: int | None = None, end: int | None = None
+        self, channels: list[int], start: int | None = None, end: int | None = None, *, skip: int = 0
     ) -> Iterator[RawMessage]:
         for part in self._file.index.in_file_order(channels, start, end):
             for place in in_file_order(list(part.items())):
                 if (start is None or place[3] >= start) and (end is None or place[3] <= end):
-                    yield self._file.read(*place)
+                    if skip:
+                        skip -= 1
+                    else:
+                        yield self._file.read(*place)
 
 
 def _merged(records: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, str]]:
