@@ -134,7 +134,8 @@ class RecordedRunner(Runner):
         self._latest[stream] = (entry.incarnation, entry.seq)
         if self._position < len(self._records) and not self.ended:
             self.aligner.push(stream, entry)
-        self.wake()
+        if not self.awake:
+            self.wake()
 
     def advance(self, stream: str, frontier: int) -> None:
         """Recorded firings wait for messages, not for promises."""
