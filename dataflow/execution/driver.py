@@ -24,15 +24,18 @@ Maker = SourceRunner | Runner
 class Driver:
     """The sources and operators of one process, which of them take a stream, and the feeds.
 
-    `arrived` returns whether something has come in that is to be taken before the feeds give more.
+    `arrived` returns whether something has come in that is to be taken before the feeds give more; `in_order` as for
+    `Ready`.
     """
 
-    def __init__(self, feeding: Feeding | None = None, arrived: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self, feeding: Feeding | None = None, arrived: Callable[[], bool] = lambda: False, *, in_order: bool = False
+    ) -> None:
         self.feeding = feeding or Feeding()
         self._arrived = arrived
         self.sources: list[SourceRunner] = []
         self.operators: list[Runner] = []
-        self.ready = Ready()
+        self.ready = Ready(in_order=in_order)
         """Those of the operators that have something to do."""
         self.consumers: dict[str, list[Runner]] = {}
 

@@ -13,10 +13,14 @@ from dataflow.execution.protocol import Runner
 
 
 class Ready:
-    """The runners of one process, in graph order."""
+    """The runners of one process, in graph order.
 
-    def __init__(self, clock: Callable[[], float] | None = None) -> None:
-        self._clock = clock or time.monotonic
+    The last of the graph are asked first, so that what is under way is done before more is begun; with `in_order`, the
+    first ones.
+    """
+
+    def __init__(self, clock: Callable[[], float] | None = None, *, in_order: bool = False) -> None:
+        self._clock, self._last_first = clock or time.monotonic, not in_order
         self.woken: list[Runner] = []
         """Those that are to be asked next."""
         self._runners: list[Runner] = []
@@ -38,8 +42,8 @@ class Ready:
             runner.wake()
 
     def step(self) -> bool:
-        """Makes one step of every runner that has something to do, the last of the graph first, so that what is under
-        way is done before more is begun. False when there was nothing to do, and nothing has come of asking."""
+        """Makes one step of every runner that has something to do. False when there was nothing to do, and nothing has
+        come of asking."""
         if self._soonest:
             self._wake_due()
         if not self.woken:
@@ -47,7 +51,7 @@ class Ready:
         asked = self.woken.copy()
         self.woken.clear()
         if len(asked) > 1:
-            asked.sort(key=_place, reverse=True)
+            asked.sort(key=_place, reverse=self._last_first)
         worked = False
         for runner in asked:
             runner.awake = False

@@ -140,7 +140,8 @@ class RecordedRunner(Runner):
         if self._next is not None and not self.ended and self.aligner.takes(stream, entry):
             self.judge.arrived(stream, entry)
             self.aligner.push(stream, entry)
-        self.wake()
+        if not self.awake:
+            self.wake()
 
     def advance(self, stream: str, frontier: int) -> None:
         """Recorded firings wait for messages, not for promises."""

@@ -108,7 +108,7 @@ class Recomputation:
         guard: MemoryGuard | None = None,
         watcher: Watcher | None = None,
     ) -> None:
-        self._driver = Driver()
+        self._driver = Driver(in_order=True)  # who writes into a message comes before those whose digests show it
         ends = {name: slices[name][1] if name in slices else end for name in feeding.operators}
         records = {n: partial(_until, partial(log.ordered, graph.nodes[n]), ends[n]) for n in feeding.operators}
         outlet = _HandOver(self._driver, frozenset(feeding.streams), made, ended)
