@@ -29,8 +29,8 @@ class MonoDepth(Operator):
 
     One image has no scale: `relative` is inverse depth up to a factor and a constant. Where `sparse` gives metric
     depth at some pixels (a stereo pair's, a projected LiDAR's), both are fitted to it, robustly, image by image, and
-    `depth` is the whole image in metres; without agreement no `depth`, and a warning in `status`. An image that is
-    black or without contrast gives neither.
+    `depth` is the whole image in metres; without agreement no `depth`, and a warning in `status`. A model whose
+    `answer` is metres gives `depth` by itself. An image that is black or without contrast gives neither.
 
     The model is one of `dataflow models` by name, or a file. It takes one (1, 3, H, W) input of RGB in float32, float16
     or uint8 and gives one value per pixel, larger for nearer, as those of Li et al., "Enforcing temporal consistency in
@@ -54,6 +54,9 @@ class MonoDepth(Operator):
     normalization: Literal["none", "unit", "imagenet"] = Param(
         "none", doc="of pixels: as they are, as shares of 255, or those less ImageNet's mean by its deviation"
     )
+    answer: Literal["nearness", "metres"] = Param(
+        "nearness", doc="what the model gives: larger for nearer without a scale, or depth in metres"
+    )
     input_size: tuple[int, int] = Param((518, 518), doc="(width, height) where the model leaves it open", unit="px")
     align: Literal["scale_and_shift", "scale"] = Param(
         "scale_and_shift", doc="what is fitted to the given depths: the model's own constant is unknown, or is 0"
@@ -70,6 +73,7 @@ class MonoDepth(Operator):
         self._session = open_session(used.file)
         mean, scale = NORMALIZATIONS[used.setting(self, "normalization")]
         free = tuple(used.setting(self, "input_size"))
+        self._metric = used.setting(self, "answer") == "metres"
         self._input = image_input(
             used.file, self._session, (free[0], free[1]), bgr=False, mean=mean, scale=scale, layouts=("nchw",)
         )
@@ -81,7 +85,13 @@ class MonoDepth(Operator):
         if (flaw := _flaw(image.data)) is not None:
             self._counts.update({"images": 1, f"images {flaw}": 1})
             return {"status": counted_status("mono_depth", image.stamp, f"the image is {flaw}", Level.WARN, counts)}
-        nearness = self._nearness(image.data)
+        nearness = self._answer(image.data)
+        if self._metric:
+            self._counts.update({"images": 1, "images with a scale": 1})
+            near = np.where(np.isfinite(nearness) & (nearness > 0) & (nearness <= self.max_range), nearness, 0)
+            depth = DepthImage(stamp=image.stamp, frame=image.frame, data=near.astype(np.float32))
+            status = counted_status("mono_depth", image.stamp, "the model gives metres", Level.OK, counts)
+            return {"depth": depth, "status": status}
         messages: dict[str, Any] = {"relative": RelativeDepth(stamp=image.stamp, frame=image.frame, data=nearness)}
         scaling, text, level = None, "no metric depth is given: relative only", Level.OK
         if sparse is not None:
@@ -106,7 +116,7 @@ class MonoDepth(Operator):
     def summary(self) -> Mapping[str, float | int]:
         return dict(self._counts)
 
-    def _nearness(self, pixels: NDArray[np.uint8]) -> Nearness:
+    def _answer(self, pixels: NDArray[np.uint8]) -> Nearness:
         """Returns the model's output (H, W) for pixels (H, W) or (H, W, 3), at their size."""
         color = three_channels(pixels)
         height, width = color.shape[:2]

@@ -43,8 +43,8 @@ class OnnxDetector(Operator):
     )
     classes: str | None = Param(
         None,
-        doc="text file with one class name a line; none takes the registry's, those of the model's metadata, or the 80 "
-        "of COCO",
+        doc="text file with one class name a line, or the names with commas between (`mug, fire extinguisher`); none "
+        "takes the registry's, those of the model's metadata, or the 80 of COCO",
     )
     score_threshold: float | None = Param(
         None, ge=0, le=1, live=True, doc="boxes below are dropped; none takes the registry's for the model, or 0.3"
@@ -106,7 +106,9 @@ class OnnxDetector(Operator):
 
     def _names(self, model: Model | None) -> tuple[str, ...] | None:
         if self.classes is not None:
-            return read_labels(self.use_file(self.classes)).names
+            names = tuple(name.strip() for name in self.classes.split(","))
+            file = len(names) == 1 or Path(self.classes).is_file()
+            return read_labels(self.use_file(self.classes)).names if file else names
         if model is None or model.classes is None:
             return None
         if isinstance(model.classes, list):

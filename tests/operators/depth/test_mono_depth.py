@@ -180,6 +180,18 @@ def test_missing_and_unfit_models_are_named(tmp_path: Path) -> None:
         MonoDepth(model=str(network(tmp_path / "four.onnx", (1, 4, 8, 8)))).setup()
 
 
+def test_a_model_that_answers_in_metres_gives_depth_by_itself(model: Path) -> None:
+    image = photograph(scene(), grey=True)
+    played = estimated(model, image, None, answer="metres", max_range=60.0)
+    (depth,) = played["depth"]
+    expected = np.asarray(image.data, np.float32)
+    np.testing.assert_allclose(depth.data, np.where(expected <= 60, expected, 0), atol=1e-3)
+    assert (depth.data > 0).any()
+    assert (depth.data == 0).any()
+    assert not played["relative"]
+    assert status_of(played) == ("the model gives metres", 0)
+
+
 def test_an_open_input_takes_the_given_size_and_pixels_are_normalised(tmp_path: Path) -> None:
     """The model passes the mean of its channels on, here of ImageNet's normalisation."""
     file = network(tmp_path / "open.onnx", (1, 3, "h", "w"))

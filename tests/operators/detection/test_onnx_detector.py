@@ -104,6 +104,12 @@ def test_class_names_come_from_a_file(tmp_path: Path) -> None:
     assert set(made.files) == {model, str(tmp_path / "names.txt")}  # both content hashes are on record
 
 
+def test_class_names_may_be_given_as_text(tmp_path: Path) -> None:
+    model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
+    found = detector(model=model, decoder="yolov8", fit="stretch", classes="mug, fire extinguisher").process(red())
+    assert found.labels() == ("fire extinguisher",)
+
+
 @pytest.mark.parametrize("given", [("crate",), ("crate", "pallet", "forklift")])
 def test_as_many_class_names_are_needed_as_the_model_has_classes(tmp_path: Path, given: tuple[str, ...]) -> None:
     model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
