@@ -96,7 +96,7 @@ def _moved_box(
     T_first_camera: Sequence[NDArray[np.float64]],
     K: NDArray[np.float64],
 ) -> NDArray[np.float64] | None:
-    """Returns the thing's labelled box (4,) that is nearest in time, moved to the image of pose `at`; None if behind."""
+    """Returns the labelled box (4,) that is nearest in time, moved to the image of pose `at`; None if behind it."""
     if thing["kind"] == "moving":
         boxes, centre = [each for each in thing["at"] if "box" in each], None
     else:
@@ -108,16 +108,16 @@ def _moved_box(
     if centre is None:
         return box if abs(nearest["t"] - times[at]) < 0.5 else None
     there = int(np.abs(times - nearest["t"]).argmin())
-    (u, v, z), (u0, v0, z0) = (
-        _pixel(np.array(centre, np.float64), T_first_camera[k], K) for k in (at, there)
-    )
+    (u, v, z), (u0, v0, z0) = (_pixel(np.array(centre, np.float64), T_first_camera[k], K) for k in (at, there))
     if z <= 0.1 or z0 <= 0.1:
         return None
     corners = (box.reshape(2, 2) - [u0, v0]) * z0 / z + [u, v]
     return np.asarray(corners.ravel())
 
 
-def _pixel(place: NDArray[np.float64], T_first_camera: NDArray[np.float64], K: NDArray[np.float64]) -> tuple[float, ...]:
+def _pixel(
+    place: NDArray[np.float64], T_first_camera: NDArray[np.float64], K: NDArray[np.float64]
+) -> tuple[float, ...]:
     x, y, z = transform_points(invert(T_first_camera), place[None])[0]
     return float(K[0, 0] * x / z + K[0, 2]), float(K[1, 1] * y / z + K[1, 2]), float(z)
 
