@@ -59,9 +59,8 @@ def main() -> None:
             assert all(frame is not None for frame in shown), decoder.lost
             decoder.close()
             size = sum(map(len, sent)) // len(sent)
-            print(
-                f"{format_} {width}x{height}: {each * 1e3:.1f} ms a packet of {size:,} bytes, first {first * 1e3:.0f} ms"
-            )
+            times = f"{each * 1e3:.1f} ms a packet of {size:,} bytes, first {first * 1e3:.0f} ms"
+            print(f"{format_} {width}x{height}: {times}")
 
 
 if __name__ == "__main__":

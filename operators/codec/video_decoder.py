@@ -55,6 +55,11 @@ class VideoDecoder(Operator):
             made["status"] = self._status(video.stamp, "")
         return made
 
+    def on_reset(self, input: str) -> None:
+        """The recording begins anew: its packets do not follow on those before."""
+        self.close()
+        self._decoder = None
+
     def close(self) -> None:
         decoder: PacketDecoder | None = getattr(self, "_decoder", None)
         if decoder is not None:

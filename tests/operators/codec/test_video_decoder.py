@@ -75,6 +75,18 @@ def test_lost_pictures_are_marked_until_the_next_key_frame() -> None:
     }
 
 
+def test_after_a_jump_of_the_clock_decoding_begins_with_a_key_frame() -> None:
+    decoder = VideoDecoder()
+    decoder.setup()
+    sent = messages("h264")
+    for message in sent[:12]:
+        assert "image" in decoder.process(message)
+    decoder.on_reset("video")  # the next number fits, and the picture does not
+    assert decoder.process(sent[4])["status"].messages == ("its parameter sets (SPS, PPS) have not come",)
+    assert "image" in decoder.process(sent[8])
+    decoder.close()
+
+
 def test_a_stream_with_b_frames_is_refused_by_its_stamp() -> None:
     decoder = VideoDecoder()
     decoder.setup()
