@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage as CompressedImageProto
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
@@ -56,11 +57,30 @@ class Drawn:
 
 
 def boxes_over(m: Detections2D) -> ImageAnnotations:
-    """Boxes and labels over the image."""
+    """Boxes and labels over the image, and the rims of masks where there are any."""
     made = ImageAnnotations(timestamp=timestamp_of(m.stamp))
+    for k in range(m.count):
+        mask = m.mask(k)
+        if mask is not None:
+            made.points.append(_rim(made, mask))
     for label, box, score in zip(m.labels(), m.boxes.tolist(), m.scores.tolist(), strict=True):
         _outline(made, box, f"{label} {score:.2f}")
     return made
+
+
+def _rim(made: ImageAnnotations, mask: npt.NDArray[np.bool_]) -> PointsAnnotation:
+    """Returns the pixels of a mask (H, W) that have a neighbour outside it."""
+    around = np.pad(mask, 1)
+    inner = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
+    rows, columns = np.nonzero(mask & ~inner)
+    points = [Point2(x=x + 0.5, y=y + 0.5) for x, y in zip(columns.tolist(), rows.tolist(), strict=True)]
+    return PointsAnnotation(
+        timestamp=made.timestamp,
+        type=PointsAnnotation.POINTS,
+        points=points,
+        outline_color=_GREEN,
+        thickness=1.0,
+    )
 
 
 def tracks_over(m: Tracks) -> ImageAnnotations:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataflow.messages.arrays import F32, F64, I32, I64
-from dataflow.messages.base import Message, array, scalar
+import numpy as np
+import numpy.typing as npt
+
+from dataflow.messages.arrays import F32, F64, I32, I64, U8
+from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import ordered_boxes, positive, table_indices, unit_quaternions, within
 
 
@@ -24,17 +27,33 @@ class Detections2D(Message):
     ids: I64 | None = array("int64", "N", "identity of each object over time (tracker, simulator)", default=None)
     visible: F32 | None = array("float32", "N", "share of the object that is not hidden, [0, 1]", default=None)
     pixel_counts: I64 | None = array("int64", "N", "visible pixels of each object", unit="px", default=None)
+    masks: U8 | None = array(
+        "uint8",
+        "N H B",
+        "visible pixels of each object, a bit for each of the image's, rows padded with 0 to whole bytes, highest bit "
+        "first (`pack_masks`)",
+        default=None,
+        added=True,
+    )
 
     def validate(self) -> None:
         positive(self, "width", "height")
         ordered_boxes(self, "boxes")
         within(self, 0.0, 1.0, "scores", "visible")
         table_indices(self, "class_ids", "class_names")
+        if self.masks is not None:
+            _of_image(self.masks, self.width, self.height)
 
     @property
     def count(self) -> int:
         """Number of objects."""
         return len(self.boxes)
+
+    def mask(self, index: int) -> npt.NDArray[np.bool_] | None:
+        """Returns the visible pixels (height, width) of an object; None where masks are not known."""
+        if self.masks is None:
+            return None
+        return np.unpackbits(self.masks[index], axis=1, count=self.width).view(np.bool_)
 
     def labels(self) -> tuple[str, ...]:
         """Class name of each object, or its class id as text where classes have no names."""
@@ -73,6 +92,23 @@ class Boxes3D(Message):
     def labels(self) -> tuple[str, ...]:
         """Class name of each object, or its class id as text where classes have no names."""
         return _labels(self.class_ids, self.class_names)
+
+
+def pack_masks(masks: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
+    """Returns masks (N, H, W) as `Detections2D.masks` holds them, (N, H, ceil(W / 8)): `numpy.packbits` along rows."""
+    return np.packbits(masks, axis=2)
+
+
+def _of_image(masks: U8, width: int, height: int) -> None:
+    """Raises MessageError for masks of another image's size, or set bits beyond its last column."""
+    if masks.shape[1:] != (height, -(-width // 8)):
+        raise MessageError(
+            f"Detections2D.masks must have shape (N, {height}, {-(-width // 8)}), the bits of {width}x{height} pixels, "
+            f"got {masks.shape}"
+        )
+    beyond = -width % 8
+    if beyond and (masks[:, :, -1] & ((1 << beyond) - 1)).any():
+        raise MessageError(f"Detections2D.masks must be 0 in the {beyond} bits beyond column {width - 1}")
 
 
 def _labels(class_ids: I32, class_names: tuple[str, ...]) -> tuple[str, ...]:

@@ -7,8 +7,9 @@ Verification, the completion of thin recordings and replays that begin in the mi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 from dataflow.execution.driver import Driver, HandOver
 from dataflow.execution.feeds.log import LogFeed
@@ -19,7 +20,8 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
-from dataflow.records.reading import FiringLog, beginning, needed_from, whole
+from dataflow.records.reading import FiringLog
+from dataflow.records.repetition import Repetition
 from dataflow.reexecution.needed import NeededStreams, first_needed
 from dataflow.reexecution.recorded_run import NotRecorded, check_type, final_stamps, seeding_of
 from dataflow.sync import Entry
@@ -108,9 +110,9 @@ class Recomputation:
     ) -> None:
         self._driver = Driver(in_order=True)  # who writes into a message comes before those whose digests show it
         ends = {name: slices[name][1] if name in slices else end for name in feeding.operators}
-        self.records = {name: list(_until(log.of(name), ends[name])) for name in feeding.operators}
+        records = {n: partial(_until, partial(log.ordered, graph.nodes[n]), ends[n]) for n in feeding.operators}
         outlet = _HandOver(self._driver, frozenset(feeding.streams), made, ended)
-        begins = {} if begin is None else _begins(graph, self.records, frozenset(feeding.streams), begin)
+        begins = {} if begin is None else _begins(graph, records, frozenset(feeding.streams), begin)
         begins |= {name: first for name, (first, _) in slices.items() if first is not None}
         nodes = [graph.nodes[name] for name in feeding.operators]
         taken = {stream for node in nodes for stream in node.taken}
@@ -120,7 +122,7 @@ class Recomputation:
                 node,
                 outlet,
                 static=graph.static,
-                records=self.records[node.name],
+                records=records[node.name],
                 inputs=inputs,
                 seed=graph.seed,
                 seeding=seeding_of(recording),
@@ -185,7 +187,7 @@ class Recomputation:
 
 
 def _begins(
-    graph: Graph, records: Mapping[str, Sequence[FiringRecord]], fed: frozenset[str], begin: int
+    graph: Graph, records: Mapping[str, Callable[[], Iterable[FiringRecord]]], fed: frozenset[str], begin: int
 ) -> dict[str, int]:
     """From which stamp on each operator is to be repeated: `begin`, or before what those need that take its messages,
     where the recording does not hold them."""
@@ -193,13 +195,12 @@ def _begins(
     moved = list(records)
     while moved:
         node = graph.nodes[moved.pop()]
-        kept, _ = whole(records[node.name])
-        repeated = beginning(kept, begins[node.name], stateless=node.operator.stateless)[1]
-        for stream, place in needed_from(repeated).items():
+        repeated = Repetition(records[node.name], begin=begins[node.name], stateless=node.operator.stateless)
+        for stream, place in repeated.needed.items():
             maker = graph.streams[stream].node
             if stream in fed or maker not in begins:
                 continue
-            made = _stamp_of(records[maker], list(graph.nodes[maker].outputs.values()).index(stream), place)
+            made = _stamp_of(records[maker](), list(graph.nodes[maker].outputs.values()).index(stream), place)
             if made is not None and made <= begins[maker]:
                 begins[maker] = made - 1
                 moved.append(maker)
@@ -215,9 +216,9 @@ def _stamp_of(records: Iterable[FiringRecord], port: int, place: tuple[int, int]
     return None
 
 
-def _until(records: Iterable[FiringRecord], end: int | None) -> Iterator[FiringRecord]:
+def _until(records: Callable[[], Iterable[FiringRecord]], end: int | None) -> Iterator[FiringRecord]:
     """The records before the first call at or after the stamp `end`."""
-    for record in records:
+    for record in records():
         if end is not None and record.kind in CALLS and record.stamp >= end:
             return
         yield record

@@ -118,7 +118,7 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
 
 def _camera(camera: Camera, shown: Layout) -> rrb.Spatial2DView:
     """One image with what is drawn over it."""
-    overlays = [f"+ {entity_of(name)}/overlay" for name in camera.overlays]
+    overlays = [f"+ {entity_of(name)}/overlay/**" for name in camera.overlays]
     return rrb.Spatial2DView(
         origin=entity_of(camera.image),
         contents=[f"+ {entity_of(camera.image)}", f"+ {entity_of(camera.image)}/scale/**", *overlays],

@@ -14,7 +14,8 @@ Color = tuple[int, int, int]
 
 
 def draw_detections(image: Image, detections: Detections2D) -> Image:
-    """Returns a colour image with boxes, labels and scores, and ids where there are any; the given one stays as it is.
+    """Returns a colour image with boxes, labels and scores, and masks and ids where there are any; the given one stays
+    as it is.
 
     A class has the same colour in every image. Raises ValueError where the boxes are of an image of another size.
     """
@@ -29,7 +30,11 @@ def draw_detections(image: Image, detections: Detections2D) -> Image:
     scale = max(0.35, height / 1200)
     line = max(1, round(height / 300))
     labels = detections.labels()
-    for k in np.argsort(detections.scores, kind="stable").tolist():  # the surest on top
+    order = np.argsort(detections.scores, kind="stable").tolist()  # the surest on top
+    for k in order if detections.masks is not None else ():
+        mask = detections.mask(k)
+        pixels[mask] = (pixels[mask] + np.array(color_of(labels[k]), np.float32)) / 2
+    for k in order:
         left, upper, right, lower = np.rint(detections.boxes[k]).astype(int).tolist()
         color = color_of(labels[k])
         cv2.rectangle(pixels, (left, upper), (right, lower), color, line)

@@ -52,7 +52,7 @@ def again(made: Node, ran: Collector, messages: Iterable[Entry], **fields: Any) 
     messages = list(messages)
     inputs = {STREAM: {(m.incarnation, m.seq): m.digest for m in messages}}
     runner = RecordedRunner(
-        made, Collector(), **{"static": frozenset(), "records": ran.records, "inputs": inputs, **fields}
+        made, Collector(), **{"static": frozenset(), "records": lambda: ran.records, "inputs": inputs, **fields}
     )
     runner.setup()
     for message in messages:
@@ -186,7 +186,7 @@ def test_done_rises_with_every_firing_that_is_repeated() -> None:
     messages = [entry(STREAM, 100 + seq, seq) for seq in range(3)]
     ran = live_run_echo(made, messages)
     records: list[FiringRecord] = ran.records
-    runner = RecordedRunner(made, Collector(), static=frozenset(), records=records, inputs={})
+    runner = RecordedRunner(made, Collector(), static=frozenset(), records=lambda: records, inputs={})
     runner.setup()
     for message in messages:
         runner.push(STREAM, message)

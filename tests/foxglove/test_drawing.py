@@ -8,7 +8,7 @@ from example_messages import example
 
 from dataflow.foxglove.drawing import data_of, drawing_of, schema_of
 from dataflow.foxglove.topics import FRAMES, Topics
-from dataflow.messages import Mesh, Odometry, SceneGraph, SegmentationMap, Tracks
+from dataflow.messages import Detections2D, Mesh, Odometry, SceneGraph, SegmentationMap, Tracks, pack_masks
 from dataflow.messages.base import message_types
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
@@ -48,6 +48,19 @@ def test_a_scene_graph_has_a_cube_for_each_node_and_a_line_for_each_relation():
     assert [t.text for t in entity.texts] == ["cup", "table", "on"]
     assert [[(p.x, p.z) for p in line.points] for line in entity.lines] == [[(1.0, 1.0), (1.0, 0.0)]]
     assert scene.deletions[0].type == 1  # everything drawn before
+
+
+def test_a_mask_is_drawn_by_the_pixels_at_its_rim():
+    pixels = np.zeros((1, 6, 9), bool)
+    pixels[0, 1:5, 2:6] = True
+    over = decoded(
+        Detections2D(
+            stamp=1, frame="camera", width=9, height=6, boxes=[[2, 1, 6, 5]], scores=[1], class_ids=[0],
+            masks=pack_masks(pixels),
+        )
+    )  # fmt: skip
+    drawn = {(p.x, p.y) for p in over.points[0].points}
+    assert drawn == {(x + 0.5, y + 0.5) for y in range(1, 5) for x in range(2, 6) if x in (2, 5) or y in (1, 4)}
 
 
 def tracks(**fields):

@@ -19,6 +19,7 @@ from dataflow.messages import (
     RadarScan,
     SceneGraph,
     Transforms,
+    pack_masks,
 )
 from dataflow.messages.geometry import quaternion_from_yaw, transform_matrix
 
@@ -83,6 +84,28 @@ def test_labels_name_classes() -> None:
     )  # fmt: skip
     assert found.labels() == ("dog", "cat")
     assert found.replace(class_names=()).labels() == ("1", "0")
+
+
+def test_detections_without_masks_keep_the_digest_that_they_had_before_there_were_any() -> None:
+    found = Detections2D(
+        stamp=1, frame="camera", width=12, height=4, class_names=("cup",), boxes=[[1, 1, 5, 3]], scores=[0.5],
+        class_ids=[0],
+    )  # fmt: skip
+    assert found.digest().hex() == "b9662bf56e2e44e00e460164deb1c120"
+    assert found.mask(0) is None
+    assert found.replace(masks=np.zeros((1, 4, 2), np.uint8)).digest() != found.digest()
+
+
+def test_masks_are_unpacked_as_they_were_packed_whatever_the_width() -> None:
+    rng = np.random.default_rng(0)
+    for width in (7, 8, 9):
+        pixels = rng.random((2, 3, width)) < 0.5
+        found = Detections2D(
+            stamp=0, frame="c", width=width, height=3, boxes=[[0, 0, 1, 1]] * 2, scores=[1, 1], class_ids=[0, 0],
+            masks=pack_masks(pixels),
+        )  # fmt: skip
+        for k in range(2):
+            np.testing.assert_array_equal(found.mask(k), pixels[k])
 
 
 def test_the_scene_graph_names_its_nodes_and_relations() -> None:

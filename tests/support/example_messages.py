@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.messages import pack_masks
 from dataflow.messages.base import ArrayField, Message, ScalarField
 
 M = TypeVar("M", bound=Message)
@@ -174,6 +175,11 @@ def _compressed_image(values: Values, rng: Rng) -> None:
     values["data"] = _encoded(extension, rng.integers(0, 256, (6, 9, 3), dtype=np.uint8))
 
 
+def _compressed_video(values: Values, rng: Rng) -> None:
+    delimiter = {"h264": b"\0\0\0\1\x09", "h265": b"\0\0\0\1\x46\1"}[values["format"]]
+    values["data"] = np.frombuffer(delimiter + rng.bytes(int(rng.integers(1, 40))), np.uint8)
+
+
 def _compressed_depth(values: Values, rng: Rng) -> None:
     values["data"] = _encoded(".png", rng.integers(0, 2**16, (6, 9), dtype=np.uint16))
 
@@ -234,6 +240,10 @@ def _named(*parallel_to: str) -> Callable[[Values, Rng], None]:
 def _detections(values: Values, rng: Rng) -> None:
     _boxes(values, rng)
     _classes(values, rng)
+    if values["masks"] is not None:
+        width, height = (int(extent) for extent in rng.integers(1, 20, 2))
+        pixels = rng.integers(0, 2, (len(values["boxes"]), height, width)).astype(bool)
+        values.update(width=width, height=height, masks=pack_masks(pixels))
 
 
 def _segmentation_map(values: Values, rng: Rng) -> None:
@@ -355,6 +365,7 @@ _REPAIRS: dict[str, Callable[[Values, Rng], None]] = {
     "Clusters": _clusters,
     "CompressedDepth": _compressed_depth,
     "CompressedImage": _compressed_image,
+    "CompressedVideo": _compressed_video,
     "Detections2D": _detections,
     "Diagnostics": _diagnostics,
     "FeatureVector": _feature_vector,

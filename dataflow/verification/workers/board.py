@@ -61,6 +61,10 @@ class Board(Watcher):
         cells[1] = self._index.get(operator, -1)
         cells[2] += 1
 
+    def goes_on(self) -> None:
+        """Counts a step of what may take long before the first one, such as opening a recording."""
+        self._cells[2] += 1
+
     def stepped(self, runner: RecordedRunner) -> None:
         """Notes what a runner has come to."""
         at = _HEAD + _COUNTS * self._index[runner.node.name]

@@ -19,6 +19,7 @@ _BACKDROP = frozenset(
     ("background", "building", "ceiling", "floor", "ground", "road", "sidewalk", "sky", "terrain", "vegetation", "wall")
 )
 _BACKDROP_ALPHA = 60  # of 255: the image stays readable
+_MASK_ALPHA = 110  # of 255
 _RAY = 10.0  # metres: how far a bearing without a range is drawn
 _PATH_VERTICES = 200
 _STILL = 0.05  # m/s
@@ -27,11 +28,26 @@ _UNSEEN = 0.3  # seconds: a track that was not matched for longer leaves the ima
 
 @visualizer(Detections2D, "overlay")
 def detections_2d(canvas: Canvas, message: Detections2D) -> None:
-    """Boxes over the image, coloured by class, labelled with name, identity and score."""
+    """Boxes over the image, coloured by class, labelled with name, identity and score; masks as a layer below."""
     shown = finite_rows(message.boxes)
     names = message.labels()
+    _masks(canvas, message, names)
     labels = [_label(names[i], _id(message.ids, i), float(message.scores[i])) for i in shown]
     _boxes_2d(canvas, message.boxes[shown], colors.of_classes([names[i] for i in shown]), labels)
+
+
+def _masks(canvas: Canvas, message: Detections2D, names: Sequence[str]) -> None:
+    """Pixels of objects in their colours, the surest on top; taken away where a message after others has none."""
+    if message.masks is None:
+        if canvas.scene.remembered.get((canvas.entity, "masked")):
+            canvas.clear("overlay/masks")
+            canvas.scene.changed(canvas.entity, "masked", False)
+        return
+    canvas.scene.changed(canvas.entity, "masked", True)
+    layer = np.zeros((message.height, message.width, 4), np.uint8)
+    for k in np.argsort(message.scores, kind="stable").tolist():
+        layer[message.mask(k)] = (*colors.of_class(names[k]), _MASK_ALPHA)
+    canvas.draw("overlay/masks", canvas.plane, rr.Image(layer, color_model="RGBA", draw_order=1.0))
 
 
 @visualizer(SegmentationMap, "overlay")

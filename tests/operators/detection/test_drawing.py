@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dataflow.messages import Detections2D, Image
+from dataflow.messages import Detections2D, Image, pack_masks
 from operators.detection import draw_detections
 from operators.detection.drawing import color_of
 
@@ -38,6 +38,15 @@ def test_edges_have_the_colour_of_their_class_and_all_else_stays() -> None:
     assert (drawn.data[50:75, 25:55] == 90).all()
     assert (image.data == 90).all()
     assert (drawn.stamp, drawn.frame) == (7, "camera")
+
+
+def test_a_mask_tints_its_pixels_alone() -> None:
+    pixels = np.zeros((1, 90, 120), bool)
+    pixels[0, 50:60, 30:40] = True
+    drawn = draw_detections(grey(), detections([[20, 40, 60, 80]]).replace(masks=pack_masks(pixels))).data
+    tinted = ((np.array(color_of("mug"), np.float32) + 90) / 2).astype(np.uint8)
+    assert (drawn[50:60, 30:40] == tinted).all()
+    assert (drawn[60:75, 30:40] == 90).all()
 
 
 def test_a_grey_image_becomes_a_coloured_one_and_without_detections_nothing_is_drawn() -> None:
