@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from dataflow.execution.absent import without_absent
 from dataflow.execution.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
@@ -19,6 +19,7 @@ from dataflow.execution.event_time import EventTime
 from dataflow.execution.failure import RAISED, OperatorFailure
 from dataflow.execution.log import FiringLog, unlisted
 from dataflow.execution.ports import Emitter
+from dataflow.execution.protocol import Faults
 from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.model import Node
@@ -29,16 +30,6 @@ from dataflow.sync.single import make_aligner
 MOST_TRIED = 256
 """Messages and waits that are over, none of which decides a firing, in one step. A timer that falls behind drops its
 ticks one by one, while new ones come due: its process would never look at anything else."""
-
-
-class Faults(Protocol):
-    """Faults of one operator on purpose."""
-
-    def begin(self, kind: str, fields: Mapping[str, Any], now: float) -> None:
-        """Plans a fault; `now`: on the steady clock, seconds."""
-
-    def before(self, firing: Firing) -> BaseException | None:
-        """Is asked before each firing: may take its time, and gives an error to fail with instead."""
 
 
 class LiveRunner(OperatorRunner):
@@ -120,7 +111,7 @@ class LiveRunner(OperatorRunner):
         return [*mine, *theirs], more + Counter(others)
 
     def has_drops(self) -> bool:
-        return self._log.pending or self.aligner.has_drops()
+        return bool(self._log.pending) or self.aligner.has_drops()
 
     # What streams say
 

@@ -50,9 +50,9 @@ def build(
         node = graph.nodes[name]
         try:
             if node.source:
-                _add_source(driver, node, graph, config, emitter, live)
+                _make_source(driver, node, graph, config, emitter, live)
             else:
-                driver.add(_runner(node, graph, config, emitter, event_clock, on_failure))
+                driver.add(_make_runner(node, graph, config, emitter, event_clock, on_failure))
         except OperatorFailure:
             raise
         except Exception as error:
@@ -61,7 +61,7 @@ def build(
         driver.feeding.play_back(_log(graph, config.replay, emitter))
 
 
-def _add_source(
+def _make_source(
     driver: Driver, node: Node, graph: Graph, config: ProcessConfig, emitter: Emitter, live: LiveSources | None
 ) -> None:
     """Makes a source; it goes on where the process before this one died."""
@@ -76,7 +76,7 @@ def _add_source(
         driver.feeding.feeds.append(source)
 
 
-def _runner(
+def _make_runner(
     node: Node,
     graph: Graph,
     config: ProcessConfig,

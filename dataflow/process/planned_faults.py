@@ -9,7 +9,7 @@ from typing import Any
 
 from dataflow.chaos.faults import OperatorFaults
 from dataflow.execution.driver import Driver
-from dataflow.execution.live import LiveRunner
+from dataflow.execution.protocol import Runner
 from dataflow.operator import ParameterError
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.streams.outlet import Outlet
@@ -34,6 +34,6 @@ def do_fault(
         case "malformed":
             for stream in maker.node.outputs.values():
                 outlet.put_raw(stream, MALFORMED)
-        case "raise" | "hang" | "slow" | "leak" if isinstance(maker, LiveRunner):
+        case "raise" | "hang" | "slow" | "leak" if isinstance(maker, Runner):
             maker.faults = maker.faults or OperatorFaults()
             maker.faults.begin(kind, fields, time.monotonic())

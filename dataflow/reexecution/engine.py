@@ -160,9 +160,10 @@ class Recomputation:
             self._driver.set_up()
             self._feed.setup()
             began = time.monotonic()
-            stopped = self._drive(until)
+            while (left := self._driver.turn()) and not until():
+                pass
             self.wall = time.monotonic() - began
-            if stopped:
+            if left:
                 return self.results()
         finally:
             if close:
@@ -183,13 +184,6 @@ class Recomputation:
     def results(self) -> Mapping[str, Verification]:
         """The outcome for each operator so far."""
         return {name: runner.result for name, runner in self.runners.items()}
-
-    def _drive(self, until: Callable[[], bool]) -> bool:
-        """Goes on until nothing is left, or `until()`; then True."""
-        while self._driver.turn():
-            if until():
-                return True
-        return False
 
 
 def _begins(
