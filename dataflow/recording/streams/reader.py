@@ -310,6 +310,10 @@ class Recording:
         self, channels: list[int], start: int | None = None, end: int | None = None, *, skip: int = 0
     ) -> Iterator[RawMessage]:
         for part in self._file.index.in_file_order(channels, start, end):
+            count = sum(map(len, part.values()))
+            if start is None and end is None and skip >= count:
+                skip -= count
+                continue
             for place in in_file_order(list(part.items())):
                 if (start is None or place[3] >= start) and (end is None or place[3] <= end):
                     if skip:
