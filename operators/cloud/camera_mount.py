@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
 from operators.cloud.held import accelerated, held
 from operators.cloud.vertical import Vertical, find_vertical
-from operators.geometry.extrinsics import transform_between
+from operators.geometry.extrinsics import transform_between, with_transform
 from operators.status import counted_status
 
 Array = NDArray[np.float64]
@@ -54,6 +53,8 @@ class CameraMount(Operator):
         self._done = False
         self._first: int | None = None
         self._best: Vertical | None = None
+        self._T: Array | None = None
+        self._known = b""
         self._counts: Counter[str] = Counter()
         self._figures: dict[str, float] = {}
 
@@ -66,9 +67,9 @@ class CameraMount(Operator):
     ) -> dict[str, Any] | None:
         """Raises ValueError where the extrinsics do not relate the accelerometer to the cloud."""
         if self._done:
-            return None
+            return self._again(cloud, extrinsics)
         if extrinsics is not None and self.base_frame in (*extrinsics.frames, *extrinsics.child_frames):
-            self._done = True
+            self._done, self._known = True, _digest(extrinsics)
             text = f"{self.base_frame} is given"
             return {"completed": extrinsics, "status": counted_status("camera_mount", cloud.stamp, text, Level.OK, {})}
         self._counts["views"] += 1
@@ -90,6 +91,17 @@ class CameraMount(Operator):
         self._done = True
         return self._decided(cloud, extrinsics, self._best)
 
+    def _again(self, cloud: PointCloud, extrinsics: Transforms | None) -> dict[str, Any] | None:
+        """Returns the completed extrinsics where those between the sensors have changed since."""
+        if extrinsics is None or _digest(extrinsics) == self._known:
+            return None
+        self._known = _digest(extrinsics)
+        T = self._T
+        completed = extrinsics
+        if T is not None:
+            completed = with_transform(extrinsics, cloud.stamp, self.base_frame, cloud.frame, T)
+        return {"completed": completed.replace(stamp=cloud.stamp)}
+
     def _decided(self, cloud: PointCloud, extrinsics: Transforms | None, found: Vertical) -> dict[str, Any]:
         T = _on_base(found)
         down, roll = np.degrees(np.arcsin(-found.up[2])), np.degrees(np.arctan2(found.up[0], -found.up[1]))
@@ -100,7 +112,8 @@ class CameraMount(Operator):
         text = f"the camera looks {down:.0f}° down, turned by {roll:.0f}°, {ground}"
         text = f"few surfaces show where up is; taken so: {text}" if guess else text
         self._counts["guesses"] += guess
-        made = _with(extrinsics, cloud, self.base_frame, T)
+        made = with_transform(extrinsics, cloud.stamp, self.base_frame, cloud.frame, T)
+        self._T, self._known = T, _digest(extrinsics)
         level = Level.WARN if guess else Level.OK
         figures = {key: f"{value:g}" for key, value in self._figures.items()}
         return {"completed": made, "status": counted_status("camera_mount", cloud.stamp, text, level, figures)}
@@ -115,6 +128,8 @@ class CameraMount(Operator):
             "done": self._done,
             "first": self._first,
             "best": None if best is None else [best.up, best.covariance, best.rival, best.height],
+            "T": self._T,
+            "known": self._known,
             "counts": dict(self._counts),
             "figures": self._figures,
         }
@@ -124,11 +139,17 @@ class CameraMount(Operator):
         if state["best"] is not None:
             up, covariance, rival, height = state["best"]
             self._best = Vertical(np.array(up), np.array(covariance), float(rival), height)
+        self._T = None if state["T"] is None else np.array(state["T"], np.float64)
+        self._known = bytes(state["known"])
         self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
         self._figures = {key: float(value) for key, value in state["figures"].items()}
 
     def summary(self) -> Mapping[str, float | int]:
         return {**self._counts, **self._figures}
+
+
+def _digest(extrinsics: Transforms | None) -> bytes:
+    return b"" if extrinsics is None else extrinsics.digest()
 
 
 def _doubt(found: Vertical) -> float:
@@ -145,16 +166,3 @@ def _on_base(found: Vertical) -> Array:
     T[:3, :3] = np.stack([x, np.cross(found.up, x), found.up])
     T[2, 3] = 0.0 if found.height is None else found.height
     return T
-
-
-def _with(extrinsics: Transforms | None, cloud: PointCloud, base_frame: str, T: Array) -> Transforms:
-    """Returns the extrinsics with one transform more: `T` of the cloud's frame on the base."""
-    old = extrinsics
-    place, turn = T[None, :3, 3], matrix_to_quaternion(T)[None]
-    return Transforms(
-        stamp=cloud.stamp,
-        frames=(*(() if old is None else old.frames), base_frame),
-        child_frames=(*(() if old is None else old.child_frames), cloud.frame),
-        translations=place if old is None else np.concatenate([old.translations, place]),
-        rotations=turn if old is None else np.concatenate([old.rotations, turn]),
-    )

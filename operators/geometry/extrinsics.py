@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from dataflow.messages import Transforms
-from dataflow.messages.geometry import invert
+from dataflow.messages.geometry import invert, matrix_to_quaternion
 from operators.geometry.frame_tree import FrameTree, TransformError, told_by
 from operators.geometry.se3 import Matrix
 
@@ -47,3 +47,21 @@ def _found(extrinsics: Transforms, source: str, target: str) -> Matrix:
         raise ValueError(
             f"extrinsics hold no transform between {source!r} and {target!r}; they hold {listed}"
         ) from None
+
+
+def with_transform(
+    extrinsics: Transforms | None, stamp: int, frame: str, child_frame: str, T_frame_child: Matrix
+) -> Transforms:
+    """Returns the extrinsics with one transform, in the place of that between the same two frames if they hold it."""
+    pairs = [] if extrinsics is None else list(zip(extrinsics.frames, extrinsics.child_frames, strict=True))
+    kept = [k for k, pair in enumerate(pairs) if set(pair) != {frame, child_frame}]
+    places, turns = [T_frame_child[:3, 3]], [matrix_to_quaternion(T_frame_child)]
+    if extrinsics is not None:
+        places, turns = [*extrinsics.translations[kept], *places], [*extrinsics.rotations[kept], *turns]
+    return Transforms(
+        stamp=stamp,
+        frames=(*(pairs[k][0] for k in kept), frame),
+        child_frames=(*(pairs[k][1] for k in kept), child_frame),
+        translations=np.array(places),
+        rotations=np.array(turns),
+    )

@@ -8,13 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Transforms
+from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Message, Transforms
 from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import invert
 from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
-from operators.geometry.extrinsics import transform_between
-from operators.monitoring.edge_alignment import EdgeAlignment, Shift, rims
-from operators.status import counted_status
+from operators.geometry.extrinsics import transform_between, with_transform
+from operators.monitoring.edge_alignment import Correction, EdgeAlignment, Shift, rims
+from operators.status import FINDING, counted_status
+
+_SHARE = 0.5  # of what is found, by which each correction changes the extrinsics
+_TRUSTED, _LEAST = 6, 2  # pairs after which a correction is made, and working pixels from which one is
+_OFTEN, _PAIRS = 0.2, 3  # share of the pairs, and fewest of them, that must not fit for a finding
 
 
 class ColorDepthCheck(Operator):
@@ -22,6 +27,9 @@ class ColorDepthCheck(Operator):
 
     A camera that is turned against its extrinsic paints things with what is beside them, and nothing fails: boxes are
     lifted from the wrong points. The check adds up images, since a single one has edges that are none of the depth's.
+    Near edges and far ones show whether a camera is displaced or turned, and what would put that right: the summary at
+    the end has it as a finding. With `calibrate` the extrinsics that it gives have half of that put right, again and
+    again while edges do not fit.
 
     Method: edges of depth on edges of the image, added up over images, as in Levinson and Thrun, "Automatic online
     calibration of cameras and lasers", 2013.
@@ -36,6 +44,9 @@ class ColorDepthCheck(Operator):
     )
     status: Out[Diagnostics] = Out(doc="with every pair that is looked at; a warning while they do not fit")
 
+    corrected: Out[Transforms] = Out(doc="the extrinsics: as given at first, then as corrected if `calibrate`")
+
+    calibrate: bool = Param(False, doc="correct the transform between the cameras")
     period: Duration = Param("400ms", ge=0, live=True, doc="time between the pairs that are looked at")
     angle: float = Param(1.2, gt=0, live=True, doc="smallest angle that is warned of", unit="°")
 
@@ -43,6 +54,7 @@ class ColorDepthCheck(Operator):
         self._alignment = EdgeAlignment()
         self._next = 0
         self._counts: Counter[str] = Counter()
+        self._change, self._given, self._finding, self._since = np.eye(4), False, "", 0
 
     def process(
         self,
@@ -51,40 +63,63 @@ class ColorDepthCheck(Operator):
         image_info: CameraInfo,
         depth_info: CameraInfo,
         extrinsics: Transforms | None = None,
-    ) -> Diagnostics | None:
+    ) -> dict[str, Message] | None:
         """Raises ValueError where an image does not fit its calibration, or no transform relates the cameras."""
         if depth.stamp < self._next:
             return None
         self._next = depth.stamp + self.period
         check_calibration("image", image, image_info)
         check_calibration("depth", depth, depth_info)
-        T = transform_between(extrinsics, depth.frame, image.frame)
+        T = self._change @ transform_between(extrinsics, depth.frame, image.frame)
         points = rims(depth.data, depth_info.K)
         self._alignment.add(image.data, image_info.K, points @ T[:3, :3].T + T[:3, 3])
         self._counts["pairs"] += 1
-        return self._status(depth.stamp, float(image_info.K[0, 0]))
+        out: dict[str, Message] = {"status": self._status(depth.stamp, image_info)}
+        self._since += 1
+        found = None
+        if self.calibrate and self._since >= _TRUSTED and any(shift.off(_LEAST) for shift in self._alignment.shifts()):
+            found = self._alignment.correction(image_info.K)
+        if found is not None:
+            self._change = found.matrix(_SHARE) @ self._change
+            self._alignment, self._since = EdgeAlignment(), 0
+            self._counts["corrections"] += 1
+        if found is not None or not self._given:
+            self._given = True
+            T_depth_image = invert(self._change @ transform_between(extrinsics, depth.frame, image.frame))
+            out["corrected"] = with_transform(extrinsics, depth.stamp, depth.frame, image.frame, T_depth_image)
+        return out
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew."""
         self._next = 0
 
     def snapshot(self) -> Mapping[str, Any]:
-        return {"alignment": self._alignment.snapshot(), "next": self._next, "counts": dict(self._counts)}
+        rest = {"change": self._change, "given": self._given, "finding": self._finding, "since": self._since}
+        return {"alignment": self._alignment.snapshot(), "next": self._next, "counts": dict(self._counts), **rest}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._alignment.restore(state["alignment"])
         self._next = int(state["next"])
         self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
+        self._change = np.array(state.get("change", np.eye(4)), np.float64)
+        self._given, self._finding = bool(state.get("given", False)), str(state.get("finding", ""))
+        self._since = int(state.get("since", 0))
 
-    def summary(self) -> Mapping[str, int]:
-        return dict(self._counts)
+    def summary(self) -> Mapping[str, int | str]:
+        """Returns the counts; and the finding, where a good part of the pairs did not fit."""
+        often = self._counts["off"] >= max(_PAIRS, _OFTEN * self._counts["pairs"])
+        return {**self._counts, **({FINDING: self._finding} if often else {})}
 
-    def _status(self, stamp: int, focal: float) -> Diagnostics:
+    def _status(self, stamp: int, info: CameraInfo) -> Diagnostics:
+        focal = float(info.K[0, 0])
         least = max(2, round(float(np.deg2rad(self.angle)) * focal / 2))
         shifts = self._alignment.shifts()
         off = [shift for shift in shifts if shift.off(least)]
         self._counts["off"] += bool(off)
-        text = "; ".join(_text(shift, focal) for shift in off[:1]) or "edges of colour and depth fit"
+        found = self._alignment.correction(info.K) if off else None
+        text = "edges of colour and depth fit"
+        if off:
+            text = self._finding = _text(off[0], focal) + ("" if found is None else _remedy(found))
         figures = {
             f"{shift.part} (°)": f"{_degrees(shift.x, focal):.1f} {_degrees(shift.y, focal):.1f}" for shift in shifts
         }
@@ -99,4 +134,13 @@ def _degrees(pixels: int, focal: float) -> float:
 def _text(shift: Shift, focal: float) -> str:
     x, y = _degrees(shift.x, focal), _degrees(shift.y, focal)
     where = f"{x:+.1f}° right and {y:+.1f}° below of depth ({shift.part})"
-    return f"colour lies {where}: a camera is turned against its extrinsic"
+    return f"colour lies {where}: a camera is turned or displaced against its extrinsic"
+
+
+def _remedy(found: Correction) -> str:
+    """Returns what would put it right, as changes of the colour camera in the depth camera's frame."""
+    if any(found.displacement):
+        right, down = (-100 * each for each in found.displacement)
+        return f"; it fits with the colour camera {right:+.1f} cm to the right and {down:+.1f} cm down"
+    right, down = (-float(np.degrees(each)) for each in found.turn)
+    return f"; it fits with the colour camera turned by {right:+.1f}° to the right and {down:+.1f}° down"

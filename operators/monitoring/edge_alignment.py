@@ -38,10 +38,31 @@ class Shift:
         return max(abs(self.x), abs(self.y)) >= least and self.here < 0.7 and self.peak >= 4.5 and self.edges >= 500
 
 
+@dataclass(frozen=True)
+class Correction:
+    """What puts the edges of the depth onto those of the image: a displacement, m, or a turn, rad, of the points.
+
+    Both are of points in the image camera's frame: x to the right and y down of `displacement`, and by `turn` the same
+    ways as seen from the camera. One of them is zero: the one that explains near and far edges less well.
+    """
+
+    displacement: tuple[float, float]
+    turn: tuple[float, float]
+
+    def matrix(self, share: float = 1.0) -> Array:
+        """Returns the transform (4, 4) of the points, or a share of it."""
+        T = np.eye(4)
+        T[:2, 3] = share * np.array(self.displacement)
+        x, y = share * np.array(self.turn)
+        T[:3, :3] = cv2.Rodrigues(np.array([-y, x, 0.0]))[0]
+        return T
+
+
 class EdgeAlignment:
     """Adds up, image by image and forgetting by `keep`, how well the edges fit at every shift up to `reach` pixels.
 
-    The two halves of the image are kept apart: a turn about the optical axis moves them against each other. Working
+    The two halves of the image are kept apart: a turn about the optical axis moves them against each other. So are near
+    edges and far ones: a camera that is turned moves all alike, one that is displaced near ones more. Working
     pixels are of half the resolution. A depth edge is the rim of what stands in front of something, which nearly
     always shows in the colour image; what else shows there is even over many images.
     """
@@ -49,8 +70,9 @@ class EdgeAlignment:
     def __init__(self, reach: int = 16, keep: float = 0.9) -> None:
         self._reach, self._keep = reach, keep
         side = 2 * reach + 1
-        self._sums = np.zeros((2, side, side), np.float64)
-        self._edges = np.zeros(2)
+        self._sums = np.zeros((2, 2, side, side), np.float64)  # near and far edges, in the left half and the right
+        self._edges = np.zeros((2, 2))
+        self._nearness = np.zeros((2, 2))  # sums of 1 / distance, and of edges, of near ones and far ones
 
     def add(self, image: NDArray[np.uint8], K: Array, rims: Array) -> None:
         """Takes an image (H, W[, 3]) with its K, and points (N, 3) of the same time on rims, in its camera's frame."""
@@ -59,28 +81,56 @@ class EdgeAlignment:
         half = half.astype(np.float32)
         slope = cv2.magnitude(cv2.Sobel(half, cv2.CV_32F, 1, 0), cv2.Sobel(half, cv2.CV_32F, 0, 1))
         slope = np.minimum(slope, np.float32(_STEEPEST))
-        drawn = _drawn(rims, K, half.shape)
         height, width = half.shape
         r, middle = self._reach, width // 2
         self._sums *= self._keep
         self._edges *= self._keep
-        for k, (left, right) in enumerate(((r, middle), (middle, width - r))):
-            template = drawn[r : height - r, left:right]
-            fit = cv2.matchTemplate(slope[:, left - r : right + r], template, cv2.TM_CCORR).astype(np.float64)
-            self._sums[k] += fit - fit.mean()
-            self._edges[k] += float(template.sum())
+        self._nearness *= self._keep
+        far = rims[:, 2] > np.median(rims[:, 2]) if len(rims) else np.zeros(0, np.bool_)
+        for layer, own in enumerate((rims[~far], rims[far])):
+            drawn = _drawn(own, K, half.shape)
+            ahead = own[own[:, 2] > 0.1, 2]
+            self._nearness[layer] += float((1 / ahead).sum()), len(ahead)
+            for k, (left, right) in enumerate(((r, middle), (middle, width - r))):
+                template = drawn[r : height - r, left:right]
+                fit = cv2.matchTemplate(slope[:, left - r : right + r], template, cv2.TM_CCORR).astype(np.float64)
+                self._sums[layer, k] += fit - fit.mean()
+                self._edges[layer, k] += float(template.sum())
 
     def shifts(self) -> list[Shift]:
         """Returns the shift of the whole image and of its halves, of those that have edges."""
-        parts = [("image", self._sums.sum(axis=0), float(self._edges.sum()))]
-        parts += [(name, s, float(n)) for name, s, n in zip(_HALVES, self._sums, self._edges.tolist(), strict=True)]
+        sums, counts = self._sums.sum(axis=0), self._edges.sum(axis=0)
+        parts = [("image", sums.sum(axis=0), float(counts.sum()))]
+        parts += [(name, s, float(n)) for name, s, n in zip(_HALVES, sums, counts.tolist(), strict=True)]
         return [_best(name, surface, edges, self._reach) for name, surface, edges in parts if surface.max() > 0]
 
+    def correction(self, K: Array) -> Correction | None:
+        """Returns what makes the edges fit a camera with K best; None before there are near edges and far ones."""
+        layers = self._sums.sum(axis=1)
+        if not (self._nearness[:, 1] > 0).all():
+            return None
+        nearness = self._nearness[:, 0] / self._nearness[:, 1]
+        shifts = np.arange(-self._reach, self._reach + 0.25, 0.5)  # of the near ones, working pixels
+        x, y = (each.ravel() for each in np.meshgrid(shifts, shifts))
+        turned, displaced = (
+            sum(_sampled(layer, x * far, y * far, self._reach) for layer, far in zip(layers, scales, strict=True))
+            for scales in ((1.0, 1.0), (1.0, float(nearness[1] / nearness[0])))
+        )
+        focal = K[0, 0] / 2
+        if turned.max() >= displaced.max():
+            best = int(np.argmax(turned))
+            return Correction((0.0, 0.0), (float(x[best] / focal), float(y[best] / focal)))
+        best = int(np.argmax(displaced))
+        metres = 1 / (focal * nearness[0])
+        return Correction((float(x[best] * metres), float(y[best] * metres)), (0.0, 0.0))
+
     def snapshot(self) -> dict[str, Any]:
-        return {"sums": self._sums, "edges": self._edges}
+        return {"sums": self._sums, "edges": self._edges, "nearness": self._nearness}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        self._sums, self._edges = np.array(state["sums"], np.float64), np.array(state["edges"], np.float64)
+        if np.ndim(state["sums"]) == 4:  # earlier versions kept near and far edges together: they begin anew
+            self._sums, self._edges = np.array(state["sums"], np.float64), np.array(state["edges"], np.float64)
+            self._nearness = np.array(state["nearness"], np.float64)
 
 
 def rims(depth: NDArray[np.float32], K: Array) -> Array:
@@ -107,6 +157,12 @@ def _drawn(points: Array, K: Array, shape: tuple[int, ...]) -> Surface:
     inside = (u >= 0) & (u < shape[1]) & (v >= 0) & (v < shape[0])
     drawn[v[inside], u[inside]] = 1.0
     return drawn
+
+
+def _sampled(surface: Array, x: Array, y: Array, reach: int) -> Array:
+    """Returns the values of a surface (S, S) at shifts (N,) up to `reach`, between its own by interpolation."""
+    at = (x + reach).astype(np.float32)[None], (y + reach).astype(np.float32)[None]
+    return cv2.remap(surface.astype(np.float32), *at, cv2.INTER_LINEAR)[0].astype(np.float64)
 
 
 def _best(part: str, surface: Array, edges: float, reach: int) -> Shift:

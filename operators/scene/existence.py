@@ -16,9 +16,9 @@ LOOK = 0.7
 
 _BINS = 20  # of scores
 _THIRDS = (1 / 3, 2 / 3)  # quantiles of a detector's own scores that divide weak, middling and strong ones
-_REAL = np.array([0.15, 0.10, 0.20, 0.25, 0.30])  # answers to a real thing before anything is learned:
-_FALSE = np.array([0.45, 0.20, 0.20, 0.10, 0.05])  # none, another class, weak, middling, strong
-_PRIOR = 2.0  # independent views that this is worth
+_REAL = np.array([0.15, 0.10, 0.25, 0.25, 0.25])  # answers to a real thing before anything is learned:
+_FALSE = np.array([0.45, 0.25, 0.15, 0.10, 0.05])  # none, another class, weak, middling, strong
+_PRIOR = 4.0  # independent views that this is worth
 _SHARE, _SHARE_PRIOR = 0.5, 5.0  # of entries that are real before anything is learned, and the entries it is worth
 _ROUNDS = 20
 

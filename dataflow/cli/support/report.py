@@ -23,6 +23,8 @@ _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""
 
 
+FINDING = "finding"
+"""Key of a summary under which an operator says what is wrong with its inputs, as a text."""
 SCORES = ("rmse", "precision", "recall", "f1", "iou", "accuracy", "error")
 """Parts of the names of figures that say how good something is."""
 MOST_SCORES, MOST_LOSSES, MOST_KEPT = 3, 4, 5
@@ -40,7 +42,8 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
         "" if total is None else f"; {seconds(total)} with start and end",
     )
     console.print(title)
-    for line in (_scores(report) or _rates(report), _losses_in_short(report) if report.wall else None, *_files(report)):
+    lost = _losses_in_short(report) if report.wall else None
+    for line in (_scores(report) or _rates(report), lost, *_findings(report), *_files(report)):
         if line is not None:
             console.print(line, soft_wrap=line.plain.startswith(WROTE))
     for operator, times in report.restarts.items():
@@ -75,6 +78,12 @@ def _scores(report: RunReport) -> Text | None:
         if scores:
             found.append(f"{operator}: {', '.join(scores[:MOST_SCORES])}")
     return Text(f"scores  {'; '.join(found)}") if found else None
+
+
+def _findings(report: RunReport) -> list[Text]:
+    """Returns what operators found wrong with what they were given, a line each."""
+    found = [(name, summary[FINDING]) for name, summary in report.summaries.items() if FINDING in summary]
+    return [Text(f"found   {name}: {text}", style="yellow") for name, text in found]
 
 
 def _rates(report: RunReport) -> Text | None:

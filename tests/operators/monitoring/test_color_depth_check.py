@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Image, Transforms
@@ -87,4 +89,84 @@ def test_a_restored_check_goes_on_as_the_first_would_have() -> None:
     told = [each.process(images[6], depths[6], *given) for each in (first, second)]
     assert told[0] is not None
     assert told[1] is not None
-    assert told[0].digest() == told[1].digest()
+    assert told[0]["status"].digest() == told[1]["status"].digest()
+
+
+def displaced(metres: float) -> Transforms:
+    """Returns the extrinsics with a colour camera that is said to be so far to the right of where it is."""
+    known = extrinsics()
+    places = known.translations.copy()
+    places[known.child_frames.index("color")] += known.matrix("color")[:3, 0] * metres
+    return known.replace(translations=places)
+
+
+def finding(operator: ColorDepthCheck, known: Transforms) -> tuple[str, list[Transforms]]:
+    """Returns what is found over the views, and the corrected extrinsics."""
+    operator.setup()
+    given = []
+    for image, depth in zip(*pairs(), strict=True):
+        made = operator.process(image, depth, info("color"), info("depth"), known)
+        if made is not None and isinstance(corrected := made.get("corrected"), Transforms):
+            given.append(corrected)
+    return str(operator.summary().get("finding", "")), given
+
+
+def boards(seed: int, shift: Callable[[float], float]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Returns an image of boards near and far, moved to the right by `shift(depth)` pixels, and points on their rims."""
+    rng, width, height = np.random.default_rng(seed), 640, 480
+    image, points = np.full((height, width), 40, np.uint8), []
+    for depth in (3.0, 3.0, 3.0, 1.0, 1.0, 1.0):
+        side = int(120 / depth) + 20
+        u, v = int(rng.uniform(80, width - 80 - side)), int(rng.uniform(80, height - 80 - side))
+        moved = u + round(shift(depth))
+        image[v : v + side, moved : moved + side] = rng.integers(120, 255)
+        edge = np.arange(side)
+        for x, y in ((u + edge, v), (u + edge, v + side), (u, v + edge), (u + side, v + edge)):
+            rays = np.stack(np.broadcast_arrays((x - 320) / 525, (y - 240) / 525, 1.0), axis=1)
+            points.append(depth * rays)
+    return image, np.concatenate(points)
+
+
+@pytest.mark.parametrize(
+    ("shift", "displacement", "turn"),
+    [(lambda z: 525 * 0.03 / z, 0.03, 0.0), (lambda z: -16.0, 0.0, -16 / 525), (lambda z: 0.0, 0.0, 0.0)],
+)
+def test_near_and_far_edges_tell_a_displaced_camera_from_a_turned_one(
+    shift: Callable[[float], float], displacement: float, turn: float
+) -> None:
+    camera = np.array([[525.0, 0, 320], [0, 525, 240], [0, 0, 1]])
+    alignment = EdgeAlignment()
+    for seed in range(10):
+        image, points = boards(seed, shift)
+        alignment.add(image, camera, points)
+    found = alignment.correction(camera)
+    assert found is not None
+    assert found.displacement == pytest.approx((displacement, 0), abs=0.005)
+    assert found.turn == pytest.approx((turn, 0), abs=0.005)
+
+
+def test_a_displaced_camera_is_found() -> None:
+    text, given = finding(ColorDepthCheck(period="200ms"), displaced(0.08))
+    assert "it fits with the colour camera" in text
+    assert len(given) == 1  # nothing is corrected
+
+
+def test_a_turned_camera_is_found_with_the_turn_that_puts_it_right() -> None:
+    text, _ = finding(ColorDepthCheck(period="200ms"), extrinsics(color=("y", 3.0)))
+    told = re.search(r"turned by (\S+)° to the right", text)
+    assert told is not None, text
+    assert float(told[1]) == pytest.approx(-3, abs=0.6)
+
+
+def test_cameras_that_fit_have_no_finding() -> None:
+    assert finding(ColorDepthCheck(period="200ms", calibrate=True), extrinsics())[0] == ""
+
+
+def test_calibration_brings_the_camera_nearer_step_by_step() -> None:
+    known = displaced(0.08)
+    right = extrinsics().matrix("color")
+    _, given = finding(ColorDepthCheck(period="200ms", calibrate=True), known)
+    away = [float(np.linalg.norm(each.matrix("color")[:3, 3] - right[:3, 3])) for each in given]
+    assert len(away) >= 2
+    assert away[0] == pytest.approx(0.08)
+    assert away[-1] < 0.055
