@@ -16,6 +16,7 @@ from dataflow.messages import (
     Clusters,
     CompressedDepth,
     CompressedImage,
+    CompressedVideo,
     DepthImage,
     Detections2D,
     Diagnostics,
@@ -317,6 +318,11 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
         example(CompressedImage, 0),
         {"format": "jpeg", "data": png8},
         r"CompressedImage\.data must hold a jpeg file, got 29 bytes that begin with 89 50 .*, which is png",
+    ),
+    (
+        example(CompressedVideo, 0),
+        {"data": [0, 0, 0, 9, 0x65]},
+        r"CompressedVideo\.data must begin with a start code .* got 5 bytes that begin with 00 00 00 09",
     ),
     (
         example(CompressedDepth, 0),
