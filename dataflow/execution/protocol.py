@@ -34,7 +34,7 @@ class Runner:
         self.absent: set[str] = set()
         """Streams whose operator is gone at the moment; only a live run asks."""
         self.awake = True
-        """True when it is to be asked for a step; it stays so in a driver without `Ready`."""
+        """True when it is to be asked for a step."""
         self.place = 0
         self.wakes_in: list[Runner] = []
         """Its place in the graph and where it puts itself when it wakes (`dataflow.execution.ready`)."""

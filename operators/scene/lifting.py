@@ -28,6 +28,8 @@ _SAME = 0.5  # overlap from which two boxes are around the same thing
 _SAME_BODY = 0.2  # that overlap where most of the points are in both
 _SMALLER = 4.0  # times smaller, and a box in another is in front
 _LEFT = 0.3  # share of its points that an object keeps
+_GAIN = 0.01  # of overlap with its box by a further part of an object
+_LOSS = 0.05  # of it by a part that is on the object's mask
 _AROUND = 0.1  # of a box's sides, by which boxes are drawn too tight
 _OUTSIDE = 0.5  # what lying in the box as a whole counts, beside the overlap: what goes on is behind or below
 _CONTAINED = 0.6  # share of a piece in the box from which it may be a further part of the object
@@ -88,6 +90,7 @@ def lift(
     background: Sequence[int],
     s: LiftSettings,
     bodies: Collection[int] = (),
+    instances: Sequence[Mask] | None = None,
 ) -> list[Lifted]:
     """Finds the object of each image box (M, 4) among a cloud's points; boxes without one are left out.
 
@@ -95,6 +98,8 @@ def lift(
     not go on beyond it is the object, with those near it that make the overlap better. `mask_classes` (M,) is the
     mask's class of each box, -1 for none. Where the box holds enough of it, only such points count, wherever their
     piece goes on; otherwise points of `background` classes do not. Points go to the box that they fit best, once.
+
+    `instances` (M) are masks (H, W) of the objects themselves; where they are known, their points count alone.
 
     For the boxes in `bodies` the mask counts more than the edges: the object is the connected part of its mask, also
     beyond the box, and its share of the mask in the box replaces the overlap.
@@ -114,26 +119,20 @@ def lift(
         inner = (u >= left) & (u <= right) & (v >= upper) & (v <= lower)
         if np.count_nonzero(inner) < s.min_points:
             continue
-        if classes is not None:
-            of_class = inner & (classes[first:last] == mask_classes[k])
-            share = s.body_share if k in bodies else s.mask_share
-            masked = mask_classes[k] >= 0 and np.count_nonzero(of_class) >= max(
-                s.min_points, share * np.count_nonzero(inner)
-            )
+        box, contained = (left, upper, right, lower), None
+        if instances is not None:
+            rows = _on(instances[k], seen, near[inner])
+        elif (rows := _of_class(near, inner, classes, first, mask_classes[k], k in bodies, s)) is None:
             if k in bodies:
-                own = classes == mask_classes[k]
-                body = _body(seen, columns, lines, own, order, (left, upper, right, lower), s) if masked else None
-                candidates += [] if body is None else [(k, *body)]
                 continue
-        rows, contained = near[inner], None
-        if classes is not None and masked:
-            rows = near[of_class]
-        else:
-            if behind is not None:
-                rows = near[inner & ~behind[first:last]]
+            rows = near[inner if behind is None else inner & ~behind[first:last]]
             around = near[(v >= upper - high) & (v <= lower + high)]
             contained = _counts(pieces[around], len(whole)) / whole
-        found = _object(seen, np.sort(rows), pieces, contained, (left, upper, right, lower), s)
+        elif k in bodies and classes is not None:
+            body = _body(seen, columns, lines, classes == mask_classes[k], order, box, s)
+            candidates += [] if body is None else [(k, *body)]
+            continue
+        found = _object(seen, np.sort(rows), pieces, contained, box, s)
         if found is not None:
             candidates.append((k, *found))
     owned = _divided(seen.places[:2], boxes, candidates, bodies)
@@ -144,6 +143,33 @@ def lift(
         if len(own) >= max(_FEWEST, _LEFT * len(points))  # else others have it
     ]
     return sorted(kept, key=lambda c: c.detection)
+
+
+def _on(mask: Mask, seen: Seen, rows: Indices) -> Indices:
+    """Returns those of some points that are on an object's mask (H, W)."""
+    columns, lines = seen.places[:2].take(rows, axis=1).astype(np.intp)
+    return rows[mask[lines, columns]]
+
+
+def _of_class(
+    near: Indices,
+    inner: Mask,
+    classes: NDArray[np.int32] | None,
+    first: int,
+    wanted: int,
+    body: bool,
+    s: LiftSettings,
+) -> Indices | None:
+    """Returns the points `near` a box that are in it and of its class in the mask; None where these are too few.
+
+    `classes` are those of all points by rising column, of which `near` begin at `first`.
+    """
+    if classes is None or wanted < 0:
+        return None
+    own = inner & (classes[first : first + len(near)] == wanted)
+    share = s.body_share if body else s.mask_share
+    enough = np.count_nonzero(own) >= max(s.min_points, share * np.count_nonzero(inner))
+    return near[own] if enough else None
 
 
 def _body(
@@ -250,7 +276,8 @@ def _object(
     kept = order[whole[order] >= _CONTAINED]
     for first in dict.fromkeys([int(order[0]), *kept[:1].tolist()]):
         parts = [first, *(c for c in order.tolist() if c != first and whole[c] >= min(_CONTAINED, whole[first]))]
-        chosen, value = _joined(low, high, parts, float(values[first]), box, s.gap)
+        gain = _GAIN if contained is not None else -_LOSS
+        chosen, value = _joined(low, high, parts, float(values[first]), box, s.gap, gain)
         rank = value + float(middle[chosen].sum() + _OUTSIDE * np.average(whole[chosen], weights=sizes[chosen]))
         best = max(best, (rank, chosen, value), key=lambda each: each[0])
     _, chosen, value = best
@@ -260,9 +287,15 @@ def _object(
 
 
 def _joined(
-    low: Array, high: Array, parts: Sequence[int], value: float, box: tuple[float, float, float, float], gap: float
+    low: Array,
+    high: Array,
+    parts: Sequence[int],
+    value: float,
+    box: tuple[float, float, float, float],
+    gap: float,
+    gain: float,
 ) -> tuple[list[int], float]:
-    """Returns the first of some parts with those near it that make the overlap with the box better, and that overlap.
+    """Returns the first of some parts with those near it by which the overlap with the box gains, and that overlap.
 
     The parts reach from `low` to `high` (5, N), in pixels and in space; `value` is the overlap of the first one.
     """
@@ -273,7 +306,7 @@ def _joined(
             continue
         both = np.minimum(least, low[:, c]), np.maximum(most, high[:, c])
         better = _overlap((*both[0][:2], *both[1][:2]), box)
-        if better > value + 0.01:
+        if better > value + gain:
             chosen, value, least, most = [*chosen, c], better, *both
     return chosen, value
 

@@ -51,9 +51,13 @@ SURFACE = -10
 
 @dataclass(frozen=True)
 class RelationRules:
-    """Lengths in metres, speeds in m/s."""
+    """Lengths in metres, speeds in m/s.
+
+    `flat` is by how much the plane of a surface is off: the middle of what lies flat on it may be so far below it.
+    """
 
     touch: float = 0.08
+    flat: float = 0.03
     near: float = 0.5
     side: float = 0.15
     above: float = 1.0
@@ -143,7 +147,7 @@ def _placed(
         if other.agent:
             continue
         off = abs(body.bottom - other.top)
-        upon = off <= 2 * rules.touch and body.height > other.top
+        upon = off <= 2 * rules.touch and body.height > other.top - rules.flat
         if not upon and min(body.top, other.top) <= max(body.bottom, other.bottom):
             continue
         share = boxes.share(body, other)
@@ -169,7 +173,8 @@ def _on_top(
     best: tuple[float, int] = (0.0, 0)
     for top in tops:
         off = abs(body.bottom - top.top)
-        if off <= 2 * rules.touch and body.center[2] > top.top and (share := boxes.share(body, top)) > 0.3:
+        upon = body.center[2] > top.top - rules.flat
+        if off <= 2 * rules.touch and upon and (share := boxes.share(body, top)) > 0.3:
             best = max(best, (min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)), top.id))
     if best[0] > 0:
         found[body.id, "on", best[1]] = best[0]

@@ -14,6 +14,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import FORMAT, RECORDING, Kind
 from dataflow.recording.mcap.attachments import Attachment
 from dataflow.recording.mcap.index import McapFile, RawMessage
+from dataflow.recording.mcap.rawfile import Watch
 from dataflow.recording.streams.access import StreamIndex
 from dataflow.recording.streams.codecs import codec_for
 from dataflow.recording.streams.entries import Event, RawRecord, Recorded
@@ -41,10 +42,13 @@ class Recording:
     MCAP or is damaged.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, watch: Watch | None = None) -> None:
+        """`watch` is called before every read of the file: a sign of progress while a long one is opened or read."""
         self.path = Path(path)
         parts = parts_in(self.path) if self.path.is_dir() else []
-        self._file: McapFile | PartedFile = PartedFile(self.path, parts) if parts else McapFile(self.path)
+        self._file: McapFile | PartedFile = (
+            PartedFile(self.path, parts, watch=watch) if parts else McapFile(self.path, watch=watch)
+        )
         try:
             self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
             _check_format(self.path, self.metadata)

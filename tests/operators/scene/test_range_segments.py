@@ -86,3 +86,14 @@ def test_the_back_of_a_chair_is_not_what_shows_between_its_slats() -> None:
     (chair,) = lifted(points, around(surface >= 2))
     assert (surface[chair] >= 2).mean() > 0.95
     assert len(chair) > 0.7 * (surface >= 2).sum()
+
+
+def test_points_off_the_mask_of_an_object_do_not_count() -> None:
+    points, surface = view(plane(-1.4), upright(1.5, -0.8, -0.2, 0.3))
+    box = around(surface == 1)
+    mask = (surface == 1).reshape(120, 160) & (np.arange(160) < 80)  # the left half is the object's
+    pixels = np.stack([U, V], axis=1)
+    seen = Seen(points, pixels + 0.5, np.isfinite(points).all(axis=1), UP, None, 0.5)
+    (found,) = lift(seen, np.array([box]), [-1], [], LiftSettings(), instances=[mask])
+    assert (U[found.points] < 80).all()
+    assert len(found.points) > 0.9 * mask.sum()
