@@ -41,7 +41,7 @@ class VideoDecoder(Operator):
         decoder = self._decoder_of(video.format)
         was_lost = bool(decoder.lost) or not self._counts.total()
         try:
-            pixels = decoder.decode(video.data.tobytes())
+            pixels = decoder.decode(video.data.tobytes(), video.stamp)
         except VideoError as error:
             raise VideoError(f"CompressedVideo at stamp {video.stamp} cannot be decoded: {error}") from error
         if pixels is None:
