@@ -53,9 +53,9 @@ TRUE_HEAD, TRUE_TAIL, SNAPSHOT_EVERY = 200, 7200, 20
 """Messages that are as a run makes them, and between two snapshots there."""
 
 
-def record_seed(folder: Path) -> Path:
+def record_seed(folder: Path, graph: str = GRAPH) -> Path:
     """A run of the graph, for its metadata and the records of `setup()`."""
-    (folder / "long.yaml").write_text(GRAPH)
+    (folder / "long.yaml").write_text(graph)
     out = folder / "seed.mcap"
     command = [str(Path(sys.executable).with_name("dataflow")), "run", str(folder / "long.yaml"), "--record", str(out)]
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).resolve().parent)}

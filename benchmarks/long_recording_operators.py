@@ -1,4 +1,4 @@
-"""Operators of `long_recording.py`: a source, and an operator with a state."""
+"""Operators of `long_recording.py` and `long_verification.py`: a source, and operators with and without a state."""
 
 from __future__ import annotations
 
@@ -49,3 +49,14 @@ class Sum(Operator):
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self.calls = state["calls"]
+
+
+class Copy(Operator):
+    """Sends what it is given."""
+
+    stateless = True
+    x: In[FeatureVector]
+    out: Out[FeatureVector]
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        return x

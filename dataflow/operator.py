@@ -45,10 +45,13 @@ from dataflow.ports import (
     SourceError,
     is_live,
 )
+from dataflow.state import KEPT, Counts, Remembered, StateOf, fresh_state, plain, reset_state, state_hints, take_over
 
 __all__ = [
+    "KEPT",
     "Batch",
     "Context",
+    "Counts",
     "Duration",
     "In",
     "InputKind",
@@ -62,6 +65,7 @@ __all__ = [
     "Outputs",
     "Param",
     "ParameterError",
+    "Remembered",
     "Sampled",
     "Source",
     "SourceError",
@@ -83,6 +87,9 @@ class Operator:
     """The outputs of `process()` depend on its inputs alone, so re-execution may begin anywhere."""
     external: ClassVar[bool] = False
     """Touches the world (an actuator, a network service): always recorded, never re-executed."""
+    state: Any
+    """The state, of the dataclass that a class annotates it with (`state: State`). None is annotated: no state."""
+    __state: ClassVar[Any] = None
     __generator: np.random.Generator | None = None
     __seed: SupportsInt = 0
 
@@ -103,6 +110,8 @@ class Operator:
             every = above.every if every is None else every
         if not abstract:
             declared = Declaration(cls, (Operator, Source), sys._getframe(1).f_locals)
+            if declared.state is not None:
+                cls.__state, cls.state = declared.state, StateOf()
             cls.spec = declared.spec(
                 merge,
                 tolerance,
@@ -158,23 +167,41 @@ class Operator:
     def close(self) -> None:
         """Releases resources. Always called, also after a failure."""
 
+    def initial_state(self) -> Any:
+        """Returns the state to begin with: by default the annotated dataclass without arguments.
+
+        Called when `state` is first asked for, and by `on_reset()`. Raises `StateError`.
+        """
+        return fresh_state(type(self), self.__state)
+
     def on_reset(self, input: str) -> None:
-        """The clock behind `input` jumped back: the stamps to come are earlier than those before."""
+        """Begins anew with `initial_state()`, the fields declared `KEPT` aside.
+
+        The clock behind `input` jumped back: the stamps to come are earlier than those before.
+        """
+        if self.__state is not None:
+            old, self.state = self.state, self.initial_state()
+            reset_state(old, self.state)
 
     def on_parameter(self, name: str) -> None:
         """A `live` parameter was changed between two firings; `self.<name>` holds the new value."""
 
     def snapshot(self) -> Mapping[str, Any] | None:
-        """The state, such that `restore` of it in a fresh operator goes on alike; None where there is no such thing.
+        """Returns the state, such that `restore` of it in a fresh operator goes on alike: by default `state` or None.
 
         Values: numbers, strings, bytes, None, numpy arrays, and lists and mappings (with string keys) of these. Called
-        between firings of a recorded run whose graph asks for snapshots.
+        between firings of a recorded run whose graph asks for snapshots. Raises `StateError` for other values.
         """
-        return None
+        if self.__state is None:
+            return None
+        snapshot: Mapping[str, Any] = plain(self.state)
+        return snapshot
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes over a state that `snapshot` gave. Called once, after `setup()`."""
-        raise NotImplementedError(f"{type(self).__name__} gives snapshots but cannot restore them")
+        """Takes over a state that `snapshot` gave. Called once, after `setup()`. Raises `StateError`."""
+        if self.__state is None:
+            raise NotImplementedError(f"{type(self).__name__} gives snapshots but cannot restore them")
+        take_over(self.state, state_hints(self.state), state)
 
     def set_parameter(self, name: str, value: Any) -> Any:
         """Changes a `live` parameter; returns the value as validated. Raises `ParameterError`."""
@@ -192,8 +219,8 @@ class Operator:
         return getattr(self, name)
 
     def summary(self) -> Mapping[str, float | int | str]:
-        """Figures to show at the end of a run (metrics sinks); read after `finish()`."""
-        return {}
+        """Returns figures to show at the end of a run, by default those of a state `Counts`; read after `finish()`."""
+        return dict(self.state.counts) if issubclass(self.__state or object, Counts) else {}
 
     @classmethod
     def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:

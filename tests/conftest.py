@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import ast
+import fcntl
+import gc
 import os
+import re
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
 import pytest
+from _pytest.mark.expression import Expression
 
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("repeatable")
@@ -20,6 +25,16 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPEN
     os.environ.setdefault(name, "1")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+TESTS = REPOSITORY / "tests"
+ROOMS = {
+    "docs": ("docs", "scaffold"),
+    "network": ("client", "foxglove", "transport"),
+    "process": (
+        "analysis", "api", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
+        "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",
+    ),
+}  # fmt: skip
+"""Folders of tests by marker; a test anywhere else is a `unit` test."""
 sys.path += [str(REPOSITORY / "tests" / "support"), str(REPOSITORY / "tools")]
 
 
@@ -35,7 +50,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     """
     whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
     worker = hasattr(config, "workerinput")  # which would divide its part again, and so on without end
-    chosen = config.option.keyword or config.option.markexpr or config.option.usepdb or config.option.collectonly
+    chosen = config.option.keyword or config.option.usepdb or config.option.collectonly
     if (
         whole
         and not worker
@@ -47,12 +62,74 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         config.option.dist = "worksteal"
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Spares the garbage collector what collection makes: it all stays until the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+def marker_of(path: Path) -> str:
+    """Returns the marker of the tests in a file or folder, by the room that it lies in."""
+    inside = path.relative_to(TESTS)
+    return next((name for name, rooms in ROOMS.items() if any(inside.is_relative_to(room) for room in rooms)), "unit")
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    item.add_marker(marker_of(item.path))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leaves out files of which `-m` selects no test, before they import anything."""
+    named = set(re.findall(r"\w+", config.option.markexpr)) - {"and", "or", "not"}
+    if collection_path.suffix != ".py" or not named or not named <= {"unit", *ROOMS}:
+        return None
+    wanted = Expression.compile(config.option.markexpr).evaluate(lambda name, **_: name == marker_of(collection_path))
+    return None if wanted else True
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _running_graphs_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keeps the graphs of these tests apart from those that others run on this machine."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("runtime")))
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _late_imports(request: pytest.FixtureRequest) -> None:
+    """Imports what a module of tests names under `if TYPE_CHECKING:` when its first test runs: torch takes seconds.
+
+    Nothing of that is imported when tests are collected, and where an extra is not installed the tests are skipped.
+    """
+    source = request.path.read_text(encoding="utf-8")
+    for node in ast.parse(source).body if "TYPE_CHECKING" in source else ():
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            exec(compile(ast.Module(node.body, []), request.path, "exec"), vars(request.module))
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Makes files that tests only read, once for all workers: `once(name, make)` is a folder that `make` filled."""
+    session = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        session = session.parent
+
+    def folder_of(name: str, make: Callable[[Path], object]) -> Path:
+        folder = session / f"once_{name}"
+        with folder.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not folder.with_suffix(".made").exists():
+                folder.mkdir(exist_ok=True)
+                make(folder)
+                folder.with_suffix(".made").touch()
+        return folder
+
+    return folder_of
 
 
 @pytest.fixture(scope="session")

@@ -66,8 +66,9 @@ It imports libraries, each under its own licence. The table lists those of their
 other contents of their wheels are noted where they are known to matter. The tests check that the installed package
 imports nothing that is under the GPL or AGPL, directly or through what it imports.
 
-`[dev]` brings evo (GPL-3.0) for the tests, which compare our trajectory errors with its; neither `dataflow` nor
-`operators` imports it.
+`[dev]` brings evo (GPL-3.0) for the tests, which compare our trajectory errors with its, and PyAV (BSD-3-Clause), whose
+wheel brings FFmpeg with x264 and x265 (GPL-2.0): with them tests encode clips of made patterns. Neither `dataflow` nor
+`operators` imports one of the two: video is decoded by OpenCV's FFmpeg, which has no such encoders.
 """
 
 

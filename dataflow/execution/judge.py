@@ -12,7 +12,7 @@ from dataflow.messages.base import Message
 from dataflow.records.comparison import Difference, Verification
 from dataflow.records.firing import WITHHELD, Emission, FiringRecord
 from dataflow.records.reading import Digests
-from dataflow.sync import Firing
+from dataflow.sync import Entry, Firing
 
 _ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
 
@@ -26,12 +26,24 @@ class Judge:
     def __init__(self, operator: str, ports: tuple[str, ...], inputs: Digests) -> None:
         self.result = Verification(operator)
         self._ports, self._inputs = ports, inputs
+        self._altered: set[tuple[str, int, int]] = set()
+        """Messages that arrived, and are not known to be the recorded ones, as long as none was given."""
+
+    def arrived(self, stream: str, entry: Entry) -> None:
+        """Looks at a message that firings will be given: messages come in the order of their stream. One whose digest
+        was not recorded (a record that is lost) is not known to be the recorded one."""
+        if self.result.tainted is None:
+            digests, place = self._inputs.get(stream), (stream, entry.incarnation, entry.seq)
+            if digests is None or digests.get((entry.incarnation, entry.seq)) != entry.digest:
+                self._altered.add(place)
+            elif self._altered:
+                self._altered.discard(place)
 
     def given(self, record: FiringRecord, firing: Firing) -> None:
-        """Looks at what a firing is given. A message whose digest was not recorded (a record that is lost) is not known
-        to be the recorded one."""
-        if self.result.tainted is None and not self._as_recorded(firing):
+        """Looks at what a firing is given."""
+        if self._altered and not self._as_recorded(firing):
             self.result.tainted = record.index
+            self._altered.clear()
 
     def outputs(self, record: FiringRecord, messages: Mapping[str, Message]) -> Iterator[tuple[str, Message, int]]:
         """Compares what came out; yields port, message and recorded number of what was sent in the recorded run."""
@@ -90,7 +102,7 @@ class Judge:
 
     def _as_recorded(self, firing: Firing) -> bool:
         return all(
-            self._inputs.get(entry.stream, {}).get((entry.incarnation, entry.seq)) == entry.digest
+            (entry.stream, entry.incarnation, entry.seq) not in self._altered
             for given in firing.inputs.values()
             for entry in entries_of(given)
         )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 from dataflow.execution.absent import without_absent
 from dataflow.execution.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
@@ -30,8 +30,15 @@ MOST_TRIED = 256
 """Messages and waits that are over, none of which decides a firing, in one step. A timer that falls behind drops its
 ticks one by one, while new ones come due: its process would never look at anything else."""
 
-Fault = Callable[[Firing], BaseException | None]
-"""A fault on purpose: is asked before each firing, may take its time, and gives an error to fail with instead."""
+
+class Faults(Protocol):
+    """Faults of one operator on purpose."""
+
+    def begin(self, kind: str, fields: Mapping[str, Any], now: float) -> None:
+        """Plans a fault; `now`: on the steady clock, seconds."""
+
+    def before(self, firing: Firing) -> BaseException | None:
+        """Is asked before each firing: may take its time, and gives an error to fail with instead."""
 
 
 class LiveRunner(OperatorRunner):
@@ -56,7 +63,7 @@ class LiveRunner(OperatorRunner):
         clock: Clock | None = None,
         event_clock: EventClock = time.time_ns,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
-        fault: Fault = lambda firing: None,
+        faults: Faults | None = None,
     ) -> None:
         more: dict[str, Any] = {"paranoid": paranoid, "operator": operator, "snapshots": snapshots}
         super().__init__(node, emitter, static=static, seed=seed, lossy=True, **more)
@@ -77,7 +84,7 @@ class LiveRunner(OperatorRunner):
         self._earlier = EarlierCounts()
         self._static = static
         self._statics: dict[str, Entry] = {}
-        self._on_failure, self._fault = on_failure, fault
+        self._on_failure, self.faults = on_failure, faults
         self._seen: dict[str, tuple[int, int]] = {}  # stream → incarnation, last stamp that the aligner was given
         self._jumped: dict[str, int] = {}  # producer → incarnation since its clock jumped back
         self._changed: dict[str, Any] = {}
@@ -230,7 +237,7 @@ class LiveRunner(OperatorRunner):
         if self.absent:
             firing = without_absent(firing, self.node, self.absent)
         try:
-            if (error := self._fault(firing)) is not None:
+            if self.faults is not None and (error := self.faults.before(firing)) is not None:
                 self._fail_on_purpose(firing, error)
             super()._fire(firing)
         except OperatorFailure as failure:

@@ -6,7 +6,7 @@ live run are repeated exactly. A `Judge` compares what comes out, digest by dige
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from dataflow.execution.align import align_spec
@@ -22,16 +22,28 @@ from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import ParameterError
 from dataflow.records.comparison import Verification
-from dataflow.records.cuts import is_known, taken_by, without_unknown
+from dataflow.records.cuts import is_known, taken_by
 from dataflow.records.firing import CALLS, FiringRecord
-from dataflow.records.reading import Digests, beginning, needed_from, whole
-from dataflow.sync import FOREVER, NEVER, Entry, Firing, MessageRef, RecordedAligner
+from dataflow.records.reading import Digests
+from dataflow.records.repetition import Repetition
+from dataflow.sync import FOREVER, NEVER, Entry, Firing, FiringInputs, MessageRef, RecordedAligner, Uses
+
+
+class Watcher:
+    """Is told what re-execution is about to do, and what it has done. Called for every step: it must be cheap."""
+
+    def begins(self, phase: str, operator: str) -> None:
+        """`phase`: setup, fire, read or close; `operator`: whose turn it is, empty for read."""
+
+    def stepped(self, runner: RecordedRunner) -> None:
+        """A runner has made a firing, or has ended."""
 
 
 class RecordedRunner(Runner):
-    """One operator, re-executed by its `records`. `inputs` are the digests of what it was given; `seeding` is the
-    version by which the recorded run seeded its generators; `begin` the stamp from which it is to be repeated. `guard`
-    watches over what it is given in each firing; without one, only the first firings are watched."""
+    """One operator, re-executed by its records: `records` reads them in the order of its calls, each once. `inputs` are
+    the digests of what it was given; `seeding` is the version by which the recorded run seeded its generators; `begin`
+    the stamp from which it is to be repeated. `guard` watches over what it is given in each firing; without one, only
+    the first firings are watched."""
 
     def __init__(
         self,
@@ -39,31 +51,35 @@ class RecordedRunner(Runner):
         emitter: Emitter,
         *,
         static: frozenset[str],
-        records: Iterable[FiringRecord],
+        records: Callable[[], Iterable[FiringRecord]],
         inputs: Digests,
         seed: int = 0,
         seeding: int = VERSION,
         guard: MemoryGuard | None = None,
         begin: int | None = None,
+        watcher: Watcher | None = None,
     ) -> None:
         super().__init__(node, node.make(), emitter)
         self._guard, self._watched = guard or MemoryGuard(), FOREVER if guard is not None else WATCHED
+        self._watcher = watcher or Watcher()
         self.calls = Calls(node, self.operator, seed, version=seeding)
         self.judge = Judge(node.name, tuple(self.ports.states), inputs)
-        kept, lost = whole(records)
-        self._setup_record = kept.pop(0) if kept and kept[0].kind == "setup" else None
-        self._before, self._records, self.result.began = beginning(kept, begin, stateless=self.operator.stateless)
-        if not self.operator.stateless:
-            self._records, self.result.unknown = without_unknown(self._records)
-        calls = [r for r in self._records if r.kind in CALLS]
-        self.result.firings = len(calls) + lost + self.result.unknown
-        self.result.lost_records = lost
+        self._repetition = Repetition(records, begin=begin, stateless=self.operator.stateless)
+        self.result.began = self._repetition.began
+        self.result.unknown, self.result.lost_records = self._repetition.unknown, self._repetition.lost
+        self._calls_left = self._repetition.calls
+        self.result.firings = self._calls_left + self.result.lost_records + self.result.unknown
         self._align_spec = align_spec(node, self.spec, static)
-        self.aligner = RecordedAligner(self._align_spec, (r.firing() for r in calls))
-        self._position = 0
+        self.aligner = RecordedAligner(self._align_spec, self._repetition.uses)
+        self._ahead = iter(self._repetition)
+        self.record = self._repetition.setup
+        """What is repeated now, or was last."""
+        self._next = next(self._ahead, None)
+        self._inputs: FiringInputs | None = None
+        """Of the next call, once it is its turn."""
         self._changed: dict[str, Any] = {}
         self._latest: dict[str, tuple[int, int]] = {}
-        self._open = {s for streams in node.inputs.values() for s in streams}
+        self._open = set(node.taken)
 
     @property
     def result(self) -> Verification:
@@ -72,11 +88,12 @@ class RecordedRunner(Runner):
 
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
+        self._watcher.begins("setup", self.node.name)
         statics = self.calls.setup()
-        if self._setup_record is not None:
-            self.judge.files(self._setup_record, self.operator.files)
-            for name, message, seq in self.judge.outputs(self._setup_record, statics):
-                self.ports.emit_as(name, message, seq, self._setup_record.incarnation)
+        if (record := self._repetition.setup) is not None:
+            self.judge.files(record, self.operator.files)
+            for name, message, seq in self.judge.outputs(record, statics):
+                self.ports.emit_as(name, message, seq, record.incarnation)
         self._take_up()
         self.ports.end_statics()
 
@@ -84,7 +101,8 @@ class RecordedRunner(Runner):
         """Returns where re-execution begins in the middle: the last restart, the parameters and the state of that
         moment."""
         changes: dict[str, Any] = {}
-        for record in self._before:
+        before = self._repetition.before
+        for record in before:
             if record.kind == "param":
                 changes[record.detail["name"]] = record.detail["value"]
             elif record.kind == "setup":
@@ -93,13 +111,13 @@ class RecordedRunner(Runner):
             elif (taken := taken_by(record)) is not None:
                 self._changed |= taken.at_setup
                 changes = dict(taken.since)
-        again = [r for r in self._before if r.kind == "setup" or ((t := taken_by(r)) is not None and t.again)]
+        again = [r for r in before if r.kind == "setup" or ((t := taken_by(r)) is not None and t.again)]
         if again:
             statics = self._make_anew(again[-1].incarnation)
             if again[-1].kind == "setup":
                 self.judge.statics(again[-1], statics)
         self._change(changes, again[-1].incarnation if again else 0)
-        if self._before and is_known(last := self._before[-1]):
+        if before and is_known(last := before[-1]):
             self.calls.restore(last.detail["state"], (last.incarnation, last.stamp))
 
     def _change(self, values: Mapping[str, Any], incarnation: int) -> None:
@@ -114,43 +132,64 @@ class RecordedRunner(Runner):
 
     def close(self) -> None:
         """Closes the operator. An error is printed: no record holds the error of `close()` in the run."""
+        self._watcher.begins("close", self.node.name)
         close_quietly(self.operator)
 
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
-        if self._position < len(self._records) and not self.ended:
+        if self._next is not None and not self.ended and self.aligner.takes(stream, entry):
+            self.judge.arrived(stream, entry)
             self.aligner.push(stream, entry)
+        self.wake()
 
     def advance(self, stream: str, frontier: int) -> None:
         """Recorded firings wait for messages, not for promises."""
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self._open.discard(stream)
+        self.wake()
 
     def step(self) -> bool:
         """Makes the next recorded firing once its messages are there; ends when it cannot come any more."""
         if self.ended:
             return False
+        self._watcher.begins("fire", self.node.name)
+        worked = self._make_next()
+        if worked:
+            self.wake()
+            self._watcher.stepped(self)
+        self._watcher.begins("read", "")
+        return worked
+
+    def _make_next(self) -> bool:
         self._repeat_changes()
-        firing = self.aligner.poll()
-        if firing is None:
-            if self._position >= len(self._records) or self._is_lost(self.aligner.missing()):
+        record = self._next
+        if record is not None and self._inputs is None:
+            self._inputs = record.firing()
+        firing = None if self._inputs is None else self.aligner.take(self._inputs)
+        if record is None or firing is None:
+            if record is None or self._is_lost(self.aligner.missing()):
                 self._end()
                 return True
-            self.done = max(self.done, self._records[self._position].stamp - 1)
+            self.done = max(self.done, record.stamp - 1)
             return False
-        record = self._records[self._position]
+        self.record = record
         with self.work:
             self._fire(firing, record)
-        self._position += 1
+        self._advance()
+        self._calls_left -= 1
         self.done = max(self.done, record.stamp)
         return True
 
+    def _advance(self) -> None:
+        """Reads the next record."""
+        self._next, self._inputs = next(self._ahead, None), None
+
     def _repeat_changes(self) -> None:
         """Returns what happened to the operator between the last firing and the next, in its recorded order."""
-        while self._position < len(self._records) and self._records[self._position].kind not in CALLS:
-            record = self._records[self._position]
-            self._position += 1
+        while self._next is not None and self._next.kind not in CALLS:
+            self.record = record = self._next
+            self._advance()
             place = (record.incarnation, record.stamp)
             match record.kind:
                 case "setup":
@@ -170,7 +209,7 @@ class RecordedRunner(Runner):
 
     def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
         """A fresh operator, with the parameters as they were last set; its static messages."""
-        self.close()
+        close_quietly(self.operator)
         self.operator = self.calls.operator = self.node.make()
         self._change(self._changed, incarnation)
         return self.calls.setup()
@@ -208,10 +247,9 @@ class RecordedRunner(Runner):
         """A replay that began in the middle: with this state, or with one that is unavailable."""
         state = record.detail["state"]
         if state is None:
-            rest = self._records[self._position :]
-            self.result.lost_records += sum(r.kind in CALLS for r in rest)
-            del self._records[self._position :]
-            self.aligner = RecordedAligner(self._align_spec, ())
+            self.result.lost_records += self._calls_left
+            self._calls_left, self._next = 0, None
+            self.aligner = RecordedAligner(self._align_spec, Uses())
             return
         self.calls.restore(state, (record.incarnation, record.stamp))
 
@@ -225,12 +263,12 @@ class RecordedRunner(Runner):
     def waiting(self) -> tuple[int | None, dict[str, int]]:
         """The stamp of the next firing, and the stream and number of the message that it waits for."""
         missing = self.aligner.missing()
-        stamp = self._records[self._position].stamp if self._position < len(self._records) else None
+        stamp = None if self._next is None else self._next.stamp
         return stamp, {} if missing is None else {missing.stream: missing.seq}
 
     def needs_from(self) -> dict[str, tuple[int, int]]:
         """By stream, the first message (incarnation, number) that is needed to repeat what is to be repeated."""
-        return needed_from(self._records)
+        return self._repetition.needed
 
     def set_parameter(self, name: str, value: Any) -> Any:
         raise ParameterError("the parameters of a re-execution are the recorded ones")
@@ -263,7 +301,7 @@ class RecordedRunner(Runner):
 
     def _end(self) -> None:
         self.ended, self.done = True, FOREVER
-        self.result.unverifiable = sum(r.kind in CALLS for r in self._records[self._position :])
+        self.result.unverifiable = self._calls_left
         if self.result.unverifiable and (lost := self.aligner.missing()) is not None:
             self.result.missing = f"{lost.stream} #{lost.seq}"
             if (lost.incarnation, lost.seq) > self._latest.get(lost.stream, (-1, -1)):

@@ -8,11 +8,9 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from dataflow.state import StateError
+
 _ARRAY = 1
-
-
-class StateError(ValueError):
-    """A state that holds something else than numbers, strings, bytes, None, arrays, lists and mappings."""
 
 
 def pack_state(state: Mapping[str, Any]) -> bytes:

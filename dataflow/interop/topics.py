@@ -29,7 +29,7 @@ UNIT = "unit"
 """Of a channel's metadata: the unit of its numbers, which ROS has no place for."""
 FIRST = 100
 """Messages of which one has to be readable."""
-_STAMPED_FIRST = {"rcl_interfaces/msg/Log"}
+_STAMPED_FIRST = {"rcl_interfaces/msg/Log", "foxglove_msgs/msg/CompressedVideo"}
 """Types that begin with a bare time."""
 
 

@@ -5,10 +5,18 @@ from dataflow.messages.camera import CameraInfo
 from dataflow.messages.clouds import Clusters, PointCloud
 from dataflow.messages.detection import Boxes3D, Detections2D, pack_masks
 from dataflow.messages.diagnostics import Diagnostics, Level
-from dataflow.messages.images import CompressedDepth, CompressedImage, DepthImage, Image, Image16, RelativeDepth
+from dataflow.messages.images import (
+    CompressedDepth,
+    CompressedImage,
+    CompressedVideo,
+    DepthImage,
+    Image,
+    Image16,
+    RelativeDepth,
+)
 from dataflow.messages.inertial import Imu, MagneticField
 from dataflow.messages.mapping import Mesh, OccupancyGrid, Planes
-from dataflow.messages.poses import NavSatFix, Odometry, ParticleSet, Path, Pose, Transforms, Twist
+from dataflow.messages.poses import NavSatFix, Odometry, ParticleSet, Path, Point, Pose, Transforms, Twist
 from dataflow.messages.ranging import LaserScan, RadarScan, RangeReading
 from dataflow.messages.scene import Activity, Classification, FeatureVector, SceneGraph
 from dataflow.messages.segmentation import SegmentationMap
@@ -25,6 +33,7 @@ __all__ = [
     "Clusters",
     "CompressedDepth",
     "CompressedImage",
+    "CompressedVideo",
     "DepthImage",
     "Detections2D",
     "Diagnostics",
@@ -48,6 +57,7 @@ __all__ = [
     "ParticleSet",
     "Path",
     "Planes",
+    "Point",
     "PointCloud",
     "Pose",
     "RadarScan",

@@ -12,6 +12,8 @@ from dataflow.messages.pictures import Picture
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 FORMATS = ("jpeg", "png", "webp")
+VIDEO_FORMATS = ("h264", "h265")
+START_CODES = (b"\0\0\1", b"\0\0\0\1")
 
 
 class Image(Message):
@@ -84,6 +86,26 @@ class CompressedImage(Message):
 
     def _picture(self) -> Picture | None:
         return self.format, self.data.tobytes()
+
+
+class CompressedVideo(Message):
+    """One picture of a video stream; most need the messages before it, back to a key frame, to be decoded.
+
+    Its bytes are in Annex B form (ITU-T H.264, H.265), of one picture, and in the order of time, so without B-frames. A
+    key frame comes with its parameter sets (SPS, PPS; VPS), so that decoding can begin with it.
+    """
+
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    format: str = scalar("str", "how the stream is encoded", choices=VIDEO_FORMATS)
+    data: U8 = array("uint8", "N", "NAL units of one picture, each after a start code")
+
+    def validate(self) -> None:
+        head = self.data[:4].tobytes()
+        if not head.startswith(START_CODES):
+            raise MessageError(
+                f"CompressedVideo.data must begin with a start code (00 00 01), as in Annex B of {self.format}, got "
+                f"{len(self.data)} bytes that begin with {head.hex(' ')}"
+            )
 
 
 class DepthImage(Message):

@@ -78,24 +78,21 @@ def is_known(record: FiringRecord) -> bool:
     return record.kind in ("snapshot", "cut") and "state" in record.detail
 
 
-def without_unknown(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
-    """The records of an operator with a state, without the calls that follow a cut at which it is not known.
+class Knowledge:
+    """Follows the records of an operator with a state: whether it is known, from a cut without a state on."""
 
-    From the next snapshot on it is known again. Returns how many calls cannot be repeated, too.
-    """
-    kept: list[FiringRecord] = []
-    unknown, waiting = 0, False
-    for record in records:
-        if record.kind == "cut" and taken_by(record) is not None:
-            waiting = "state" not in record.detail
-        elif waiting and record.kind == "snapshot" and is_known(record):
-            waiting = False
-            kept.append(replace(record, kind="restore"))
-            continue
-        elif waiting and record.kind == "setup":
-            waiting = False
-        if waiting and record.kind in (*CALLS, "reset"):
-            unknown += record.kind in CALLS
-            continue
-        kept.append(record)
-    return kept, unknown
+    def __init__(self) -> None:
+        self._lost = False
+
+    def of(self, record: FiringRecord) -> FiringRecord | None:
+        """Returns the next record as it is to be repeated; None for a call that cannot be, since the state is not
+        known. From the next snapshot on it is known again."""
+        kind = record.kind
+        if kind == "cut" and taken_by(record) is not None:
+            self._lost = "state" not in record.detail
+        elif self._lost and kind == "snapshot" and is_known(record):
+            self._lost = False
+            return replace(record, kind="restore")
+        elif self._lost and kind == "setup":
+            self._lost = False
+        return None if self._lost and kind in (*CALLS, "reset") else record

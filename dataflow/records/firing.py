@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgpack
 
@@ -215,23 +215,55 @@ class Batch:
 
 def decode_batch(data: bytes) -> Batch:
     """Raises `FiringRecordError` for anything that `encode_batch` did not write."""
+    rows = unpack_batch(data)
+    return Batch(rows.operator, rows.incarnation, rows.last, decode_rows(rows), data)
+
+
+class Rows(NamedTuple):
+    """A batch of which the records are rows still: values in the order of the fields of `FiringRecord` from `kind` on,
+    with references to `streams` by number."""
+
+    operator: str
+    incarnation: int
+    first: int
+    last: bool
+    names: list[str]
+    streams: list[str]
+    rows: list[list[Any]]
+
+
+def unpack_batch(data: bytes) -> Rows:
+    """The rows of a batch, for those who need little of each. Raises `FiringRecordError` for what is no batch; what a
+    row holds is not looked at."""
     try:
         batch = msgpack.unpackb(data, raw=False)
         if batch["format"] != FORMAT:
             raise FiringRecordError(f"firing records of format {batch['format']!r}; this version reads {FORMAT}")
         operator, incarnation, first = batch["operator"], batch["incarnation"], batch["first"]
-        names, streams = batch["inputs"], batch["streams"]
-        records = tuple(
-            _record(operator, incarnation, first + offset, row, names, streams)
-            for offset, row in enumerate(batch["rows"])
-        )
-        last = bool(batch["last"])
+        return Rows(operator, incarnation, first, bool(batch["last"]), batch["inputs"], batch["streams"], batch["rows"])
     except FiringRecordError:
         raise
-    except (ValueError, TypeError, KeyError, IndexError, RecursionError, msgpack.UnpackException) as error:
-        what = f"{type(error).__name__}: {error}".rstrip(": ")
-        raise FiringRecordError(f"not a batch of firing records ({what})") from error
-    return Batch(operator, incarnation, last, records, data)
+    except _DAMAGE as error:
+        raise _damaged(error) from error
+
+
+def decode_rows(batch: Rows) -> tuple[FiringRecord, ...]:
+    """The records of a batch. Raises `FiringRecordError`."""
+    operator, incarnation, first, _, names, streams, rows = batch
+    try:
+        return tuple([_record(operator, incarnation, first + n, row, names, streams) for n, row in enumerate(rows)])
+    except FiringRecordError:
+        raise
+    except _DAMAGE as error:
+        raise _damaged(error) from error
+
+
+_DAMAGE = (ValueError, TypeError, KeyError, IndexError, RecursionError, msgpack.UnpackException)
+
+
+def _damaged(error: Exception) -> FiringRecordError:
+    what = f"{type(error).__name__}: {error}".rstrip(": ")
+    return FiringRecordError(f"not a batch of firing records ({what})")
 
 
 def _record(
@@ -239,21 +271,21 @@ def _record(
 ) -> FiringRecord:
     kind, stamp, tick, inputs, stale, late, outputs, outcome, drops, detail, wall_start, duration = row
     return FiringRecord(
-        operator=operator,
-        incarnation=incarnation,
-        index=index,
-        kind=KINDS[kind],
-        stamp=stamp,
-        tick=bool(tick),
-        inputs={name: _decode_ref(ref, streams) for name, ref in zip(names, inputs, strict=True)} if inputs else {},
-        stale=frozenset(stale) if stale else _NO_NAMES,
-        late=frozenset(late) if late else _NO_NAMES,
-        outputs=tuple(None if e is None else Emission(e[0], stamp + e[1], e[2]) for e in outputs),
-        outcome=OUTCOMES[outcome],
-        drops=tuple(Drop(i, streams[s], at, n, inc, why, of) for i, s, inc, n, at, why, of in drops) if drops else (),
-        detail=detail,
-        wall_start=wall_start,
-        duration=duration,
+        operator,
+        incarnation,
+        index,
+        KINDS[kind],
+        stamp,
+        bool(tick),
+        {name: _decode_ref(ref, streams) for name, ref in zip(names, inputs, strict=True)} if inputs else {},
+        frozenset(stale) if stale else _NO_NAMES,
+        frozenset(late) if late else _NO_NAMES,
+        tuple([None if e is None else Emission(e[0], stamp + e[1], e[2]) for e in outputs]),
+        OUTCOMES[outcome],
+        tuple(Drop(i, streams[s], at, n, inc, why, of) for i, s, inc, n, at, why, of in drops) if drops else (),
+        detail,
+        wall_start,
+        duration,
     )
 
 
@@ -273,10 +305,10 @@ def _encode_ref(ref: InputRef, stream_index: Callable[[str], int]) -> list[Any] 
 def _decode_ref(data: list[Any] | None, streams: list[str]) -> InputRef:
     if data is None:
         return None
-    tag, *rest = data
-    if tag == 0:
-        stream, incarnation, seq = rest
+    if data[0] == 0:
+        _, stream, incarnation, seq = data
         return MessageRef(streams[stream], incarnation, seq)
+    tag, *rest = data
     if tag == 1:
         return tuple(RunRef(streams[s], i, first, first + more) for s, i, first, more in rest)
     if tag == 2:

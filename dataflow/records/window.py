@@ -5,14 +5,14 @@ Earlier records are left out as from a recording that was cut: a `cut` record re
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from dataflow.recording import Recording
 from dataflow.recording.layout import PARAMETERS, RECOVERED, TOLD
 from dataflow.recording.streams.cutting import cut_of
 from dataflow.records.cuts import Taken, cut_record, is_known
 from dataflow.records.firing import CALLS, FiringRecord, FiringRecordError, decode_batch, encode_batch
-from dataflow.records.reading import FiringLog, Maker, needed_from
+from dataflow.records.reading import FiringLog, Maker, note_taken
 
 FIRST_REACH = 60 * 10**9
 """Span (ns) before the stamp in which records are looked for at first: states are recorded about that often."""
@@ -67,18 +67,20 @@ def _heads(recording: Recording) -> Mapping[str, bytes]:
 
 def _window(recording: Recording, heads: Mapping[str, bytes], start: int) -> FiringLog | None:
     """The records from about `start` on, behind those of each operator's beginning; None where one has none there."""
-    batches: dict[str, list[bytes]] = {}
+    firsts: dict[str, bytes] = {}
     for operator, payload in recording.firings(start=start):
-        batches.setdefault(operator, []).append(payload)
-    if any(count > 1 and operator not in batches for operator, count in recording.firing_batches().items()):
+        firsts.setdefault(operator, payload)
+    counts = {name: count for name, count in recording.firing_batches().items() if name not in firsts}
+    if any(count > 1 or (count and name not in heads) for name, count in counts.items()):
         return None
+    kept: dict[str, list[bytes]] = {name: [] if name in firsts else [head] for name, head in heads.items()}
     begins: dict[str, int] = {}
-    for operator, found in batches.items():
+    for operator, found in firsts.items():
         head = heads.get(operator)
         if head is None:
             return None
         try:
-            before, after = decode_batch(head), decode_batch(found[0])
+            before, after = decode_batch(head), decode_batch(found)
         except FiringRecordError:
             return None  # a reader of the whole file names the damaged batch
         last, first = before.records[-1], after.records[0]
@@ -89,11 +91,11 @@ def _window(recording: Recording, heads: Mapping[str, bytes], start: int) -> Fir
             left_out = first.index - 1 - last.index
             taken = Taken(again=False, at_setup={}, since={}, state=None)
             cut = cut_record(place, left_out=left_out, taken=taken, held=(), stamp=first.stamp)
-            found[:0] = [head, encode_batch([cut])]
+            kept[operator] = [head, encode_batch([cut])]
             begins[operator] = first.index
         elif first.index == last.index + 1:
-            found.insert(0, head)
-    return FiringLog({name: batches.get(name, [head]) for name, head in heads.items()}, str(recording.path), begins)
+            kept[operator] = [head]
+    return FiringLog(kept, str(recording.path), recording, start=start, begins=begins)
 
 
 def _suffices(
@@ -104,25 +106,39 @@ def _suffices(
     needed: dict[str, tuple[int, int]] = {}
     made: dict[str, tuple[int, int]] = {}
     for maker in makers:
-        begin = log.begins.get(maker.name)
-        records = [r for r in log.of(maker.name) if begin is None or r.index >= begin]
-        if any(r.incarnation or r.kind in ("reset", "param") for r in records):
+        made |= _made_from(log.records(maker.name), log.begins.get(maker.name), list(maker.outputs.values()))
+        taken = _taken_by(log, maker, stamp, stateless=maker.name in stateless, stateful=maker.name in stateful)
+        if taken is None:
             return False
-        made |= _made_from(log.of(maker.name), begin, list(maker.outputs.values()))
-        since = len(records)
-        if maker.name in stateless:
-            since = next((k for k, r in enumerate(records) if r.kind in CALLS and r.stamp >= stamp), len(records))
-        elif maker.name in stateful:
-            since = max((k + 1 for k, r in enumerate(records) if is_known(r) and r.stamp <= stamp), default=0)
-            if begin is not None and not since:
-                return False
-        for stream, place in needed_from(records[since:]).items():
+        for stream, place in taken.items():
             needed[stream] = min(place, needed.get(stream, place))
     return all(place >= made[stream] for stream, place in needed.items() if stream in made)
 
 
+def _taken_by(
+    log: FiringLog, maker: Maker, stamp: int, *, stateless: bool, stateful: bool
+) -> Mapping[str, tuple[int, int]] | None:
+    """By stream, the first message that is needed to repeat an operator from `stamp` on; None where its records in the
+    window do not suffice for that."""
+    begin = log.begins.get(maker.name)
+    taken: dict[str, tuple[int, int]] = {}
+    counts, known = stateful, False
+    for record in log.records(maker.name):
+        if begin is not None and record.index < begin:
+            continue
+        if record.incarnation or record.kind in ("reset", "param"):
+            return None
+        counts = counts or (stateless and record.kind in CALLS and record.stamp >= stamp)
+        if stateful and is_known(record) and record.stamp <= stamp:
+            known = True
+            taken.clear()
+        elif counts:
+            note_taken(taken, record)
+    return None if stateful and begin is not None and not known else taken
+
+
 def _made_from(
-    records: Sequence[FiringRecord], begin: int | None, streams: Sequence[str]
+    records: Iterable[FiringRecord], begin: int | None, streams: Sequence[str]
 ) -> Mapping[str, tuple[int, int]]:
     """By stream, the message (incarnation, number) from which on there are all records of its maker."""
     if begin is None:

@@ -69,7 +69,7 @@ def first_needed(log: FiringLog, graph: Graph, runners: Iterable[RecordedRunner]
     stamps: dict[str, int] = {}
     for maker in {graph.streams[stream].node for stream in needed}:
         streams = list(graph.nodes[maker].outputs.values())
-        for record in log.of(maker):
+        for record in log.records(maker):
             if record.kind == "reset":
                 return None  # stamps went back there
             for stream, emission in zip(streams, record.outputs, strict=False):

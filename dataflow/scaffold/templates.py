@@ -9,8 +9,17 @@ OPERATOR = Template('''\
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from dataflow.messages import Image, Number
 from dataflow.operator import In, Operator, Out, Param
+
+
+@dataclass
+class State:
+    """What the next result depends on: kept in recordings, so that a part of one is replayed and verified."""
+
+    darkest: float = 1.0
 
 
 class $Class(Operator):
@@ -20,30 +29,19 @@ class $Class(Operator):
     brightness: Out[Number] = Out(doc="mean of all pixels, 0 to 1")
 
     scale: float = Param(1.0, gt=0, live=True, doc="factor on the result")
-
-    def setup(self) -> None:
-        """Loads what takes long, once, before the first message."""
-        self.darkest = 1.0
+    state: State
 
     def process(self, image: Image) -> Number:
         """Called for each image, in the order of their timestamps. Returns a message, or None for nothing."""
         value = self.scale * float(image.data.mean()) / 255
-        if value < self.darkest:
-            self.darkest = value
+        if value < self.state.darkest:
+            self.state.darkest = value
             self.log.info("darkest so far: %.3f", value)
         return Number(stamp=image.stamp, value=value)
 
-    def snapshot(self) -> dict[str, float]:
-        """The state, from which a part of a recording is replayed and verified."""
-        return {"darkest": self.darkest}
-
-    def restore(self, state: dict[str, float]) -> None:
-        """Takes over what `snapshot` gave."""
-        self.darkest = state["darkest"]
-
     def summary(self) -> dict[str, float]:
         """Figures that `dataflow run` prints at the end."""
-        return {"darkest": self.darkest}
+        return {"darkest": self.state.darkest}
 ''')
 
 OPERATOR_TEST = Template('''\

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         StreamOrderError,
         Waiting,
     )
-    from dataflow.sync.recorded import RecordedAligner
+    from dataflow.sync.recorded import RecordedAligner, Uses
     from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, RunRef, input_refs, messages_of, refs_of
     from dataflow.sync.spec import AlignSpec, BatchSpec, SampledSpec, TriggerSpec
     from dataflow.sync.stamps import FOREVER, NEVER, format_duration, format_stamp, parse_duration, trail
@@ -44,7 +44,7 @@ else:
                 "StreamOrderError",
                 "Waiting",
             ),
-            "recorded": ("RecordedAligner",),
+            "recorded": ("RecordedAligner", "Uses"),
             "refs": ("FiringInputs", "InputRef", "MessageRef", "RunRef", "input_refs", "messages_of", "refs_of"),
             "spec": ("AlignSpec", "BatchSpec", "SampledSpec", "TriggerSpec"),
             "stamps": ("FOREVER", "NEVER", "format_duration", "format_stamp", "parse_duration", "trail"),
@@ -77,6 +77,7 @@ __all__ = [
     "StreamEnd",
     "StreamOrderError",
     "TriggerSpec",
+    "Uses",
     "Waiting",
     "format_duration",
     "format_stamp",

@@ -2,31 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 
 from dataflow.sync.entries import Entry, Firing, InputValue
 from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, messages_of
 from dataflow.sync.spec import AlignSpec
 
+_BITS = 10
+_PAGE = 1 << _BITS
+_MOST = 255
+
+
+class Uses:
+    """Counts how often recorded firings take each message, in a byte a message as long as it is less than 255 times."""
+
+    def __init__(self) -> None:
+        self._pages: dict[tuple[str, int], dict[int, bytearray]] = {}
+        """(stream, incarnation) → number of a message without its last bits → counts by these."""
+        self._more: dict[tuple[str, int, int], int] = {}
+
+    def add(self, inputs: Mapping[str, InputRef]) -> None:
+        """Counts what one firing takes."""
+        for ref in inputs.values():
+            for message in (ref,) if ref.__class__ is MessageRef else messages_of(ref):
+                pages = self._pages.setdefault((message.stream, message.incarnation), {})
+                page = pages.get(message.seq >> _BITS)
+                if page is None:
+                    page = pages[message.seq >> _BITS] = bytearray(_PAGE)
+                at = message.seq & _PAGE - 1
+                if page[at] < _MOST:
+                    page[at] += 1
+                else:
+                    place = (message.stream, message.incarnation, message.seq)
+                    self._more[place] = self._more.get(place, 0) + 1
+
+    def left(self, stream: str, incarnation: int, seq: int) -> bool:
+        """Tells whether a message is still to be taken."""
+        page = self._pages.get((stream, incarnation), {}).get(seq >> _BITS)
+        return page is not None and page[seq & _PAGE - 1] > 0
+
+    def take(self, message: MessageRef) -> bool:
+        """Counts one use as done. Returns whether it was the last of that message."""
+        if self._more:
+            place = (message.stream, message.incarnation, message.seq)
+            if (more := self._more.pop(place, 0)) > 1:
+                self._more[place] = more - 1
+            if more:
+                return False
+        page = self._pages[message.stream, message.incarnation][message.seq >> _BITS]
+        page[message.seq & _PAGE - 1] -= 1
+        return not page[message.seq & _PAGE - 1]
+
 
 class RecordedAligner:
-    """Yields recorded firings again, each as soon as all its messages are there.
+    """Makes recorded firings again, each as soon as all its messages are there.
 
-    records: the operator's fire, tick and finish records in order. They say which messages will be taken, and how
-    often: only those are held, each until its last firing. Whatever else arrives is let go at once.
+    `uses`: how often the firings to come take each message. Only those are held, each until its last firing. Whatever
+    else arrives is let go at once.
     """
 
-    def __init__(self, spec: AlignSpec, records: Iterable[FiringInputs]) -> None:
-        self._records = list(records)
-        self._place = 0
+    def __init__(self, spec: AlignSpec, uses: Uses) -> None:
         self._streams = frozenset(spec.streams)
-        self._wanted: dict[tuple[str, int], dict[int, int]] = {}
-        """(stream, incarnation) → number of a message → how many records still take it."""
-        for record in self._records:
-            for ref in record.inputs.values():
-                for message in messages_of(ref):
-                    uses = self._wanted.setdefault((message.stream, message.incarnation), {})
-                    uses[message.seq] = uses.get(message.seq, 0) + 1
+        self._uses = uses
         self._held: dict[MessageRef, Entry] = {}
         self._missing: MessageRef | None = None
 
@@ -34,32 +71,30 @@ class RecordedAligner:
         """A message arrives; streams may be interleaved in any way."""
         if stream not in self._streams:
             raise KeyError(f"stream {stream!r} feeds no input; those that do: {', '.join(sorted(self._streams))}")
-        if entry.seq in self._wanted.get((stream, entry.incarnation), ()):
+        if self.takes(stream, entry):
             if not entry.stream:
                 entry = Entry(entry.stamp, entry.value, entry.seq, entry.incarnation, entry.digest, stream)
             self._held[MessageRef(stream, entry.incarnation, entry.seq)] = entry
 
-    def poll(self) -> Firing | None:
-        """The next recorded firing, or None while a message of it is missing or when there is none left."""
-        if self.ended() or (self._missing is not None and self._missing not in self._held):
+    def takes(self, stream: str, entry: Entry) -> bool:
+        """Tells whether a firing to come takes a message."""
+        return self._uses.left(stream, entry.incarnation, entry.seq)
+
+    def take(self, record: FiringInputs) -> Firing | None:
+        """Returns the firing that `record` tells of, the next one; None while a message of it is missing."""
+        if self._missing is not None and self._missing not in self._held:
             return None
-        record = self._records[self._place]
         self._missing = None
         inputs: dict[str, InputValue] = {}
         for name, ref in record.inputs.items():
             inputs[name] = self._resolve(ref)
             if self._missing is not None:
                 return None
-        self._place += 1
         self._let_go(record)
         return Firing(record.stamp, record.kind, record.tick, inputs, record.stale, record.late)
 
-    def ended(self) -> bool:
-        """Tells whether every recorded firing has been returned."""
-        return self._place >= len(self._records)
-
     def missing(self) -> MessageRef | None:
-        """A message that the next firing waits for; None if `poll` has not found one missing."""
+        """A message that the next firing waits for; None if `take` has not found one missing."""
         return self._missing
 
     def buffered(self) -> dict[str, int]:
@@ -91,7 +126,5 @@ class RecordedAligner:
         """Counts what `record` took, and releases what no later record takes."""
         for ref in record.inputs.values():
             for message in messages_of(ref):
-                uses = self._wanted[message.stream, message.incarnation]
-                uses[message.seq] -= 1
-                if not uses[message.seq]:
-                    del uses[message.seq], self._held[message]
+                if self._uses.take(message):
+                    del self._held[message]

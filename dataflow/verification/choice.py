@@ -7,10 +7,9 @@ from collections.abc import Collection, Iterable
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.layout import OUTCOME
-from dataflow.records.firing import FiringRecord
-from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import NotRecorded, ReplayError
+from dataflow.verification.books import Books
 from dataflow.verification.ledger import COMPLETE
 
 
@@ -72,11 +71,11 @@ def unfed_operators(
     return found
 
 
-def require_records(recording: Recording, log: FiringLog, operators: Iterable[str]) -> None:
-    """Raises `ReplayError` for the first operator without firing records."""
+def require_records(recording: Recording, recorded: Collection[str], operators: Iterable[str]) -> None:
+    """Raises `ReplayError` for the first operator that is not among those that left firing records."""
     outcome = recording.metadata.get(OUTCOME, {}).get("outcome", "")
     for name in operators:
-        if log.batches(name):
+        if name in recorded:
             continue
         if recording.torn or outcome not in ("", COMPLETE):
             why = "the recording has no proper end" if recording.torn else f"its outcome: {outcome}"
@@ -90,12 +89,11 @@ def require_records(recording: Recording, log: FiringLog, operators: Iterable[st
         )
 
 
-def require_ports(recording: Recording, graph: Graph, log: FiringLog, operators: Iterable[str]) -> None:
+def require_ports(recording: Recording, graph: Graph, books: Books, operators: Iterable[str]) -> None:
     """Raises `ReplayError` for the first operator whose outputs are not those it was recorded with."""
     for name in operators:
-        node = graph.nodes[name]
-        if not same_ports(log.of(name), node.outputs):
-            recorded = next(len(r.outputs) for r in log.of(name) if r.outcome == "ok" and r.outputs)
+        node, recorded = graph.nodes[name], books.of(name).ports
+        if recorded not in (None, len(node.outputs)):
             raise ReplayError(
                 f"{recording.path}: operator {name!r} was recorded with {recorded} output ports and has "
                 f"{len(node.outputs)} now ({', '.join(node.outputs)}), so its firings cannot be compared: verify with "
@@ -103,7 +101,7 @@ def require_ports(recording: Recording, graph: Graph, log: FiringLog, operators:
             )
 
 
-def accountable(recording: Recording, graph: Graph, log: FiringLog, name: str) -> bool:
+def accountable(recording: Recording, graph: Graph, books: Books, name: str) -> bool:
     """Returns whether the records of a node can be held against its streams.
 
     Not where another operator made them (with another graph), nor where a replay did of a stream whose clock had
@@ -112,29 +110,23 @@ def accountable(recording: Recording, graph: Graph, log: FiringLog, name: str) -
     node = graph.nodes[name]
     streams = [s for s in node.outputs.values() if s in recording.streams]
     makers = {recording.streams[s].metadata.get("operator", name) for s in streams}
-    records = log.of(name)
-    replayed = bool(records) and bool(records[0].detail.get("replayed"))
+    book = books.of(name)
     jumped = any(len(recording.counts(s)) > 1 for s in streams)
-    return makers == {name} and not (replayed and jumped) and same_ports(records, node.outputs)
+    return makers == {name} and not (book.replayed and jumped) and book.ports in (None, len(node.outputs))
 
 
 def stored_checks(
-    recording: Recording, graph: Graph, log: FiringLog, nodes: Iterable[str]
+    recording: Recording, graph: Graph, books: Books, nodes: Iterable[str]
 ) -> tuple[list[str], tuple[str, ...]]:
     """The recorded streams of `nodes` that can be compared with their records, and those that cannot be read as the
     messages that they were."""
     able: list[str] = []
     unable: list[str] = []
     for name in nodes:
-        if not log.of(name):
+        if not books.of(name).records:
             continue
         for stream in graph.nodes[name].outputs.values():
             info = recording.streams.get(stream)
             if info is not None:
                 (able if info.message_type is not None and not info.declared_otherwise else unable).append(stream)
     return able, tuple(unable)
-
-
-def same_ports(records: Iterable[FiringRecord], outputs: Collection[str]) -> bool:
-    record = next((r for r in records if r.outcome == "ok" and r.outputs), None)
-    return record is None or len(record.outputs) == len(outputs)

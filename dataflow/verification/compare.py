@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -11,8 +11,7 @@ from dataflow.messages.base import Message
 from dataflow.recording import Recording
 from dataflow.recording.streams.diff import FieldDifference, differences
 from dataflow.records.comparison import Verification
-from dataflow.records.firing import FiringRecord
-from dataflow.records.reading import FiringLog, Place
+from dataflow.records.firing import Emission, FiringRecord
 from dataflow.sync import Entry
 
 NOT_STORED = "the recording does not hold this message"
@@ -97,30 +96,25 @@ class Comparer:
         self,
         recording: Recording,
         graph: Graph,
-        log: FiringLog,
         operators: Collection[str],
         tolerance: float | None,
+        repeated: Callable[[str], FiringRecord | None],
     ) -> None:
-        self._recording, self._graph, self._log, self._tolerance = recording, graph, log, tolerance
+        """`repeated` returns the record by which an operator is being repeated now."""
+        self._recording, self._graph, self._tolerance, self._repeated = recording, graph, tolerance, repeated
         self.found = {name: OutputComparison(name) for name in operators}
-        makers = [graph.nodes[name] for name in operators]
-        self._digests = log.digests(makers, {stream for maker in makers for stream in maker.outputs.values()})
-        self._records: dict[str, Mapping[Place, FiringRecord]] = {}
 
     def made(self, stream: str, entry: Entry) -> None:
         """Takes a message that an operator has made under the number of a recorded one."""
         comparison = self.found[self._graph.streams[stream].node]
-        place = (entry.incarnation, entry.seq)
-        expected = self._digests[stream].get(place)
-        if expected is None:
-            return
-        if expected == entry.digest:
+        record, expected = self._expected(comparison.operator, stream)
+        if expected.digest == entry.digest:
             comparison.equal += 1
             return
-        if self._tolerance is None and comparison.first and not self._is_of_the_first(comparison, stream, place):
+        if self._tolerance is None and comparison.first and not _is_of_the_first(comparison, record):
             comparison.beyond += 1
             return
-        recorded = self._recorded(stream, entry)
+        recorded = self._recorded(stream, entry, expected)
         fields: Sequence[FieldDifference] = ()
         if recorded is not None:
             fields, largest = differences(recorded, entry.value, self._tolerance)
@@ -129,9 +123,8 @@ class Comparer:
                 comparison.within += 1
                 return
         comparison.beyond += 1
-        if comparison.first and not self._is_of_the_first(comparison, stream, place):
+        if comparison.first and not _is_of_the_first(comparison, record):
             return
-        record = self._record(stream, place)
         ports = self._graph.nodes[comparison.operator].outputs
         comparison.first.append(
             OutputDifference(
@@ -142,7 +135,7 @@ class Comparer:
                 firing=record.stamp,
                 seq=entry.seq,
                 incarnation=entry.incarnation,
-                recorded=expected.hex(),
+                recorded=expected.digest.hex(),
                 here=entry.digest.hex(),
                 fields=tuple(fields),
                 note="" if recorded is not None else NOT_STORED,
@@ -158,32 +151,27 @@ class Comparer:
             comparison.own = result.first is None or result.own_fault
         return {name: found for name, found in self.found.items() if results[name].first is not None}
 
-    def _is_of_the_first(self, comparison: OutputComparison, stream: str, place: Place) -> bool:
-        first, record = comparison.first[0], self._record(stream, place)
-        return (first.incarnation, first.index) == (record.incarnation, record.index)
+    def _expected(self, operator: str, stream: str) -> tuple[FiringRecord, Emission]:
+        """The record that is being repeated, and what it tells of a stream."""
+        record = self._repeated(operator)
+        port = list(self._graph.nodes[operator].outputs.values()).index(stream)
+        emission = None if record is None else record.outputs[port]
+        assert record is not None
+        assert emission is not None
+        return record, emission
 
-    def _record(self, stream: str, place: Place) -> FiringRecord:
-        """The record of the call that emitted a message."""
-        if stream not in self._records:
-            node = self._graph.nodes[self._graph.streams[stream].node]
-            port = list(node.outputs.values()).index(stream)
-            self._records[stream] = {
-                (record.incarnation, emission.seq): record
-                for record in self._log.of(node.name)
-                if record.outputs and (emission := record.outputs[port]) is not None
-            }
-        return self._records[stream][place]
-
-    def _recorded(self, stream: str, entry: Entry) -> Message | None:
+    def _recorded(self, stream: str, entry: Entry, emission: Emission) -> Message | None:
         """The recorded message in whose place `entry` was made; it may have another stamp."""
         info = self._recording.streams.get(stream)
         if info is None or info.message_type is None:
             return None
         place = (entry.incarnation, entry.seq)
-        outputs = list(self._graph.nodes[self._graph.streams[stream].node].outputs.values())
-        emission = self._record(stream, place).outputs[outputs.index(stream)]
-        assert emission is not None
         for found in self._recording.messages([stream], start=emission.stamp, end=emission.stamp):
             if (found.incarnation, found.seq) == place:
                 return found.message
         return None
+
+
+def _is_of_the_first(comparison: OutputComparison, record: FiringRecord) -> bool:
+    first = comparison.first[0]
+    return (first.incarnation, first.index) == (record.incarnation, record.index)

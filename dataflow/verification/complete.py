@@ -28,6 +28,7 @@ from dataflow.sinks.recorder import RecorderSink
 from dataflow.supervision.core.report import Watch
 from dataflow.supervision.replay import plan_replay
 from dataflow.sync import Entry
+from dataflow.verification.books import Books
 from dataflow.verification.choice import require_records
 from dataflow.verification.ledger import read_ledger
 from dataflow.verification.workers.board import Board
@@ -87,7 +88,7 @@ def complete(
     """
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
-        feeding = _plan(recording, played, FiringLog.read(recording))  # refuses here what would fail there
+        feeding = _plan(recording, played)  # refuses here what would fail there
     part = out.with_name(f"{out.name}.part")
     request = {"path": str(path), "part": str(part), "graph": played.to_json()}
     call = Call(f"{__name__}:{complete_part.__name__}", request, feeding.operators)
@@ -111,9 +112,9 @@ def complete(
         part.unlink(missing_ok=True)
 
 
-def _plan(recording: Recording, graph: Graph, log: FiringLog) -> Feeding:
+def _plan(recording: Recording, graph: Graph) -> Feeding:
     again = [name for name, node in graph.nodes.items() if not node.source and not node.external]
-    require_records(recording, log, again)
+    require_records(recording, FiringLog.read(recording).operators, again)
     replaced = set(graph.nodes) - set(again)
     return Feeding(tuple(again), plan_replay(recording, graph, replaced=replaced).streams)
 
@@ -123,9 +124,9 @@ def complete_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     graph = Graph.from_json(request["graph"])
     part = Path(request["part"])
     started = time.monotonic()
-    with Recording(request["path"]) as recording:
+    with Recording(request["path"], watch=board.goes_on) as recording:
         log = FiringLog.read(recording)
-        feeding = _plan(recording, graph, log)
+        feeding = _plan(recording, graph)
         store = _Store(recording, graph, feeding, part)
         work = Recomputation(
             recording,
@@ -138,7 +139,7 @@ def complete_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             watcher=board,
         )
         results = work.run(until=lambda: any(runner.result.first for runner in work.runners.values()))
-        ledger = read_ledger(recording, graph, log, feeding.operators)
+        ledger = read_ledger(recording, graph, Books(log, graph), feeding.operators)
         for result in results.values():
             ledger.enter(result)
         kept = store.keep(recording)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from itertools import chain
 from typing import Any
 
 from dataflow.records.reading import Place
@@ -42,14 +43,20 @@ class StoredStream:
 
 
 class StoredCheck:
-    """Checks one stream, message by message in any order. `digests`: what the records say was emitted, by place.
+    """Checks one stream, message by message: quickest in the order of its messages, but they may come in any.
 
-    `whole`: the stream is read from its beginning; else what is missing counts from the first message on.
+    `recorded`: (place, digest) of what the records say was sent, in the order of the places. Of it there is in memory
+    what was passed over. `whole`: the stream is read from its beginning; else what is missing counts from the first
+    message on.
     """
 
-    def __init__(self, stream: str, maker: str, digests: Mapping[Place, bytes], *, static: bool, whole: bool) -> None:
+    def __init__(
+        self, stream: str, maker: str, recorded: Iterable[tuple[Place, bytes]], *, static: bool, whole: bool
+    ) -> None:
         self._result = StoredStream(stream, maker)
-        self._left = {place: digest for place, digest in digests.items() if place[1] >= 0}
+        self._ahead = iter(recorded)
+        self._next = next(self._ahead, None)
+        self._passed: dict[Place, bytes] = {}
         self._static, self._whole = static, whole
         self._first: Place | None = None
 
@@ -58,7 +65,7 @@ class StoredCheck:
         result = self._result
         if self._first is None or place < self._first:
             self._first = place
-        expected = self._left.pop(place, None)
+        expected = self._expected(place)
         if expected is None:
             result.uncalled += 1
             if result.first_uncalled is None or place < result.first_uncalled:
@@ -68,13 +75,22 @@ class StoredCheck:
             if result.first_changed is None or place < result.first_changed:
                 result.first_changed = place
 
+    def _expected(self, place: Place) -> bytes | None:
+        """The recorded digest of a message that was not taken before."""
+        while self._next is not None and self._next[0] < place:
+            self._passed[self._next[0]] = self._next[1]
+            self._next = next(self._ahead, None)
+        if self._next is None or self._next[0] != place:
+            return self._passed.pop(place, None)
+        digest, self._next = self._next[1], next(self._ahead, None)
+        return digest
+
     def result(self) -> StoredStream:
         """The outcome, once every message was taken. A static stream is recorded once, however often it was made."""
-        left = set(self._left)
-        if self._static and self._first is not None:
-            left = set()
-        elif not self._whole:
-            left = {place for place in left if self._first is not None and place > self._first}
-        self._result.missing = len(left)
-        self._result.first_missing = min(left, default=None)
+        if not (self._static and self._first is not None):
+            ahead = () if self._next is None else (self._next,)
+            for place in chain(sorted(self._passed), (p for p, _ in chain(ahead, self._ahead))):
+                if self._whole or (self._first is not None and place > self._first):
+                    self._result.missing += 1
+                    self._result.first_missing = self._result.first_missing or place
         return self._result

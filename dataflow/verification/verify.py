@@ -7,6 +7,8 @@ import os
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,13 @@ from dataflow.recording.layout import RECOVERED
 from dataflow.recording.streams.cutting import cut_of
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
-from dataflow.records.reading import FiringLog, beginning, whole
+from dataflow.records.reading import FiringLog
+from dataflow.records.repetition import Repetition
 from dataflow.records.window import records_from
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, processes_of
 from dataflow.supervision.core.report import OperatorCounts, Watch
+from dataflow.verification.books import Books
 from dataflow.verification.choice import (
     accountable,
     chosen_operators,
@@ -38,7 +42,6 @@ from dataflow.verification.retrial import Retrial, Trial, mates_of, retry
 from dataflow.verification.stored import StoredStream
 from dataflow.verification.workers import job as part
 from dataflow.verification.workers import partition, slices
-from dataflow.verification.workers.mail import shared_records
 from dataflow.verification.workers.prestart import EarlyWorkers
 from dataflow.verification.workers.processes import Call, Locate, Workers, call_workers
 
@@ -50,13 +53,14 @@ Attempt = Callable[[Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]], list[A
 class _Task:
     """Holds what is to be verified, with its data from the recording: all that was read before any worker starts.
 
-    `unfed`: operators that cannot be repeated, by the stream that they need and the recording does not hold;
-    `placed`: the process in which each ran.
+    `records`: see `FiringLog.to_wire`; `unfed`: operators that cannot be repeated, by the stream that they need and the
+    recording does not hold; `placed`: the process in which each ran.
     """
 
     path: Path
     graph: Graph
-    log: FiringLog
+    records: Mapping[str, Any]
+    books: Books
     ledger: Ledger
     operators: tuple[str, ...]
     stood_in: tuple[str, ...]
@@ -112,47 +116,45 @@ def verify(
     workers = workers or call_workers
     task = _prepare(path, graph, first, only, start, jobs, early)
     options: dict[str, Any] = {"threads": task.graph.threads, "stall_timeout": stall_timeout, "watch": watch}
-    with shared_records(task.log) as (records, batches):
-        options |= {"early": early, "locate": _locate(task)}
-        request = {
-            "path": str(path),
-            "graph": task.graph.to_json(),
-            "records": records,
-            "batches": batches,
-            "begin": task.begin,
-            "incomplete": sorted(task.incomplete),
-            "tolerance": tolerance,
-            "checks": [],
-            "slices": {},
-            "until": [],
-            "guard": paranoid,
-        }
+    options |= {"early": early, "locate": _locate(task)}
+    request = {
+        "path": str(path),
+        "graph": task.graph.to_json(),
+        "records": task.records,
+        "begin": task.begin,
+        "incomplete": sorted(task.incomplete),
+        "tolerance": tolerance,
+        "checks": [],
+        "slices": {},
+        "until": [],
+        "guard": paranoid,
+    }
 
-        def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
-            function = f"{part.__name__}:{part.verify_part.__name__}"
-            made = [Call(function, {**request, **more, "operators": list(names)}, names) for more, names in calls]
-            return workers(made, **options)
+    def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
+        function = f"{part.__name__}:{part.verify_part.__name__}"
+        made = [Call(function, {**request, **more, "operators": list(names)}, names) for more, names in calls]
+        return workers(made, **options)
 
-        answers = attempt(
-            (
-                {
-                    "checks": list(one.checks),
-                    "slices": {name: (cut.begin, cut.end) for name, cut in one.slices.items()},
-                },
-                one.operators,
-            )
-            for one in task.parts
+    answers = attempt(
+        (
+            {
+                "checks": list(one.checks),
+                "slices": {name: (cut.begin, cut.end) for name, cut in one.slices.items()},
+            },
+            one.operators,
         )
-        divided, left = slices.answer(task.graph, task.log, answers)
-        if left:
-            needed = tuple(n for n in task.operators if n in with_makers(task.held, task.graph, left))
-            answers += attempt([({}, needed)])
-        answers.append(divided)
-        report = _report(task, answers, tolerance, start)
-        if report.culprits:
-            differing = [v.operator for v in report.operators if v.operator in report.culprits and v.first is not None]
-            retrial = _retry(task, differing, answers, attempt)
-            report = _report(task, answers, tolerance, start, retrial)
+        for one in task.parts
+    )
+    divided, left = slices.answer(task.books, answers)
+    if left:
+        needed = tuple(n for n in task.operators if n in with_makers(task.held, task.graph, left))
+        answers += attempt([({}, needed)])
+    answers.append(divided)
+    report = _report(task, answers, tolerance, start)
+    if report.culprits:
+        differing = [v.operator for v in report.operators if v.operator in report.culprits and v.first is not None]
+        retrial = _retry(task, differing, answers, attempt)
+        report = _report(task, answers, tolerance, start, retrial)
     return replace(report, total=time.monotonic() - began)
 
 
@@ -173,8 +175,9 @@ def _prepare(
             wanted = with_makers(recording.streams.keys(), played, chosen_operators(played, first, only))
             early.foresee({played.nodes[name].use.partition(":")[0] for name in wanted})
         log = _read_records(recording, played, start)
-        told = [n for n in played.nodes if accountable(recording, played, log, n)]
-        incomplete = incomplete_streams(recording, played, log, told)
+        books = Books(log, played)
+        told = [n for n in played.nodes if accountable(recording, played, books, n)]
+        incomplete = incomplete_streams(recording, played, books, told)
         held = recording.streams.keys() - incomplete
         chosen = with_makers(held, played, chosen_operators(played, first, only))
         unfed = {} if first or only else unfed_operators(recording, played, chosen, incomplete)
@@ -182,23 +185,26 @@ def _prepare(
             plan_feeding(recording, played, sorted(chosen), incomplete=incomplete)  # raises, and names what is missing
         chosen -= unfed.keys()
         operators = tuple(name for name in played.nodes if name in chosen)
-        require_records(recording, log, operators)
-        require_ports(recording, played, log, operators)
+        require_records(recording, books.operators, operators)
+        require_ports(recording, played, books, operators)
         plan_feeding(recording, played, operators, incomplete=incomplete)
         feeding = {
             played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
         } - chosen
         sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
-        stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, log, n)]
-        checks, unchecked = stored_checks(recording, played, log, [*operators, *stand_ins])
+        stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, books, n)]
+        checks, unchecked = stored_checks(recording, played, books, [*operators, *stand_ins])
         cores = len(os.sched_getaffinity(0))
-        parts = partition.planned(played, log, operators, held=held, jobs=jobs, cores=cores, divide=start is None)
+        parts = partition.planned(
+            played, log, books, operators, held=held, jobs=jobs, cores=cores, divide=start is None
+        )
         begin, last = _span(recording, start)
         return _Task(
             path=path,
             graph=played,
-            log=log,
-            ledger=read_ledger(recording, played, log, [*operators, *stand_ins]),
+            records=log.to_wire(),
+            books=books,
+            ledger=read_ledger(recording, played, books, [*operators, *stand_ins]),
             operators=operators,
             stood_in=tuple(name for name in played.nodes if name in feeding),
             stand_ins=tuple(stand_ins),
@@ -234,14 +240,12 @@ def _locate(task: _Task) -> Locate:
 
     def located(call: Call, operator: str, repeated: int) -> str:
         node = task.graph.nodes[operator]
-        kept, _ = whole(task.log.of(operator))
         begin, _ = call.request["slices"].get(operator, (task.begin, None))
-        _, ahead, _ = beginning(kept, begin, stateless=node.operator.stateless)
-        calls = [record for record in ahead if record.kind in CALLS]
-        if repeated >= len(calls):
-            return "its end"
-        record = calls[repeated]
-        return f"firing {record.index} ({record.kind}) at stamp {record.stamp}"
+        with Recording(task.path) as recording:
+            log = FiringLog.from_wire(task.records, recording)
+            ahead = Repetition(partial(log.ordered, node), begin=begin, stateless=node.operator.stateless)
+            record = next(islice((r for r in ahead if r.kind in CALLS), repeated, None), None)
+        return "its end" if record is None else f"firing {record.index} ({record.kind}) at stamp {record.stamp}"
 
     return located
 
@@ -261,7 +265,7 @@ def _report(
         task.ledger.enter(found[name])
         found[name].wrote = found[name].wrote or retrial.wrote.get(name, "")
     for name, stream in task.unfed.items():
-        calls = sum(record.kind in CALLS for record in task.log.of(name))
+        calls = task.books.of(name).calls
         found[name] = Verification(name, firings=calls, unverifiable=max(calls, 1), missing=stream)
     operators = tuple(found[name] for name in task.graph.nodes if name in found)
     nodes = task.graph.nodes

@@ -14,6 +14,7 @@ from dataflow.messages import (
     CameraInfo,
     CompressedDepth,
     CompressedImage,
+    CompressedVideo,
     DepthImage,
     Detections2D,
     Image,
@@ -29,7 +30,7 @@ from dataflow.messages import (
 )
 from dataflow.view.pacing import Pace
 
-COLOR: tuple[type[Message], ...] = (Image, CompressedImage, Image16)
+COLOR: tuple[type[Message], ...] = (Image, CompressedImage, CompressedVideo, Image16)
 DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth, RelativeDepth)
 OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
 
@@ -82,8 +83,12 @@ class Layout:
         return tuple(name for name, type_ in self.streams.items() if issubclass(type_, types))
 
     def pace(self, step: int) -> Pace:
-        """The choice of what is drawn in a step of event time (ns). Kept and static streams are drawn whole."""
-        return Pace(step, frozenset(self.of_type(*HEAVY)) - self.static - self.kept)
+        """The choice of what is drawn in a step of event time (ns). Kept and static streams are drawn whole.
+
+        Video is decoded whole, and its visualiser chooses by the same steps.
+        """
+        chosen = frozenset(self.of_type(*HEAVY)) - frozenset(self.of_type(CompressedVideo))
+        return Pace(step, chosen - self.static - self.kept)
 
 
 def layout(

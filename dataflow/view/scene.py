@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 
 from dataflow.messages.geometry import split_matrix
+from dataflow.video.decoder import PacketDecoder
 from dataflow.view import colors
 from dataflow.view.frames import Attach, Change, Detach, FrameTree, NewRoot, Rank
 from dataflow.view.layout import Layout, is_truth
@@ -102,6 +103,8 @@ class SceneState:
     trails: dict[str, Trail] = field(default_factory=dict)
     track_paths: dict[str, dict[int, deque[tuple[int, Vector]]]] = field(default_factory=dict)
     remembered: dict[tuple[str, str], Any] = field(default_factory=dict)
+    videos: dict[str, PacketDecoder] = field(default_factory=dict)
+    """By stream, the decoder of its packets."""
     unshown: Unshown = field(default_factory=Unshown)
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     begin: int | None = None

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
+    from operators.cloud.camera_mount import CameraMount
     from operators.cloud.cloud_builder import CloudBuilder
     from operators.cloud.cloud_colorizer import CloudColorizer
     from operators.cloud.cloud_filter import CloudFilter
@@ -15,6 +16,7 @@ else:  # most need scipy, which a graph without them need not load
     __getattr__, __dir__ = lazily(
         __name__,
         {
+            "camera_mount": ("CameraMount",),
             "cloud_builder": ("CloudBuilder",),
             "cloud_colorizer": ("CloudColorizer",),
             "cloud_filter": ("CloudFilter",),
@@ -25,6 +27,7 @@ else:  # most need scipy, which a graph without them need not load
     )
 
 __all__ = [
+    "CameraMount",
     "CloudBuilder",
     "CloudColorizer",
     "CloudFilter",

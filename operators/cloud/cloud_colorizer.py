@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, Clusters, Diagnostics, Image, Message, PointCloud, SegmentationMap, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.colorizing import Sight, sight
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
@@ -43,9 +42,7 @@ class CloudColorizer(Operator):
     slack: float = Param(
         0.1, ge=0, live=True, doc="share of depth behind the nearest that still counts as seen; 0: all"
     )
-
-    def setup(self) -> None:
-        self._counts: Counter[str] = Counter()
+    state: Counts
 
     def process(
         self,
@@ -74,20 +71,11 @@ class CloudColorizer(Operator):
             )
         counts = {"points": cloud.count, "seen": int(seen.seen.sum()), "hidden": seen.hidden,
                   "outside the image": seen.outside, "behind or not finite": seen.behind}  # fmt: skip
-        self._counts.update(counts | {"clouds": 1, "clouds of which nothing is seen": not counts["seen"]})
+        self.state.counts.update(counts | {"clouds": 1, "clouds of which nothing is seen": not counts["seen"]})
         messages: dict[str, Message] = {"colored": colored, "status": _status(cloud.stamp, counts)}
         if classes is not None:
             messages["labels"] = _labels(colored, classes, seen, kept)
         return messages
-
-    def snapshot(self) -> Mapping[str, int]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, int]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, int]:
-        return dict(self._counts)
 
 
 def _labels(colored: PointCloud, classes: SegmentationMap, seen: Sight, kept: NDArray[np.bool_]) -> Clusters:

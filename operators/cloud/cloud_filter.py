@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, PointCloud
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param
+from dataflow.operator import Counts, In, Operator, Out, Param
 from operators.cloud.filtering import Voxels, finite, in_box, in_range, radius_inliers, statistical_inliers
 from operators.cloud.normals import FEWEST, estimate_normals
 from operators.status import counted_status
@@ -49,6 +48,7 @@ class CloudFilter(Operator):
     radius_neighbours: int = Param(3, ge=1, live=True, doc="how many others it needs there")
     normal_neighbours: int = Param(0, ge=0, le=200, doc="points that a normal is estimated from; 0 for none")
     normal_radius: float = Param(0.3, gt=0, live=True, doc="they lie within this radius", unit="m")
+    state: Counts
 
     def setup(self) -> None:
         """Raises ValueError for a range or box that can hold no point, and for too few neighbours of a normal."""
@@ -62,8 +62,6 @@ class CloudFilter(Operator):
             raise ValueError(
                 f"normal_neighbours is {self.normal_neighbours}: a normal needs {FEWEST} points, 0 is none"
             )
-        self._dropped: Counter[str] = Counter()
-        self._given = self._kept = self._clouds = self._empty = 0
 
     def process(self, cloud: PointCloud) -> dict[str, Any]:
         dropped: dict[str, int] = {}
@@ -91,27 +89,10 @@ class CloudFilter(Operator):
                 viewpoint=np.zeros(3),
             )
             kept = kept.replace(normals=normals.astype(np.float32))
-        self._count(cloud.count, dropped, kept.count)
+        self.state.counts.update({"clouds": 1, "clouds left empty": not kept.count})
+        self.state.counts.update({"points": cloud.count, "points kept": kept.count})
+        self.state.counts.update({f"dropped, {step}": count for step, count in dropped.items()})
         return {"filtered": kept, "status": _status(cloud, dropped, kept.count)}
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "dropped": dict(self._dropped),
-            "counts": [self._given, self._kept, self._clouds, self._empty],
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._dropped = Counter(state["dropped"])
-        self._given, self._kept, self._clouds, self._empty = (int(n) for n in state["counts"])
-
-    def summary(self) -> Mapping[str, float | int]:
-        steps = {f"dropped, {step}": count for step, count in self._dropped.items()}
-        return {
-            "clouds": self._clouds,
-            "clouds left empty": self._empty,
-            "points": self._given,
-            "points kept": self._kept,
-        } | steps
 
     def _in_range(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
         return in_range(points, self.min_range, self.max_range)
@@ -130,13 +111,6 @@ class CloudFilter(Operator):
         if not self.radius:
             return np.ones(len(points), np.bool_)
         return radius_inliers(points, self.radius, self.radius_neighbours)
-
-    def _count(self, given: int, dropped: Mapping[str, int], kept: int) -> None:
-        self._dropped.update(dropped)
-        self._given += given
-        self._kept += kept
-        self._clouds += 1
-        self._empty += kept == 0
 
 
 def _select(cloud: PointCloud, chosen: NDArray[np.bool_]) -> PointCloud:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from dataflow.messages import Diagnostics, Message, PointCloud, Pose
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import transform_points
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import finite
 from operators.cloud.registration import Prepared, Registered, Settings, register
 from operators.geometry.se3 import about_fixed_axes
@@ -48,6 +46,7 @@ class CloudRegistration(Operator):
     sure_score: float = Param(
         0.6, doc="a score from which on 0.02 less of `min_fitness` and 0.01 more of `max_violation` suffice"
     )
+    state: Counts
 
     def setup(self) -> None:
         self._settings = Settings(
@@ -60,11 +59,10 @@ class CloudRegistration(Operator):
             sure_score=self.sure_score,
         )
         self._target: tuple[PointCloud, Prepared] | None = None
-        self._counts: Counter[str] = Counter()
 
     def process(self, cloud: PointCloud, target: PointCloud) -> dict[str, Message]:
         found = register(self._prepared(cloud), self._prepared_target(target), self._settings, self.rng)
-        self._counts["failed" if found.reason else "registered"] += 1
+        self.state.counts["failed" if found.reason else "registered"] += 1
         messages: dict[str, Message] = {"status": _status(cloud.stamp, found)}
         if not found.reason:
             messages["pose"] = Pose.from_matrix(
@@ -82,14 +80,8 @@ class CloudRegistration(Operator):
             messages["aligned"] = aligned
         return messages
 
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
     def summary(self) -> Mapping[str, int]:
-        return {"registered": self._counts["registered"], "failed": self._counts["failed"]}
+        return {"registered": self.state.counts["registered"], "failed": self.state.counts["failed"]}
 
     def _prepared(self, cloud: PointCloud) -> Prepared:
         return Prepared.of_cloud(cloud.points[finite(cloud.points)], self.voxel)

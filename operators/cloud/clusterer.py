@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,7 +20,7 @@ from dataflow.messages import (
 )
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.boards import Points, with_contents
 from operators.cloud.clustering import Shape, dbscan, kept, shape_of
 from operators.cloud.filtering import Voxels, finite
@@ -70,11 +69,11 @@ class Clusterer(Operator):
     board: float = Param(
         0.25, gt=0, live=True, doc="least length of a board of furniture; infinite keeps furniture whole", unit="m"
     )
+    state: Counts
 
     def setup(self) -> None:
         """Raises ValueError for an up of length 0."""
         self._up = unit(self.up)
-        self._counts: Counter[str] = Counter()
 
     def process(
         self, cloud: PointCloud, pose: Pose | Odometry | None = None, extrinsics: Transforms | None = None
@@ -96,22 +95,15 @@ class Clusterer(Operator):
             "points in none": len(usable) - int(sizes.sum()),
         }
         lost = pose is not None and not told(pose)
-        self._counts.update(counts | {"clouds": 1, "clouds without clusters": not shapes, "poses not finite": lost})
+        self.state.counts.update(
+            counts | {"clouds": 1, "clouds without clusters": not shapes, "poses not finite": lost}
+        )
         return {
             "clusters": _clusters(cloud, labels, shapes),
             "boxes": _boxes(cloud, sizes, shapes),
             "features": _features(cloud, shapes),
             "status": _status(cloud.stamp, counts, lost),
         }
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
     def _labels(self, points: NDArray[np.float32], up: NDArray[np.float64]) -> NDArray[np.int32]:
         """Returns the cluster (N,) of each point, -1 for none."""

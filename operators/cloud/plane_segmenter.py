@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Boxes3D, Diagnostics, Odometry, Planes, PointCloud, Pose, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.clustering import level_axes
 from operators.cloud.filtering import finite
 from operators.cloud.gravity import standing, told, unit
@@ -25,6 +26,15 @@ Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 _THICKNESS = 0.02  # metres, of a surface's box
+
+
+@dataclass
+class State(Counts):
+    """Holds the height of the floor, m, the stamp of the last cloud that was looked at, and the directions of walls."""
+
+    floor: float | None = None
+    looked: int | None = None
+    walls: WallDirections = field(default_factory=WallDirections)
 
 
 class PlaneSegmenter(Operator):
@@ -75,6 +85,7 @@ class PlaneSegmenter(Operator):
     wall_top: float = Param(1.2, gt=0, doc="a wall is seen up to this height above the floor at least", unit="m")
     door_side: float = Param(1.05, ge=0, doc="a plane no wider and turned against the walls is no wall", unit="m")
     floor_memory: float = Param(0.1, gt=0, doc="the floor is within this of where it was", unit="m")
+    state: State
 
     def setup(self) -> None:
         """Raises ValueError for an up of length 0 and for table heights the wrong way round."""
@@ -100,21 +111,14 @@ class PlaneSegmenter(Operator):
             floor_memory=self.floor_memory,
             door_side=self.door_side,
         )
-        self._begin()
-        self._counts: Counter[str] = Counter()
-
-    def _begin(self) -> None:
-        self._floor: float | None = None
-        self._looked: int | None = None
-        self._walls = WallDirections()
 
     def process(
         self, cloud: PointCloud, pose: Pose | Odometry | None = None, extrinsics: Transforms | None = None
     ) -> dict[str, Any]:
         """Raises ValueError where no transform relates the cloud's frame to that of the pose."""
-        if self._looked is not None and cloud.stamp - self._looked < self.period * 1e9:
+        if self.state.looked is not None and cloud.stamp - self.state.looked < self.period * 1e9:
             return {}
-        self._looked = cloud.stamp
+        self.state.looked = cloud.stamp
         T = standing(cloud, pose, extrinsics)
         up, height = (self._up, 0.0) if T is None else (T[2, :3], float(T[2, 3]))
         lost = pose is not None and not told(pose)
@@ -124,22 +128,24 @@ class PlaneSegmenter(Operator):
         labels = np.full(cloud.count, -1, np.int32)
         if len(points):
             scene = Scene.of_cloud(points, up, self._search)
-            known = None if self._floor is None else self._floor - height
+            known = None if self.state.floor is None else self.state.floor - height
             surfaces, floor = self._surfaces(scene, known, _turned(up) if T is None else T[:3, :3])
-            self._floor = None if floor is None else floor + height
+            self.state.floor = None if floor is None else floor + height
             if T is None:
-                self._walls = WallDirections()  # the sensor may have turned when the next cloud comes
+                self.state.walls = WallDirections()  # the sensor may have turned when the next cloud comes
             labels[usable] = self._labels(points, scene, [surface.plane for surface in surfaces])
         named = np.array([surface.name != "other" for surface in surfaces] + [False])
         found = Counter(surface.name for surface in surfaces)
-        self._counts.update({name: found[name] for name in SURFACES} | {"clouds": 1, "clouds without": not surfaces})
-        self._counts["poses not finite"] += lost
+        self.state.counts.update(
+            {name: found[name] for name in SURFACES} | {"clouds": 1, "clouds without": not surfaces}
+        )
+        self.state.counts["poses not finite"] += lost
         boxes = _boxes(cloud, surfaces, labels)
         return {
             "planes": _planes(cloud, surfaces, labels),
             "surfaces": boxes,
             "rest": _without(cloud, named[labels]),
-            "status": _status(cloud, found, self._floor is not None, lost),
+            "status": _status(cloud, found, self.state.floor is not None, lost),
         }
 
     def _surfaces(self, scene: Scene, floor: float | None, R: Array) -> tuple[list[Surface], float | None]:
@@ -148,38 +154,16 @@ class PlaneSegmenter(Operator):
         `R` (3, 3) turns the cloud's frame to one whose z is up, and that stays.
         """
         cell = 2 * self.voxel
-        before = self._walls.axes
+        before = self.state.walls.axes
         axes = None if before is None else before @ R
         planes = find_planes(scene, self._search, self.rng, axes)
         surfaces, found = recognised(scene, planes, self._rules, floor, cell, axes)
         walls = [s for s in surfaces if s.name == "wall" and s.seen.size[0] > self.door_side]
-        self._walls.add(_rows([R @ s.plane.normal for s in walls], 3), np.array([s.plane.area for s in walls]))
-        if before is None and (now := self._walls.axes) is not None:
+        self.state.walls.add(_rows([R @ s.plane.normal for s in walls], 3), np.array([s.plane.area for s in walls]))
+        if before is None and (now := self.state.walls.axes) is not None:
             planes = find_planes(scene, self._search, self.rng, now @ R)
             surfaces, found = recognised(scene, planes, self._rules, floor, cell, now @ R)
         return surfaces, found
-
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew: the floor and the directions of walls are looked for again."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "floor": self._floor,
-            "looked": self._looked,
-            "walls": self._walls.snapshot(),
-            "counts": dict(self._counts),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._floor = None if state["floor"] is None else float(state["floor"])
-        self._looked = state.get("looked")  # not in those of earlier versions
-        if "walls" in state:
-            self._walls.restore(state["walls"])
-        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
     def _labels(self, points: NDArray[np.float32], scene: Scene, planes: list[Plane]) -> Labels:
         """Returns the plane (N,) of every point: that of its voxel, or -1 where the point itself lies off it."""

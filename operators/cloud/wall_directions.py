@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dataflow.operator import Remembered
 
 Array = NDArray[np.float64]
 
@@ -16,12 +16,15 @@ _ENOUGH = 1.0  # m² of wall
 _AGREED = 0.9  # length of the mean of unit vectors at four times the angle: half of them within 4 degrees
 
 
-class WallDirections:
+class WallDirections(Remembered):
     """Averages the normals of walls, which turn by 90 degrees from one to the next in most buildings.
 
     Angles are those of a frame whose z is up, and that stays. Where walls do not agree, there is no common direction.
     Coughlan and Yuille, "Manhattan world", 1999.
     """
+
+    _sum: complex
+    _weight: float
 
     def __init__(self) -> None:
         self._sum, self._weight = 0j, 0.0
@@ -41,9 +44,3 @@ class WallDirections:
         angle = math.atan2(self._sum.imag, self._sum.real) / 4
         c, s = math.cos(angle), math.sin(angle)
         return np.array([[c, s, 0.0], [-s, c, 0.0]])
-
-    def snapshot(self) -> dict[str, float]:
-        return {"real": self._sum.real, "imag": self._sum.imag, "weight": self._weight}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._sum, self._weight = complex(state["real"], state["imag"]), float(state["weight"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from dataflow.messages import DepthImage, Diagnostics
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param
+from dataflow.operator import Counts, In, Operator, Out, Param
 from operators.depth.despeckling import bilateral, flying, median, outlying, replaced, valid
 from operators.status import counted_status
 
@@ -45,6 +44,7 @@ class DepthFilter(Operator):
     smoothing_sigma: float = Param(
         0.005, gt=0, live=True, doc="of the bilateral filter, in inverse depth: a few times the noise", unit="1/m"
     )
+    state: Counts
 
     def setup(self) -> None:
         """Raises ValueError for a range that holds no depth, and for a median that OpenCV does not have."""
@@ -52,7 +52,6 @@ class DepthFilter(Operator):
             raise ValueError(f"min_range {self.min_range} m must be below max_range {self.max_range} m")
         if self.smoothing == "median" and self.window > 5:
             raise ValueError(f"the median smooths in a window of 3 or 5 pixels, not {self.window}")
-        self._counts: Counter[str] = Counter()
 
     def process(self, depth: DepthImage) -> dict[str, Any]:
         given = valid(depth.data)
@@ -80,17 +79,8 @@ class DepthFilter(Operator):
         elif self.smoothing == "bilateral":
             out = bilateral(out, self.window, self.smoothing_sigma)
         blind = not out.any()
-        self._counts.update(counts | {"images": 1, "images without return": int(blind)})
+        self.state.counts.update(counts | {"images": 1, "images without return": int(blind)})
         return {"filtered": depth.replace(data=out), "status": _status(depth.stamp, counts, blind)}
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
 
 def _status(stamp: int, counts: Mapping[str, int], blind: bool) -> Diagnostics:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
 from typing import Any, Literal
 
 import cv2
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import DepthImage, Diagnostics, Image, RelativeDepth
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.depth.scaling import Scaling, fitted
 from operators.inference import ModelError, open_session
 from operators.models.use import use_model
@@ -66,6 +64,7 @@ class MonoDepth(Operator):
     least_agreeing: float = Param(0.5, gt=0, le=1, live=True, doc="nor does a smaller share of them that agree")
     most_given: int = Param(2000, ge=10, doc="of more depths, so many are drawn")
     max_range: float = Param(20.0, gt=0, live=True, doc="farther depths are no returns", unit="m")
+    state: Counts
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError where there is none, ModelError where it is of another kind."""
@@ -77,17 +76,16 @@ class MonoDepth(Operator):
         self._input = image_input(
             used.file, self._session, (free[0], free[1]), bgr=False, mean=mean, scale=scale, layouts=("nchw",)
         )
-        self._counts: Counter[str] = Counter()
 
     def process(self, image: Image, sparse: DepthImage | None = None) -> dict[str, Any]:
         """Raises ValueError where the given depths are of another view, ModelError for an output of another shape."""
         counts = {"given": 0, "agreeing": 0}
         if (flaw := _flaw(image.data)) is not None:
-            self._counts.update({"images": 1, f"images {flaw}": 1})
+            self.state.counts.update({"images": 1, f"images {flaw}": 1})
             return {"status": counted_status("mono_depth", image.stamp, f"the image is {flaw}", Level.WARN, counts)}
         nearness = self._answer(image.data)
         if self._metric:
-            self._counts.update({"images": 1, "images with a scale": 1})
+            self.state.counts.update({"images": 1, "images with a scale": 1})
             near = np.where(np.isfinite(nearness) & (nearness > 0) & (nearness <= self.max_range), nearness, 0)
             depth = DepthImage(stamp=image.stamp, frame=image.frame, data=near.astype(np.float32))
             status = counted_status("mono_depth", image.stamp, "the model gives metres", Level.OK, counts)
@@ -102,19 +100,10 @@ class MonoDepth(Operator):
                 text = f"1/depth is {scaling.scale:.3g} of nearness and {scaling.shift:+.3g} 1/m"
                 depth = scaling.depth(nearness, self.max_range)
                 messages["depth"] = DepthImage(stamp=image.stamp, frame=image.frame, data=depth)
-        self._counts.update(
+        self.state.counts.update(
             {"images": 1, "images with a scale": int(scaling is not None), "images without": int(level is Level.WARN)}
         )
         return messages | {"status": counted_status("mono_depth", image.stamp, text, level, counts)}
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
     def _answer(self, pixels: NDArray[np.uint8]) -> Nearness:
         """Returns the model's output (H, W) for pixels (H, W) or (H, W, 3), at their size."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.depth.stereo_matching import MatchingConfig, StereoMatcher
 from operators.geometry.calibration import check_calibration
 from operators.geometry.stereo import rectified_pair
@@ -57,6 +56,7 @@ class StereoDepth(Operator):
     )
 
     _calibration: tuple[CameraInfo, CameraInfo] | None = None
+    state: Counts
 
     def setup(self) -> None:
         """Raises ValueError for parameters that contradict each other."""
@@ -72,7 +72,6 @@ class StereoDepth(Operator):
                 tolerance=self.tolerance,
             )
         )
-        self._counts: Counter[str] = Counter()
 
     def on_parameter(self, name: str) -> None:
         self._check_range()
@@ -101,21 +100,12 @@ class StereoDepth(Operator):
             "out of range": int(np.isfinite(disparity).sum() - kept.sum()),
         }
         blind = counts["measured"] < self.least_share * z.size
-        self._counts.update(counts | {"pairs": 1, "blind pairs": int(blind)})
+        self.state.counts.update(counts | {"pairs": 1, "blind pairs": int(blind)})
         data = np.where(kept, z, 0).astype(np.float32)
         return {
             "depth": DepthImage(stamp=left.stamp, frame=left.frame, data=data),
             "status": _status(left, right, counts, blind),
         }
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
     def _check_range(self) -> None:
         if self.min_range >= self.max_range:

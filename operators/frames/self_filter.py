@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.frames.robot_body import RobotBody
 from operators.geometry.body import BodyPart, in_body
 from operators.geometry.calibration import check_calibration
@@ -36,31 +35,22 @@ class SelfFilter(Operator):
     body: tuple[BodyPart, ...] = Param(doc="parts of the robot")
     base_frame: str = Param("base_link", min_length=1, doc="frame of the parts that name none")
     padding: float = Param(0.03, ge=0, live=True, doc="parts are so much larger on every side", unit="m")
+    state: Counts
 
     def setup(self) -> None:
         """Raises ValueError for a body without parts."""
         self._robot = RobotBody(_parts(self.body), self.base_frame)
-        self._counts: Counter[str] = Counter()
 
     def process(self, cloud: PointCloud, transforms: Mapping[str, Transforms] | None = None) -> dict[str, Any]:
         """Raises ValueError where no transforms lead from the cloud's frame to a part's."""
         own = in_body(cloud.points, self._robot.seen_from(cloud.frame, transforms or {}), self.padding)
         counts = {"points": cloud.count, "removed": int(own.sum())}
-        self._counts.update(counts | {"clouds": 1})
+        self.state.counts.update(counts | {"clouds": 1})
         filtered = cloud
         if own.any():
             given = {name: value for name in _FIELDS if (value := getattr(cloud, name)) is not None}
             filtered = cloud.replace(**{name: value[~own] for name, value in given.items()})
         return {"filtered": filtered, "status": _status("self_filter", cloud.stamp, "points", counts)}
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
 
 class DepthSelfFilter(Operator):
@@ -81,11 +71,11 @@ class DepthSelfFilter(Operator):
     body: tuple[BodyPart, ...] = Param(doc="parts of the robot")
     base_frame: str = Param("base_link", min_length=1, doc="frame of the parts that name none")
     padding: float = Param(0.03, ge=0, live=True, doc="parts are so much larger on every side", unit="m")
+    state: Counts
 
     def setup(self) -> None:
         """Raises ValueError for a body without parts."""
         self._robot = RobotBody(_parts(self.body), self.base_frame)
-        self._counts: Counter[str] = Counter()
 
     def process(
         self, depth: DepthImage, depth_info: CameraInfo, transforms: Mapping[str, Transforms] | None = None
@@ -103,20 +93,11 @@ class DepthSelfFilter(Operator):
         data = np.where(given, depth.data, 0).astype(np.float32)
         data[rows[own], columns[own]] = 0
         counts = {"returns": int(given.sum()), "removed": int(own.sum())}
-        self._counts.update(counts | {"images": 1})
+        self.state.counts.update(counts | {"images": 1})
         return {
             "filtered": depth.replace(data=data),
             "status": _status("depth_self_filter", depth.stamp, "returns", counts),
         }
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
 
 def _parts(body: tuple[BodyPart, ...]) -> tuple[BodyPart, ...]:

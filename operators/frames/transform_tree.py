@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from dataflow.messages import Diagnostics, Message, Odometry, Pose, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import Context, Duration, In, Operator, Out, Param, Sampled
+from dataflow.operator import Context, Counts, Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.frame_tree import FrameTree, TransformError, told_by
 from operators.status import counted_status
 
 LAG = "1s"
 _MAY_STILL_COME = ("unknown frame", "not connected", "too late")
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the transforms, the stamps still asked for, and the present, ns."""
+
+    tree: FrameTree
+    asked: deque[int] = field(default_factory=deque)
+    now: int = 0
 
 
 class TransformTree(Operator, merge=True):
@@ -39,10 +49,18 @@ class TransformTree(Operator, merge=True):
     patience: Duration = Param("500ms", ge=0, le=1_000_000_000, doc="how long a question waits for transforms to come")
     gap: Duration = Param("1s", gt=0, doc="transforms farther apart in time are not interpolated between")
     extrapolation: Duration = Param("0s", ge=0, doc="how far beyond its newest stamp a transform goes on as it moved")
+    state: State
+
+    def initial_state(self) -> State:
+        return State(tree=FrameTree(gap=self.gap, reach=self.extrapolation))
 
     def setup(self) -> None:
-        self._counts: Counter[str] = Counter()
-        self._begin()
+        self._fixed: dict[str, Transforms] = {}
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew: nothing before it can be interpolated with."""
+        super().on_reset(input)
+        self._fixed = {}
 
     def process(
         self,
@@ -52,54 +70,26 @@ class TransformTree(Operator, merge=True):
         fixed: Mapping[str, Transforms] | None = None,
     ) -> dict[str, Any]:
         """Raises TransformError where fixed transforms contradict each other or the tree."""
-        self._now = context.stamp
+        self.state.now = context.stamp
         self._take_fixed(fixed or {})
         notes = self._take_moving(moving or {})
         if at is not None:
-            self._asked.append(at.stamp)
-            self._counts["asked"] += 1
+            self.state.asked.append(at.stamp)
+            self.state.counts["asked"] += 1
         return self._settle(notes)
 
     def finish(self) -> dict[str, Any]:
         """Answers one question more where it can; what remains is counted."""
         messages = self._settle([])
-        self._counts["unanswered at the end"] += len(self._asked)
-        self._asked.clear()
+        self.state.counts["unanswered at the end"] += len(self.state.asked)
+        self.state.asked.clear()
         return messages
-
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew: nothing before it can be interpolated with."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "tree": self._tree.snapshot(),
-            "asked": list(self._asked),
-            "now": self._now,
-            "counts": dict(self._counts),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._tree.restore(state["tree"])
-        self._now = int(state["now"])
-        self._asked.extend(int(stamp) for stamp in state["asked"])
-        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return {name: count for name, count in self._counts.items() if count}
-
-    def _begin(self) -> None:
-        self._now = 0
-        self._tree = FrameTree(gap=self.gap, reach=self.extrapolation)
-        self._fixed: dict[str, Transforms] = {}
-        self._asked: deque[int] = deque()
 
     def _take_fixed(self, fixed: Mapping[str, Transforms]) -> None:
         for stream, transforms in fixed.items():
             if self._fixed.get(stream) is not transforms:
                 for told in told_by(transforms):
-                    self._tree.fix(*told)
+                    self.state.tree.fix(*told)
                 self._fixed[stream] = transforms
 
     def _take_moving(self, moving: Mapping[str, Message]) -> list[str]:
@@ -108,7 +98,7 @@ class TransformTree(Operator, merge=True):
             assert isinstance(message, Transforms | Pose | Odometry)
             for told in told_by(message):
                 try:
-                    self._tree.add(message.stamp, *told)
+                    self.state.tree.add(message.stamp, *told)
                 except TransformError as error:
                     self._drop(f"left out: {error.reason}", str(error), notes)
         return notes
@@ -116,21 +106,21 @@ class TransformTree(Operator, merge=True):
     def _settle(self, notes: list[str]) -> dict[str, Any]:
         """Answers the oldest question that can be answered, and drops those that cannot or have waited too long."""
         messages: dict[str, Any] = {}
-        while self._asked:
-            stamp = self._asked[0]
+        while self.state.asked:
+            stamp = self.state.asked[0]
             try:
-                T = self._tree.lookup(self.frame, self.child, stamp)
+                T = self.state.tree.lookup(self.frame, self.child, stamp)
             except TransformError as error:
-                if error.reason in _MAY_STILL_COME and self._now - stamp < self.patience:
+                if error.reason in _MAY_STILL_COME and self.state.now - stamp < self.patience:
                     break
                 self._drop(f"dropped: {error.reason}", str(error), notes)
-                self._asked.popleft()
+                self.state.asked.popleft()
                 continue
-            self._asked.popleft()
-            if self._now - stamp > self.spec.outputs["pose"].lag:
+            self.state.asked.popleft()
+            if self.state.now - stamp > self.spec.outputs["pose"].lag:
                 self._drop("dropped: answered too late", f"the answer for {stamp} came more than {LAG} later", notes)
                 continue
-            self._counts["answered"] += 1
+            self.state.counts["answered"] += 1
             messages["pose"] = Pose.from_matrix(T, stamp=stamp, frame=self.frame, child_frame=self.child)
             break
         if notes:
@@ -138,9 +128,9 @@ class TransformTree(Operator, merge=True):
         return messages
 
     def _drop(self, count: str, text: str, notes: list[str]) -> None:
-        self._counts[count] += 1
+        self.state.counts[count] += 1
         notes.append(text)
 
     def _status(self, notes: list[str]) -> Diagnostics:
         more = f" (and {len(notes) - 1} more)" if len(notes) > 1 else ""
-        return counted_status("transform_tree", self._now, notes[0] + more, Level.WARN, self._counts)
+        return counted_status("transform_tree", self.state.now, notes[0] + more, Level.WARN, self.state.counts)

@@ -7,14 +7,15 @@ the constant twist that leads from one to the other. Foote, "tf: the transform l
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from dataflow.messages import Odometry, Pose, Transforms
 from dataflow.messages.geometry import invert
+from dataflow.operator import Remembered
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 
@@ -41,16 +42,18 @@ class _Edge:
     matrices: list[Matrix] = field(default_factory=list)
 
 
-class FrameTree:
+class FrameTree(Remembered):
     """Transforms between named frames, of the last `horizon` nanoseconds.
 
     Two stamps farther apart than `gap` are not interpolated between; up to `reach` beyond the newest stamp a transform
     goes on with its last twist.
     """
 
+    _edges: dict[str, _Edge]
+
     def __init__(self, *, horizon: int = 10_000_000_000, gap: int = 1_000_000_000, reach: int = 0) -> None:
         self._horizon, self._gap, self._reach = horizon, gap, reach
-        self._edges: dict[str, _Edge] = {}
+        self._edges = {}
 
     def fix(self, frame: str, child: str, T_frame_child: Matrix) -> None:
         """Takes in a transform that never changes.
@@ -90,25 +93,6 @@ class FrameTree:
             self._down(way[: way.index(shared)], stamp) for way in (ups, downs)
         )  # fmt: skip
         return np.asarray(invert(T_shared_frame) @ T_shared_child)
-
-    def snapshot(self) -> dict[str, Any]:
-        """Returns the moving transforms as plain values."""
-        return {
-            child: {
-                "parent": edge.parent,
-                "stamps": np.array(edge.stamps, np.int64),
-                "matrices": np.array(edge.matrices).reshape(-1, 4, 4),
-            }
-            for child, edge in self._edges.items()
-            if edge.fixed is None
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up moving transforms; fixed ones must be told again."""
-        self._edges = {
-            child: _Edge(values["parent"], None, values["stamps"].tolist(), list(values["matrices"]))
-            for child, values in state.items()
-        }
 
     def _edge(self, frame: str, child: str) -> _Edge:
         if child in self._up(frame):

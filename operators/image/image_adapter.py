@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 from dataflow.messages import Diagnostics, Image
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param
+from dataflow.operator import Counts, In, Operator, Out, Param
 from operators.image.adaptation import Adaptation, measure
 from operators.status import counted_status
 
@@ -33,33 +32,25 @@ class ImageAdapter(Operator):
     brightness: float = Param(80.0, ge=1, le=200, live=True, doc="mean grey level to which darker images are raised")
     most_gain: float = Param(5.0, ge=1, le=20, live=True, doc="the exposure is lengthened so many times at most")
     most_noise: float = Param(8.0, gt=0, le=50, live=True, doc="nor so far that noise exceeds so many grey levels")
-
-    def setup(self) -> None:
-        self._counts: Counter[str] = Counter()
+    state: Counts
 
     def process(self, image: Image) -> Mapping[str, Any]:
-        self._counts["images"] += 1
+        self.state.counts["images"] += 1
         if not self.adapt or min(image.width, image.height) < 3:
             return {"adapted": image, "status": self._status(image.stamp, "passed as it is")}
         adaptation = Adaptation(self.usual_noise, self.brightness, self.most_gain, self.most_noise)
         measured = measure(image.data)
         gain, excess = adaptation.gain(measured), adaptation.excess(measured)
-        self._counts.update({"made brighter": int(gain > 1), "noise removed": int(excess > 0)})
+        self.state.counts.update({"made brighter": int(gain > 1), "noise removed": int(excess > 0)})
         text = f"noise {measured.noise:.1f}, of which {excess:.1f} removed; brightness {measured.brightness:.0f}"
         text += f", exposed {gain:.1f} times as long" if gain > 1 else ""
         pixels = adaptation.apply(image.data, measured)
         adapted = image if pixels is image.data else image.replace(data=pixels)
         return {"adapted": adapted, "status": self._status(image.stamp, text)}
 
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
     def summary(self) -> Mapping[str, int]:
         """Counts images, those made brighter, and those of which noise was removed."""
-        return dict(self._counts)
+        return dict(self.state.counts)
 
     def _status(self, stamp: int, text: str) -> Diagnostics:
-        return counted_status("image_adapter", stamp, text, Level.OK, self._counts)
+        return counted_status("image_adapter", stamp, text, Level.OK, self.state.counts)

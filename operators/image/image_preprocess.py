@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from dataflow.messages import CameraInfo, Diagnostics, Image
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_fit, told_again
 from operators.geometry.lens import check_model, check_projection, is_distorted
 from operators.image.preparation import Preparation, Tone, grey_of
@@ -49,9 +48,7 @@ class ImagePreprocess(Operator):
     rectified_suffix: str = Param("_rectified", doc="added to the frame's name where `rectify` turns it")
 
     _made: tuple[CameraInfo, Preparation] | None = None
-
-    def setup(self) -> None:
-        self._counts: Counter[str] = Counter()
+    state: Counts
 
     def process(self, image: Image, image_info: CameraInfo) -> dict[str, Any]:
         """Raises ValueError where image and calibration do not fit, or that does not do for what is asked for."""
@@ -62,21 +59,12 @@ class ImagePreprocess(Operator):
         pixels = preparation.apply(grey_of(image.data) if self.grey else image.data)
         info = preparation.info.replace(stamp=image.stamp)
         counts = {"pixels": info.width * info.height, "without image": preparation.empty}
-        self._counts.update({"images": 1, "pixels without image": preparation.empty})
+        self.state.counts.update({"images": 1, "pixels without image": preparation.empty})
         return {
             "prepared": Image(stamp=image.stamp, frame=info.frame, data=pixels),
             "prepared_info": info,
             "status": _status(image, info, self.lens, counts),
         }
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
     def _preparation(self, info: CameraInfo) -> Preparation:
         window = Window.of((info.width, info.height), self.crop, self.width, self.height)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from dataflow.messages import CameraInfo, Diagnostics, Image, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_fit, told_again
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.lens import check_model, check_projection
@@ -75,9 +74,7 @@ class StereoPreprocess(Operator):
     suffix: str = Param("_rectified", min_length=1, doc="added to the frames' names")
 
     _pair: _Pair | None = None
-
-    def setup(self) -> None:
-        self._counts: Counter[str] = Counter()
+    state: Counts
 
     def process(
         self, left: Image, right: Image, left_info: CameraInfo, right_info: CameraInfo,
@@ -98,17 +95,8 @@ class StereoPreprocess(Operator):
             "left without image": pair.left.empty,
             "right without image": pair.right.empty,
         }
-        self._counts.update({"pairs": 1, "pixels without image": pair.left.empty + pair.right.empty})
+        self.state.counts.update({"pairs": 1, "pixels without image": pair.left.empty + pair.right.empty})
         return messages | {"status": _status(left.stamp, pair.baseline, counts)}
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
     def _pair_of(self, left: CameraInfo, right: CameraInfo, extrinsics: Transforms | None) -> _Pair:
         """Returns how the pair is prepared; that is worked out anew where it is told something else."""

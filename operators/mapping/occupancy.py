@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dataflow.operator import Remembered
 
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -38,7 +38,7 @@ class GridSettings:
     most_cubes: int
 
 
-class ColumnGrid:
+class ColumnGrid(Remembered):
     """Log-odds of occupancy in cubes of the map frame: columns over the cells of the floor, cut into slices.
 
     A ray over a table does not observe the table, so heights are kept apart until the grid is asked for its plan. Cubes
@@ -46,11 +46,14 @@ class ColumnGrid:
     change per cube and scan as in Hornung et al., "OctoMap", 2013.
     """
 
+    _corner: Cubes
+    _odds: NDArray[np.float32]
+
     def __init__(self, settings: GridSettings) -> None:
         self._settings = settings
         low, high = settings.band
         self._slices = max(1, round((high - low) / settings.layer))
-        self._corner: Cubes = np.zeros(2, np.int32)  # column and row of the first cell, in cells from the origin
+        self._corner = np.zeros(2, np.int32)  # column and row of the first cell, in cells from the origin
         self._odds = np.zeros((self._slices, 0, 0), np.float32)
 
     def insert(self, origin: Array, points: Array) -> int:
@@ -98,14 +101,6 @@ class ColumnGrid:
         share = 100 / (1 + np.exp(-np.where(known, fullest, 0.0)[window].astype(np.float64)))
         cells = np.where(known[window], np.rint(share), -1).astype(np.int8)
         return cells, (self._corner + np.array([columns[0], rows[0]])) * self._settings.resolution
-
-    def snapshot(self) -> dict[str, Any]:
-        """Returns all that the grid holds."""
-        return {"corner": self._corner, "odds": self._odds}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes what `snapshot` of a grid with the same settings gave."""
-        self._corner, self._odds = np.array(state["corner"]), np.array(state["odds"])
 
     def _cubes(self, points: Points) -> Cubes:
         """Returns column, row and slice (3, N) of points (3, N) within the band."""

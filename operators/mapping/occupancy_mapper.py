@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from dataflow.messages import Diagnostics, Message, OccupancyGrid, Odometry, PointCloud, Pose, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.mapping.occupancy import ColumnGrid, GridSettings
 from operators.mapping.placing import placed
 from operators.status import counted_status
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the map and its frame, empty before the first pose."""
+
+    grid: ColumnGrid
+    frame: str = ""
 
 
 class OccupancyMapper(Operator):
@@ -57,6 +64,7 @@ class OccupancyMapper(Operator):
     bound: float = Param(3.5, gt=0, le=20, doc="most that is remembered, in log-odds: less forgets movers faster")
     period: int = Param(5, ge=1, live=True, doc="the map comes with every so many clouds")
     most_cubes: int = Param(100_000_000, ge=1, doc="the largest map; a larger one ends the run")
+    state: State
 
     def setup(self) -> None:
         """Raises ValueError for a band or a range that holds nothing."""
@@ -64,9 +72,8 @@ class OccupancyMapper(Operator):
             raise ValueError(f"lower {self.lower} m must be below upper {self.upper} m")
         if self.near >= self.far:
             raise ValueError(f"near {self.near} m must be below far {self.far} m")
-        self._begin()
 
-    def _begin(self) -> None:
+    def initial_state(self) -> State:
         settings = GridSettings(
             resolution=self.resolution,
             layer=self.layer,
@@ -79,59 +86,45 @@ class OccupancyMapper(Operator):
             bound=self.bound,
             most_cubes=self.most_cubes,
         )
-        self._grid = ColumnGrid(settings)
-        self._counts: Counter[str] = Counter()
-        self._frame = ""
+        return State(grid=ColumnGrid(settings))
 
     def process(
         self, cloud: PointCloud, pose: Pose | Odometry, extrinsics: Transforms | None = None
     ) -> dict[str, Message]:
         """Raises ValueError where no transform relates cloud and pose, where the poses' frame changes, and where the
         map would have more than `most_cubes`."""
-        if self._frame and pose.frame != self._frame:
-            raise ValueError(f"the map is in frame {self._frame!r}, but the pose in {pose.frame!r}")
-        self._frame = pose.frame
+        if self.state.frame and pose.frame != self.state.frame:
+            raise ValueError(f"the map is in frame {self.state.frame!r}, but the pose in {pose.frame!r}")
+        self.state.frame = pose.frame
         seen = placed(cloud, pose, extrinsics)
-        used = 0 if seen is None else self._grid.insert(seen.origin, seen.points)
+        used = 0 if seen is None else self.state.grid.insert(seen.origin, seen.points)
         reason = ""
         if seen is None:
             reason = "the pose is not finite"
         elif not used:
             reason = "no point is usable" if cloud.count else "the cloud is empty"
-        self._counts.update({"clouds": 1, "clouds left out": bool(reason), "points": used})
+        self.state.counts.update({"clouds": 1, "clouds left out": bool(reason), "points": used})
         counts = {"points": cloud.count, "points used": used}
         level = Level.WARN if reason else Level.OK
         status = counted_status("occupancy_mapper", cloud.stamp, reason or f"{used} points", level, counts)
         messages: dict[str, Message] = {"status": status}
-        if self._counts["clouds"] % self.period == 0:
+        if self.state.counts["clouds"] % self.period == 0:
             messages["map"] = self._map(cloud.stamp)
         return messages
 
-    def on_reset(self, input: str) -> None:
-        """Begins a new map: the clock of a stream began anew."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {"grid": self._grid.snapshot(), "counts": dict(self._counts), "frame": self._frame}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._grid.restore(state["grid"])
-        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
-        self._frame = str(state["frame"])
-
     def summary(self) -> Mapping[str, float | int]:
-        cells, _ = self._grid.plan()
+        cells, _ = self.state.grid.plan()
         area = self.resolution**2
-        return dict(self._counts) | {
+        return dict(self.state.counts) | {
             "free m²": round(float(((cells >= 0) & (cells < 50)).sum()) * area, 2),
             "taken m²": round(float((cells >= 50).sum()) * area, 2),
         }
 
     def _map(self, stamp: int) -> OccupancyGrid:
-        cells, corner = self._grid.plan()
+        cells, corner = self.state.grid.plan()
         return OccupancyGrid(
             stamp=stamp,
-            frame=self._frame,
+            frame=self.state.frame,
             resolution=self.resolution,
             cells=cells,
             position=np.array([*corner, 0.0]),

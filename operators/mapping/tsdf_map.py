@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,12 +21,21 @@ from dataflow.messages import (
     Transforms,
 )
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.mapping.placing import sensor_pose
 from operators.mapping.surface_nets import extract
 from operators.mapping.tsdf import DistanceField, FieldSettings
 from operators.status import counted_status
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the map, its frame, empty before the first pose, and whether it has colours."""
+
+    field: DistanceField
+    frame: str = ""
+    colored: bool = False
 
 
 class TsdfMap(Operator):
@@ -63,14 +72,14 @@ class TsdfMap(Operator):
     most_weight: float = Param(20.0, gt=0, doc="most that a voxel remembers: less follows changes faster")
     period: int = Param(50, ge=1, live=True, doc="mesh and cloud come with every so many images")
     most_blocks: int = Param(200_000, ge=1, doc="blocks of 512 voxels; a larger map ends the run")
+    state: State
 
     def setup(self) -> None:
         """Raises ValueError for a range that holds no depth."""
         if self.near >= self.far:
             raise ValueError(f"near {self.near} m must be below far {self.far} m")
-        self._begin()
 
-    def _begin(self) -> None:
+    def initial_state(self) -> State:
         settings = FieldSettings(
             voxel=self.voxel,
             truncation=self.truncation * self.voxel,
@@ -79,10 +88,7 @@ class TsdfMap(Operator):
             most_weight=self.most_weight,
             most_blocks=self.most_blocks,
         )
-        self._field = DistanceField(settings)
-        self._counts: Counter[str] = Counter()
-        self._frame = ""
-        self._colored = False
+        return State(field=DistanceField(settings))
 
     def process(
         self,
@@ -95,46 +101,29 @@ class TsdfMap(Operator):
         """Raises ValueError where depth, image and calibration do not fit, no transform relates camera and pose, the
         poses' frame changes, or the map would have more than `most_blocks`."""
         check_calibration("depth", depth, depth_info)
-        if self._frame and pose.frame != self._frame:
-            raise ValueError(f"the map is in frame {self._frame!r}, but the pose in {pose.frame!r}")
-        self._frame = pose.frame
+        if self.state.frame and pose.frame != self.state.frame:
+            raise ValueError(f"the map is in frame {self.state.frame!r}, but the pose in {pose.frame!r}")
+        self.state.frame = pose.frame
         placed = sensor_pose(depth.frame, pose, extrinsics)
         told = 0
         if placed is not None:
-            told = self._field.integrate(depth.data, self._colors(depth, image), depth_info.K, placed[0])
+            told = self.state.field.integrate(depth.data, self._colors(depth, image), depth_info.K, placed[0])
         reason = ""
         if placed is None:
             reason = "the pose is not finite"
         elif not told:
             reason = "no depth is usable"
-        self._counts.update({"images": 1, "images left out": bool(reason)})
-        counts = {"voxels": told, "blocks": len(self._field)}
+        self.state.counts.update({"images": 1, "images left out": bool(reason)})
+        counts = {"voxels": told, "blocks": len(self.state.field)}
         level = Level.WARN if reason else Level.OK
         text = reason or f"{told} voxels"
         messages: dict[str, Message] = {"status": counted_status("tsdf_map", depth.stamp, text, level, counts)}
-        if self._counts["images"] % self.period == 0:
+        if self.state.counts["images"] % self.period == 0:
             messages |= self._surface(depth.stamp)
         return messages
 
-    def on_reset(self, input: str) -> None:
-        """Begins a new map: the clock of a stream began anew."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "field": self._field.snapshot(),
-            "counts": dict(self._counts),
-            "frame": self._frame,
-            "colored": self._colored,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._field.restore(state["field"])
-        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
-        self._frame, self._colored = str(state["frame"]), bool(state["colored"])
-
     def summary(self) -> Mapping[str, int]:
-        return dict(self._counts) | {"blocks": len(self._field)}
+        return dict(self.state.counts) | {"blocks": len(self.state.field)}
 
     def _colors(self, depth: DepthImage, image: Image | None) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
         if image is None or image.stamp != depth.stamp:
@@ -144,21 +133,21 @@ class TsdfMap(Operator):
                 f"image has {image.width}x{image.height} pixels, depth {depth.width}x{depth.height}: "
                 f"colours must be registered to the depth"
             )
-        self._colored = True
+        self.state.colored = True
         return image.data if image.data.ndim == 3 else np.repeat(image.data[..., None], 3, axis=2)
 
     def _surface(self, stamp: int) -> dict[str, Message]:
-        surface = extract(self._field, self.voxel, self.min_weight)
-        colors = surface.colors if self._colored else None
+        surface = extract(self.state.field, self.voxel, self.min_weight)
+        colors = surface.colors if self.state.colored else None
         mesh = Mesh(
             stamp=stamp,
-            frame=self._frame,
+            frame=self.state.frame,
             vertices=surface.vertices,
             triangles=surface.triangles,
             normals=surface.normals,
             colors=colors,
         )
         cloud = PointCloud(
-            stamp=stamp, frame=self._frame, points=surface.vertices, normals=surface.normals, colors=colors
+            stamp=stamp, frame=self.state.frame, points=surface.vertices, normals=surface.normals, colors=colors
         )
         return {"mesh": mesh, "cloud": cloud}

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.estimation.kernels import huber
 from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
@@ -51,7 +50,7 @@ class Misfit:
         return float(np.linalg.norm(self.shift))
 
 
-class DepthScanAgreement:
+class DepthScanAgreement(Remembered):
     """Follows, pair by pair, the misfit of depth images and scans by point-to-plane alignment with forgetting.
 
     Each pair is aligned from where the last ones led, and its information is added to theirs, whose weight falls by
@@ -59,6 +58,10 @@ class DepthScanAgreement:
     as in Blais and Levine, "Registering multiview range data to create 3D computer objects", 1995, with the scale as
     one more unknown.
     """
+
+    _x: Array
+    _information: Array
+    pairs: int
 
     def __init__(self, keep: float = 0.9) -> None:
         self._keep = keep
@@ -89,14 +92,6 @@ class DepthScanAgreement:
         """Returns the misfit by the pairs so far."""
         sigmas = np.sqrt(np.diag(np.linalg.inv(self._posterior())))
         return Misfit(self._x[:3].copy(), self._x[3:6].copy(), float(self._x[6]), sigmas)
-
-    def snapshot(self) -> dict[str, Any]:
-        return {"x": self._x, "information": self._information, "pairs": self.pairs}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._x = np.array(state["x"], np.float64)
-        self._information = np.array(state["information"], np.float64)
-        self.pairs = int(state["pairs"])
 
     def _posterior(self) -> Array:
         return self._information + np.diag(1.0 / _PRIOR**2)

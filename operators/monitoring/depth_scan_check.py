@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.geometry.calibration import check_calibration
@@ -20,6 +18,13 @@ from operators.status import counted_status
 
 _SURE = 4.0  # standard deviations by which a misfit must stand out
 _AT_ONCE = 2_000_000  # ns: differences of stamps that need no motion
+
+
+@dataclass
+class State(Counts):
+    """Holds the misfit by the pairs so far."""
+
+    agreement: DepthScanAgreement = field(default_factory=DepthScanAgreement)
 
 
 class DepthScanCheck(Operator, tolerance="60ms"):
@@ -46,9 +51,7 @@ class DepthScanCheck(Operator, tolerance="60ms"):
     scale: float = Param(0.02, gt=0, live=True, doc="largest share by which depths may be too long or short")
     pairs: int = Param(5, ge=1, live=True, doc="pairs that must have been seen before it warns")
 
-    def setup(self) -> None:
-        self._agreement = DepthScanAgreement()
-        self._counts: Counter[str] = Counter()
+    state: State
 
     def process(
         self,
@@ -65,32 +68,22 @@ class DepthScanCheck(Operator, tolerance="60ms"):
         if cloud.time_offsets is not None or abs(apart) > _AT_ONCE:
             velocity = _velocity(motion, extrinsics, cloud.frame)
             if velocity is None:
-                self._counts["without a velocity"] += 1
+                self.state.counts["without a velocity"] += 1
                 return self._status(cloud.stamp)
             offsets = np.zeros(cloud.count) if cloud.time_offsets is None else cloud.time_offsets.astype(np.float64)
             points = deskewed(points, offsets + apart * 1e-9, velocity)
         T = transform_between(extrinsics, cloud.frame, depth.frame)
         usable = points[np.isfinite(points).all(axis=1)]
-        taken = self._agreement.add(depth.data, depth_info.K, usable, T)
-        self._counts["pairs" if taken else "with few common surfaces"] += 1
+        taken = self.state.agreement.add(depth.data, depth_info.K, usable, T)
+        self.state.counts["pairs" if taken else "with few common surfaces"] += 1
         return self._status(cloud.stamp)
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew; the sensors are where they were, so what is known of them stays."""
 
-    def snapshot(self) -> Mapping[str, Any]:
-        return {"agreement": self._agreement.snapshot(), "counts": dict(self._counts)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._agreement.restore(state["agreement"])
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, int]:
-        return dict(self._counts)
-
     def _status(self, stamp: int) -> Diagnostics:
-        found = self._agreement.misfit()
-        wrong = self._wrong(found) if self._agreement.pairs >= self.pairs else []
+        found = self.state.agreement.misfit()
+        wrong = self._wrong(found) if self.state.agreement.pairs >= self.pairs else []
         text = f"depth against LiDAR: {', '.join(wrong)}" if wrong else "depth and LiDAR fit"
         figures = {
             "angle (°)": f"{np.rad2deg(found.angle):.2f}",
@@ -98,7 +91,7 @@ class DepthScanCheck(Operator, tolerance="60ms"):
             "scale": f"{1 + found.scale:.4f}",
         }
         return counted_status(
-            "depth_scan_check", stamp, text, Level.WARN if wrong else Level.OK, {**figures, **self._counts}
+            "depth_scan_check", stamp, text, Level.WARN if wrong else Level.OK, {**figures, **self.state.counts}
         )
 
     def _wrong(self, found: Misfit) -> list[str]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.geometry import se3
 
 Array = NDArray[np.float64]
@@ -96,12 +96,14 @@ class Contradiction:
         return f"{self.sensor}: {abs(self.size):.1%} {'more' if self.size > 0 else 'less'} {name} than {others}"
 
 
-class MotionAgreement:
+class MotionAgreement(Remembered):
     """Compares sensors two by two, and names those that are contradicted, and by which."""
+
+    _pairs: dict[tuple[str, str], Pair]
 
     def __init__(self, limits: Limits, keep: float = 0.95) -> None:
         self._limits, self._keep = limits, keep
-        self._pairs: dict[tuple[str, str], Pair] = {}
+        self._pairs = {}
 
     def add(self, windows: Mapping[str, Window]) -> None:
         """Takes each sensor's motion in one window."""
@@ -115,15 +117,6 @@ class MotionAgreement:
         for what in ("way", "turn", "direction"):
             found += list(self._contradicted(what))
         return found
-
-    def snapshot(self) -> dict[str, Any]:
-        return {f"{a}|{b}": [p.coarse, p.information, p.gain] for (a, b), p in self._pairs.items()}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        for name, (coarse, information, gain) in state.items():
-            a, _, b = name.partition("|")
-            pair = Pair(bool(coarse), np.array(information, np.float64), np.array(gain, np.float64))
-            self._pairs[a, b] = pair
 
     def _contradicted(self, what: str) -> Iterator[Contradiction]:
         sizes = {names: self._judged(pair, what) for names, pair in self._pairs.items()}
@@ -159,13 +152,15 @@ class MotionAgreement:
         return 0.0 if spread < 0.5 * limit or abs(size) + spread < limit else None
 
 
-class Track:
+class Track(Remembered):
     """Keeps the poses (4, 4) of the body by one sensor over the last seconds."""
+
+    stamps: list[int]
+    poses: list[Array]
 
     def __init__(self, span: int = 3_000_000_000, gap: int = 350_000_000) -> None:
         self._span, self._gap = span, gap
-        self.stamps: list[int] = []
-        self.poses: list[Array] = []
+        self.stamps, self.poses = [], []
 
     def pose(self, stamp: int, T: Array) -> None:
         self.stamps.append(stamp)
@@ -197,13 +192,6 @@ class Track:
             return None
         motion = self.between(self.stamps[-2], self.stamps[-1])
         return None if motion is None else motion / ((self.stamps[-1] - self.stamps[-2]) * 1e-9)
-
-    def snapshot(self) -> list[Any]:
-        return [list(self.stamps), np.array(self.poses).reshape(-1, 4, 4)]
-
-    def restore(self, state: Sequence[Any]) -> None:
-        self.stamps = [int(stamp) for stamp in state[0]]
-        self.poses = list(np.array(state[1], np.float64).reshape(-1, 4, 4))
 
     def _at(self, stamp: int) -> Array | None:
         following = int(np.searchsorted(self.stamps, stamp)) if self.stamps else 0

@@ -2,24 +2,42 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from dataflow.messages import Diagnostics, Imu, Message, Odometry, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
-from dataflow.operator import Batch, Context, Duration, In, Operator, Out, Param, Sampled
+from dataflow.operator import Batch, Context, Counts, Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
-from operators.monitoring.motion_agreement import Contradiction, Limits, MotionAgreement, Track, Window
+from operators.monitoring.motion_agreement import Array, Contradiction, Limits, MotionAgreement, Track, Window
 from operators.status import counted_status
 
 _NEWEST = 350_000_000  # ns: the speed from an older pose is not compared with the wheels'
 _SLACK = 300_000_000  # ns that a window waits for the slowest sensor
 _WHEELS = "wheels"
 _HANGS = 500_000_000  # ns for which a sensor gives the same reading of a motion when it counts as hanging
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the sensors' tracks, what they were found to contradict, and which of them slip or hang."""
+
+    agreement: MotionAgreement
+    tracks: dict[str, Track] = field(default_factory=dict)
+    blind: set[str] = field(default_factory=set)
+    """Sensors that measure turns alone."""
+    found: list[Contradiction] = field(default_factory=list)
+    end: int = 0
+    slipping: bool = False
+    said: bool = False
+    slipped: int = -1
+    """When the wheels last slipped: a window with that time is no evidence on their radii."""
+    readings: dict[str, tuple[int, Array]] = field(default_factory=dict)
+    """Since when each of the moving sensors gives the reading that it gives."""
+    hanging: set[str] = field(default_factory=set)
 
 
 class MotionCheck(Operator, merge=True):
@@ -48,24 +66,11 @@ class MotionCheck(Operator, merge=True):
     angle: float = Param(1.5, gt=0, doc="angle between directions", unit="°")
     slip: float = Param(0.15, gt=0, doc="speed by which wheels may differ at any moment, beside a third", unit="m/s")
 
-    def setup(self) -> None:
-        self._begin()
+    state: State
 
-    def _begin(self) -> None:
+    def initial_state(self) -> State:
         limits = Limits(self.way, self.turn, self.coarse_turn, float(np.deg2rad(self.angle)))
-        self._tracks: dict[str, Track] = {}
-        self._blind: set[str] = set()
-        """Sensors that measure turns alone."""
-        self._agreement = MotionAgreement(limits)
-        self._found: list[Contradiction] = []
-        self._end = 0
-        self._slipping = self._said = False
-        self._slipped = -1
-        """When the wheels last slipped: a window with that time is no evidence on their radii."""
-        self._readings: dict[str, tuple[int, np.ndarray]] = {}
-        """Since when each of the moving sensors gives the reading that it gives."""
-        self._hanging: set[str] = set()
-        self._counts: Counter[str] = Counter()
+        return State(agreement=MotionAgreement(limits))
 
     def process(
         self,
@@ -81,9 +86,9 @@ class MotionCheck(Operator, merge=True):
         }
         for sample in imu:
             name = f"gyroscope of {sample.frame}"
-            self._blind.add(name)
+            self.state.blind.add(name)
             if not np.isfinite(sample.angular_velocity).all():
-                self._counts[f"{name}: not finite"] += 1
+                self.state.counts[f"{name}: not finite"] += 1
                 continue
             rate = turns[sample.frame] @ sample.angular_velocity
             self._follow(name, sample.stamp, sample.angular_velocity)
@@ -91,83 +96,50 @@ class MotionCheck(Operator, merge=True):
         for stream, odometry in (motions or {}).items():
             T = transform_between(extrinsics, odometry.child_frame, self.base_frame)
             if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
-                self._counts[f"{stream.partition('/')[2]}: not finite"] += 1
+                self.state.counts[f"{stream.partition('/')[2]}: not finite"] += 1
                 continue
             self._track(stream.partition("/")[2]).pose(odometry.stamp, T @ odometry.matrix() @ invert(T))
         messages: dict[str, Message] = {}
         if wheels is not None:
             messages |= self._passed(wheels)
-        if self._judge(context.stamp) or self._said != self._slipping:
+        if self._judge(context.stamp) or self.state.said != self.state.slipping:
             messages["status"] = self._status(context.stamp)
         return messages
 
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew, so nothing before it can be compared with."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "tracks": {name: track.snapshot() for name, track in self._tracks.items()},
-            "blind": sorted(self._blind),
-            "agreement": self._agreement.snapshot(),
-            "end": self._end,
-            "slipping": [self._slipping, self._said, self._slipped],
-            "readings": {name: [since, reading] for name, (since, reading) in self._readings.items()},
-            "hanging": sorted(self._hanging),
-            "counts": dict(self._counts),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        for name, track in state["tracks"].items():
-            self._track(name).restore(track)
-        self._blind = set(state["blind"])
-        self._agreement.restore(state["agreement"])
-        self._found = self._agreement.contradictions()
-        self._end = int(state["end"])
-        self._readings = {n: (int(since), np.array(r, np.float64)) for n, (since, r) in state["readings"].items()}
-        self._hanging = set(state["hanging"])
-        slipping, said, slipped = state["slipping"]
-        self._slipping, self._said, self._slipped = bool(slipping), bool(said), int(slipped)
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, int]:
-        return dict(self._counts)
-
     def _track(self, name: str) -> Track:
-        return self._tracks.setdefault(name, Track())
+        return self.state.tracks.setdefault(name, Track())
 
     def _passed(self, wheels: Odometry) -> dict[str, Message]:
         """The wheels' message if nothing contradicts it."""
         if wheels.linear is None or wheels.angular is None:
             return {"checked": wheels}
         if not all(np.isfinite(part).all() for part in (wheels.position, wheels.linear, wheels.angular)):
-            self._counts["wheels: not finite"] += 1
-            self._counts["held back"] += 1
+            self.state.counts["wheels: not finite"] += 1
+            self.state.counts["held back"] += 1
             return {}
         self._track(_WHEELS).twist(wheels.stamp, np.concatenate([wheels.linear, wheels.angular]))
         self._follow(_WHEELS, wheels.stamp, np.concatenate([wheels.linear, wheels.angular]))
-        self._slipping = self._slips(wheels)
-        self._slipped = wheels.stamp if self._slipping else self._slipped
-        held = self._slipping or any(c.alone and c.sensor == _WHEELS for c in self._found)
-        self._counts["held back" if held else "passed on"] += 1
+        self.state.slipping = self._slips(wheels)
+        self.state.slipped = wheels.stamp if self.state.slipping else self.state.slipped
+        held = self.state.slipping or any(c.alone and c.sensor == _WHEELS for c in self.state.found)
+        self.state.counts["held back" if held else "passed on"] += 1
         return {} if held else {"checked": wheels}
 
     def _follow(self, name: str, stamp: int, reading: np.ndarray) -> None:
         """Notices a sensor that gives the same reading over and over, unless it is that of rest."""
-        since, last = self._readings.get(name, (stamp, reading))
+        since, last = self.state.readings.get(name, (stamp, reading))
         same = bool(np.array_equal(reading, last))
-        self._readings[name] = (since if same else stamp, reading)
+        self.state.readings[name] = (since if same else stamp, reading)
         hangs = same and stamp - since >= _HANGS and bool(reading.any())
-        (self._hanging.add if hangs else self._hanging.discard)(name)
+        (self.state.hanging.add if hangs else self.state.hanging.discard)(name)
 
     def _slips(self, wheels: Odometry) -> bool:
         """Returns whether two others that agree, or more, contradict the speed of the wheels."""
         assert wheels.linear is not None
         own = float(wheels.linear[0])
         others = []
-        for name, track in sorted(self._tracks.items()):
-            if name != _WHEELS and name not in self._blind:
+        for name, track in sorted(self.state.tracks.items()):
+            if name != _WHEELS and name not in self.state.blind:
                 velocity = track.newest(wheels.stamp, _NEWEST)
                 if velocity is not None:
                     others.append(float(velocity[0]))
@@ -178,27 +150,27 @@ class MotionCheck(Operator, merge=True):
 
     def _judge(self, now: int) -> bool:
         """Takes the next window if it is past; False where it is not."""
-        self._end = self._end or now + self.window
-        if now < self._end + _SLACK:
+        self.state.end = self.state.end or now + self.window
+        if now < self.state.end + _SLACK:
             return False
         windows = {}
-        for name, track in self._tracks.items():
-            motion = track.between(self._end - self.window, self._end)
-            if motion is not None and not (name == _WHEELS and self._slipped >= self._end - self.window):
-                blind = np.where(np.arange(6) < 3, np.nan, motion) if name in self._blind else motion
+        for name, track in self.state.tracks.items():
+            motion = track.between(self.state.end - self.window, self.state.end)
+            if motion is not None and not (name == _WHEELS and self.state.slipped >= self.state.end - self.window):
+                blind = np.where(np.arange(6) < 3, np.nan, motion) if name in self.state.blind else motion
                 windows[name] = Window(blind, coarse=name == _WHEELS)
-        self._agreement.add(windows)
-        self._found = self._agreement.contradictions()
-        self._counts["windows"] += 1
-        self._counts["windows with a contradiction"] += bool(self._found)
-        self._end = max(self._end + self.window, now - _SLACK)
+        self.state.agreement.add(windows)
+        self.state.found = self.state.agreement.contradictions()
+        self.state.counts["windows"] += 1
+        self.state.counts["windows with a contradiction"] += bool(self.state.found)
+        self.state.end = max(self.state.end + self.window, now - _SLACK)
         return True
 
     def _status(self, stamp: int) -> Diagnostics:
-        self._said = self._slipping
-        texts = [contradiction.text() for contradiction in self._found]
-        if self._slipping:
+        self.state.said = self.state.slipping
+        texts = [contradiction.text() for contradiction in self.state.found]
+        if self.state.slipping:
             texts.insert(0, "the wheels turn otherwise than the robot moves")
-        texts += [f"{name} repeats its last reading" for name in sorted(self._hanging)]
+        texts += [f"{name} repeats its last reading" for name in sorted(self.state.hanging)]
         text = "; ".join(texts) or "motions agree"
-        return counted_status("motion_check", stamp, text, Level.WARN if texts else Level.OK, self._counts)
+        return counted_status("motion_check", stamp, text, Level.WARN if texts else Level.OK, self.state.counts)

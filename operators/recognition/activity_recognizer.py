@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Activity, Boxes3D, Classification, Odometry, Pose, SceneGraph
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.labels import LabelSpace, labels_file
 from operators.recognition.activity_model import ActivityModel
 from operators.recognition.activity_samples import STEP
@@ -37,6 +36,14 @@ class _Agent:
     activity: str
     since: int
     looks: Looks
+
+
+@dataclass
+class State(Counts):
+    """Holds the agents by their ids, and what is around them."""
+
+    agents: dict[int, _Agent] = field(default_factory=dict)
+    around: Surroundings = field(default_factory=Surroundings)
 
 
 class ActivityRecognizer(Operator):
@@ -70,6 +77,7 @@ class ActivityRecognizer(Operator):
     least: float = Param(0.35, ge=0, lt=1, live=True, doc="probability below which an activity is unknown")
     posture: float = Param(1.0, ge=0, live=True, doc="how much postures count beside the network; 0 for not at all")
     memory: float = Param(1.5, ge=0, doc="time out of sight after which an activity is unknown", unit="s")
+    state: State
 
     @classmethod
     def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
@@ -81,12 +89,6 @@ class ActivityRecognizer(Operator):
         self._model = ActivityModel.open(file)
         self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._classes = (*self._model.classes, UNKNOWN)
-        self._counts: Counter[str] = Counter()
-        self._begin()
-
-    def _begin(self) -> None:
-        self._agents: dict[int, _Agent] = {}
-        self._around = Surroundings()
 
     def process(
         self,
@@ -102,46 +104,19 @@ class ActivityRecognizer(Operator):
         bodies, unusable = mattering(nodes, self._labels, objects if same else None)
         seen = seen_times(nodes)
         time = nodes.stamp * 1e-9
-        self._around.update(time, bodies)
+        self.state.around.update(time, bodies)
         agents = sorted((b for b in bodies if b.agent), key=lambda b: b.id)
-        self._agents = {b.id: self._agents.get(b.id) or self._fresh(nodes.stamp) for b in agents}
+        self.state.agents = {b.id: self.state.agents.get(b.id) or self._fresh(nodes.stamp) for b in agents}
         here = None if robot is None else robot.matrix()[:2, 3]
         looks = self._looks(postures) if postures is not None and postures.stamp == nodes.stamp else {}
         vectors = []
         for body in agents:
-            window = self._agents[body.id].window
+            window = self.state.agents[body.id].window
             window.add(time, body)
-            self._agents[body.id].looks.update(time, looks.get(body.id))
-            vectors.append(window.vector(body, (nodes.stamp - seen[body.id]) * 1e-9, self._around, here))
-        self._counts.update({"graphs": 1, "agents": len(agents), "unusable nodes": unusable})
+            self.state.agents[body.id].looks.update(time, looks.get(body.id))
+            vectors.append(window.vector(body, (nodes.stamp - seen[body.id]) * 1e-9, self.state.around, here))
+        self.state.counts.update({"graphs": 1, "agents": len(agents), "unusable nodes": unusable})
         return self._answer(nodes.stamp, agents, vectors, seen)
-
-    def on_reset(self, input: str) -> None:
-        """The clock behind an input began anew: so do all agents."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        agents = [
-            [i, a.window.snapshot(), a.state, a.stepped, a.activity, a.since, a.looks.snapshot()]
-            for i, a in self._agents.items()
-        ]
-        return {"agents": agents, "around": self._around.snapshot(), "counts": dict(self._counts)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._around.restore(state["around"])
-        for id, window, network, stepped, activity, since, *_, looks in state["agents"]:  # once there was more
-            agent = self._fresh(int(since))
-            agent.window.restore(window)
-            agent.looks.restore(looks)
-            agent.state, agent.stepped = np.array(network, np.float32), None if stepped is None else int(stepped)
-            agent.activity = str(activity)
-            self._agents[int(id)] = agent
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        """Counts graphs, agents, answers that were unknown, and nodes that are not finite."""
-        return dict(self._counts)
 
     def _fresh(self, stamp: int) -> _Agent:
         return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, Looks())
@@ -165,25 +140,25 @@ class ActivityRecognizer(Operator):
         probabilities = np.zeros((len(agents), len(self._classes)), np.float32)
         objects = np.full(len(agents), -1, np.int64)
         if agents:
-            states = np.stack([self._agents[b.id].state for b in agents])
+            states = np.stack([self.state.agents[b.id].state for b in agents])
             probabilities[:, :-1], states = self._model.step(np.stack(vectors), states)
             for k, body in enumerate(agents):
-                evidence = self._agents[body.id].looks.evidence(self.posture)
+                evidence = self.state.agents[body.id].looks.evidence(self.posture)
                 if evidence is not None:
                     probabilities[k, :-1] *= evidence
             probabilities /= np.maximum(probabilities.sum(axis=1, keepdims=True), 1e-6)
         chosen = []
         for k, body in enumerate(agents):
-            agent = self._agents[body.id]
+            agent = self.state.agents[body.id]
             if agent.stepped is None or stamp - agent.stepped >= STEP * 1e9:
                 agent.state, agent.stepped = states[k], stamp
             fresh = stamp - seen[body.id] <= self.memory * 1e9
             activity = self._likeliest(probabilities[k], fresh)
-            self._counts["unknown"] += activity == UNKNOWN
+            self.state.counts["unknown"] += activity == UNKNOWN
             if activity != agent.activity:
                 agent.activity, agent.since = activity, stamp
             chosen.append(self._classes.index(activity))
-            objects[k] = self._around.object_of(activity, body)
+            objects[k] = self.state.around.object_of(activity, body)
         rows = np.arange(len(agents))
         probabilities = np.clip(probabilities, 0, 1)
         unsure = 1 - probabilities.max(axis=1, initial=0.0)
@@ -196,7 +171,7 @@ class ActivityRecognizer(Operator):
             scores=np.where(known, probabilities[rows, chosen], unsure).astype(np.float32),
             probabilities=probabilities,
             objects=objects,
-            since=np.array([self._agents[b.id].since for b in agents], np.int64),
+            since=np.array([self.state.agents[b.id].since for b in agents], np.int64),
         )
 
     def _likeliest(self, probabilities: NDArray[np.float32], fresh: bool) -> str:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.scene.bodies import Body
 
 Array = NDArray[np.float64]
@@ -52,12 +52,18 @@ class Look:
         return float(self.center[2] + self.size[2] / 2)
 
 
-class Surroundings:
+class Surroundings(Remembered):
     """The things around the agents of a scene, and how small ones have moved of late."""
 
+    _pasts: dict[int, deque[tuple[float, Array]]]
+    _lowest: dict[int, float]
+
     def __init__(self) -> None:
-        self._pasts: dict[int, deque[tuple[float, Array]]] = {}
-        self._lowest: dict[int, float] = {}
+        self._pasts, self._lowest = {}, {}
+        self.restored()
+
+    def restored(self) -> None:
+        """Waits for the next update to learn what is there."""
         self._now: dict[str, list[Body]] = {}
 
     def update(self, time: float, things: Sequence[Body]) -> None:
@@ -96,17 +102,6 @@ class Surroundings:
         """Returns how far a drink is above its lowest place: one in the hand is the one that matters."""
         return min(float(drink.center[2]) - self._lowest.get(drink.id, float(drink.center[2])), 0.3)
 
-    def snapshot(self) -> dict[str, Any]:
-        return {
-            "pasts": [[i, [[t, p] for t, p in past]] for i, past in self._pasts.items()],
-            "lowest": [[i, z] for i, z in self._lowest.items()],
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._pasts = {int(i): deque((float(t), np.array(p)) for t, p in past) for i, past in state["pasts"]}
-        self._lowest = {int(i): float(z) for i, z in state["lowest"]}
-        self._now = {}
-
     def _seat(self, now: Look, before: Look) -> tuple[float, float, float, float]:
         away, seat = min(((_flat(b.center - now.center), b.id, b) for b in self._now["seat"]), default=(FAR, 0, None))[
             ::2
@@ -143,14 +138,16 @@ class Surroundings:
         return away / FAR, closing, now.top - float(drink.center[2]), lifted, speed, second, reached
 
 
-class AgentWindow:
+class AgentWindow(Remembered):
     """Sliding window of one agent's motion."""
 
+    _looks: deque[Look]
+    _begun: float | None
+    _step: float
+    _heights: tuple[float, float] | None
+
     def __init__(self) -> None:
-        self._looks: deque[Look] = deque()
-        self._begun: float | None = None
-        self._step = 0.0
-        self._heights: tuple[float, float] | None = None
+        self._looks, self._begun, self._step, self._heights = deque(), None, 0.0, None
 
     def add(self, time: float, body: Body) -> None:
         """Adds the agent's body at a time; times rise. The velocity of a new rigid agent gives its earlier position."""
@@ -190,22 +187,6 @@ class AgentWindow:
             *around.of(now, before),
         ]  # fmt: skip
         return np.clip(np.nan_to_num(np.array(values, np.float32)), -3, 3)
-
-    def snapshot(self) -> dict[str, Any]:
-        return {
-            "looks": [[look.time, look.center, look.size] for look in self._looks],
-            "begun": self._begun,
-            "step": self._step,
-            "heights": None if self._heights is None else list(self._heights),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._looks = deque(
-            Look(float(t), np.array(c, np.float64), np.array(s, np.float64)) for t, c, s in state["looks"]
-        )
-        self._begun, self._step = state["begun"], float(state["step"])
-        heights = state["heights"]
-        self._heights = None if heights is None else (float(heights[0]), float(heights[1]))
 
     def _since(self, seconds: float) -> list[Look]:
         """Returns the looks of so many seconds, two at least where there are two."""

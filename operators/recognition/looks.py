@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dataflow.operator import Remembered
 
 F32 = NDArray[np.float32]
 
@@ -15,11 +15,13 @@ _SPAN = 0.5  # seconds
 _DOUBT = 0.01  # what a look leaves to an activity at least
 
 
-class Looks:
+class Looks(Remembered):
     """Looks at a posture in the last half second; each gives probabilities of activities."""
 
+    _taken: deque[tuple[float, F32]]
+
     def __init__(self) -> None:
-        self._taken: deque[tuple[float, F32]] = deque()
+        self._taken = deque()
 
     def update(self, time: float, probabilities: F32 | None) -> None:
         """Takes the look (C,) of a time, seconds, if there is one, and forgets the old ones."""
@@ -38,9 +40,3 @@ class Looks:
             return None
         logs = np.log(np.maximum(np.stack([look for _, look in self._taken]), _DOUBT)).mean(axis=0)
         return np.asarray(np.exp(weight * (logs - logs.max())), np.float32)
-
-    def snapshot(self) -> list[Any]:
-        return [[time, look] for time, look in self._taken]
-
-    def restore(self, state: Sequence[Any]) -> None:
-        self._taken = deque((float(time), np.array(look, np.float32)) for time, look in state)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Boxes3D, Classification, Clusters, Odometry, PointCloud, Pose, SceneGraph, Transforms
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.labels import LabelSpace, labels_file
 from operators.recognition.posture_model import PostureModel
@@ -49,6 +48,8 @@ class PostureRecognizer(Operator):
     weights: str | None = Param(None, doc="network file of `dataflow train posture`; none means the shipped one")
     labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives the roles of classes")
 
+    state: Counts
+
     @classmethod
     def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
         return trained_in_simulation(params["weights"] or shipped("posture.onnx"))
@@ -58,7 +59,6 @@ class PostureRecognizer(Operator):
         file = self.use_file(str(shipped("posture.onnx")) if self.weights is None else self.weights)
         self._model = PostureModel.open(file)
         self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
-        self._counts: Counter[str] = Counter()
 
     def process(
         self,
@@ -77,7 +77,7 @@ class PostureRecognizer(Operator):
         if fresh:
             T_world_cloud = pose.matrix() @ transform_between(extrinsics, cloud.frame, pose.child_frame)
             found = _silhouettes(nodes, boxes, clusters, cloud, T_world_cloud, self._labels)
-        self._counts.update({"graphs": 1, "persons": len(found), "graphs without a new view": int(not fresh)})
+        self.state.counts.update({"graphs": 1, "persons": len(found), "graphs without a new view": int(not fresh)})
         names = self._model.classes
         probabilities = np.zeros((0, len(names)), np.float32)
         if found:
@@ -92,15 +92,9 @@ class PostureRecognizer(Operator):
             ids=np.array([id for id, _ in found], np.int64),
         )
 
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(n) for key, n in state.items()})
-
     def summary(self) -> Mapping[str, float | int]:
         """Counts graphs, persons judged, and graphs whose cloud or clusters are of another time."""
-        return dict(self._counts)
+        return dict(self.state.counts)
 
 
 def _silhouettes(

@@ -27,7 +27,7 @@ _SLACK = 0.02  # of the distance, by which points stray
 class MapSettings:
     """Lengths in metres, times in seconds, evidence in log odds; noise of ranges at one metre, grows by the square.
 
-    `label` is the mean of what labels of its class count, over its views, below which a small thing that moves or is
+    `odds` are the log odds from which an object is given, by its detector's answers. `label` is the mean of what labels of its class count, over its views, below which a small thing that moves or is
     carried is doubted: other things are often called so, but not surely.
     """
 
@@ -37,6 +37,7 @@ class MapSettings:
     image_overlap: float = 0.3
     confirm: float = 1.25
     views: int = 3
+    odds: float = -0.7
     vacated: float = 1.0
     missed: float = 0.12
     miss_angle: float = 0.03

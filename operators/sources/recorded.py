@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataflow.messages import (
     CameraInfo,
     CompressedImage,
+    CompressedVideo,
     DepthImage,
     Image,
     Imu,
@@ -36,6 +37,7 @@ class RecordedCamera(RecordedSource):
 
     image: Out[Image] = Out(doc="colour or grey")
     compressed: Out[CompressedImage] = Out(doc="the same, encoded")
+    video: Out[CompressedVideo] = Out(doc="the same as H.264 or H.265")
     info: Out[CameraInfo] = Out(static=True, doc="its calibration")
 
 

@@ -59,13 +59,17 @@ class Frame:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Dataset:
-    """A listed folder. One unit of a depth image is `1 / depth_scale` metres; the values in `invalid` are no return."""
+    """A listed folder. One unit of a depth image is `1 / depth_scale` metres; the values in `invalid` are no return.
+
+    `T_depth_image` is x, y, z (m), qx, qy, qz, qw of the colour camera in the depth camera's frame.
+    """
 
     frames: Sequence[Frame]
     depth_scale: float
     invalid: tuple[int, ...]
     image_intrinsics: Intrinsics
     depth_intrinsics: Intrinsics
+    T_depth_image: tuple[float, float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def detect_layout(folder: Path) -> LayoutName:
@@ -85,7 +89,8 @@ def list_7scenes(folder: Path, rate: float, first_stamp: int) -> Dataset:
     """`frame-NNNNNN.color.jpg|png`, `.depth.png` (millimetres), `.pose.txt`; frame N is at first_stamp + N / rate.
 
     `camera-intrinsics.txt` is K of the depth camera. The colour camera is not the same and not registered to it: its
-    focal length is taken as 525 px, the Kinect's nominal one, around the same centre.
+    focal length is taken as 525 px, the Kinect's nominal one, around the same centre, and its place as 2.5 cm to the
+    right, which is how a Kinect v1 is built.
     """
     numbers: dict[int, str] = {}
     present: set[str] = set()
@@ -108,7 +113,8 @@ def list_7scenes(folder: Path, rate: float, first_stamp: int) -> Dataset:
         stamp = frame_stamp(number, rate, first_stamp)
         frames.append(Frame(numbers[number], stamp, folder / image, folder / f"{stem}.depth.png", pose))
     depth = _intrinsics_file(folder) or Intrinsics(585.0, 585.0, 320.0, 240.0)
-    return Dataset(frames, 1000.0, (0, 65535), Intrinsics(525.0, 525.0, depth.cx, depth.cy), depth)
+    image = Intrinsics(525.0, 525.0, depth.cx, depth.cy)
+    return Dataset(frames, 1000.0, (0, 65535), image, depth, (0.025, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
 
 
 def list_tum(folder: Path) -> Dataset:

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dataflow.operator import Remembered
 
 Array = NDArray[np.float64]
 
@@ -30,12 +31,15 @@ class BoxNoise:
     growth: float = 0.4
 
 
-class BoxFilter:
+class BoxFilter(Remembered):
     """Follows (centre x, centre y, width, height) at constant velocity; the four are independent of each other.
 
     Noise grows with the box's height, as in Wojke et al., "Simple online and realtime tracking with a deep association
     metric", 2017, and with the weakness of the score, as in Du et al., "GIAOTracker", 2021.
     """
+
+    mean: Array
+    covariance: Array
 
     def __init__(self, box: Array, score: float, noise: BoxNoise) -> None:
         self._noise = noise
@@ -68,12 +72,6 @@ class BoxFilter:
         """The box (4,) as (x1, y1, x2, y2)."""
         box: Array = boxes_of([self])[0]
         return box
-
-    def snapshot(self) -> dict[str, Any]:
-        return {"mean": self.mean, "covariance": self.covariance}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.mean, self.covariance = np.array(state["mean"]), np.array(state["covariance"])
 
     def _measured(self, score: float) -> Array:
         n = self._noise

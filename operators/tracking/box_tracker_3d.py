@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import TrackState
+from dataflow.operator import Remembered
 from operators.tracking.assignment import assign
 from operators.tracking.box_filter import kalman
 
 Array = NDArray[np.float64]
 _GATE = 11.34  # 99 % of chi-square with 3 degrees of freedom
 _MOST = 4.0
-_FIELDS = ("id", "mean", "covariance", "size", "size_weight", "yaw", "class_id", "evidence", "born", "seen")
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class Solids:
     covariances: Array | None = None
 
 
-class BoxTracker3D:
+class BoxTracker3D(Remembered):
     """Follows upright boxes at constant velocity: Kalman filter on the centre, weighted means of extent and heading.
 
     Strong boxes are matched first, weak ones continue what is left, both by Mahalanobis distance of centres within a
@@ -80,11 +78,13 @@ class BoxTracker3D:
     it moves. After Weng et al., "3D multi-object tracking: a baseline and new evaluation metrics", 2020.
     """
 
+    tracks: list[SolidTrack]
+    _next: int
+    _stamp: int | None
+
     def __init__(self, settings: BoxTracker3DSettings) -> None:
         self._settings = settings
-        self.tracks: list[SolidTrack] = []
-        self._next = 1
-        self._stamp: int | None = None
+        self.tracks, self._next, self._stamp = [], 1, None
 
     def update(self, stamp: int, found: Solids) -> list[SolidTrack]:
         """Takes the boxes of one time; returns the tracks, with those that end now, by rising id."""
@@ -114,17 +114,6 @@ class BoxTracker3D:
     def forget(self) -> None:
         """Drops all tracks; their ids are not used again."""
         self.tracks, self._stamp = [], None
-
-    def snapshot(self) -> Mapping[str, Any]:
-        rows = [{f: getattr(t, f) for f in _FIELDS} | {"state": int(t.state)} for t in self.tracks]
-        return {"next": self._next, "stamp": self._stamp, "tracks": rows}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._next, self._stamp = int(state["next"]), state["stamp"]
-        self.tracks = []
-        for row in state["tracks"]:
-            arrays = {f: np.array(row[f], np.float64) for f in ("mean", "covariance", "size")}
-            self.tracks.append(SolidTrack(**({f: row[f] for f in _FIELDS} | arrays), state=TrackState(row["state"])))
 
     def _predict(self, track: SolidTrack, seconds: float) -> None:
         F = np.eye(6)

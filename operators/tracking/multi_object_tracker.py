@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -11,12 +12,21 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, Diagnostics, FeatureVector, Tracks, TrackState
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.status import counted_status
 from operators.tracking.box_filter import BoxFilter, BoxNoise, FilterpyBoxFilter, boxes_of
 from operators.tracking.box_tracker import BoxTrack, BoxTracker, BoxTrackerSettings
 
 Array = NDArray[np.float64]
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the tracks, what they are of, and the names of their classes in the order of their arrival."""
+
+    tracker: BoxTracker
+    view: tuple[str, int, int] | None = None
+    classes: list[str] = field(default_factory=list)
 
 
 class MultiObjectTracker(Operator):
@@ -46,14 +56,11 @@ class MultiObjectTracker(Operator):
     position_noise: float = Param(0.03, gt=0, doc="standard deviation of a box's middle, share of its height")
     acceleration: float = Param(4.0, gt=0, doc="standard deviation of its acceleration", unit="heights/s²")
     filter: Literal["numpy", "filterpy"] = Param("numpy", doc="what runs the Kalman filters; filterpy takes longer")
+    state: State
 
-    def setup(self) -> None:
-        self._counts: Counter[str] = Counter()
-        self._begin()
-
-    def _begin(self) -> None:
+    def initial_state(self) -> State:
         noise = BoxNoise(position=self.position_noise, acceleration=self.acceleration)
-        self._tracker = BoxTracker(
+        tracker = BoxTracker(
             BoxTrackerSettings(
                 strong=self.strong,
                 birth=self.birth,
@@ -66,23 +73,22 @@ class MultiObjectTracker(Operator):
                 filter=FilterpyBoxFilter if self.filter == "filterpy" else BoxFilter,
             )
         )
-        self._view: tuple[str, int, int] | None = None
-        self._classes: list[str] = []
+        return State(tracker=tracker)
 
     def process(self, detections: Detections2D, features: FeatureVector | None = None) -> dict[str, Any]:
         """Raises ValueError where boxes of another camera arrive."""
         view = (detections.frame, detections.width, detections.height)
-        resized = self._view is not None and view[1:] != self._view[1:]
-        if self._view is not None and view[0] != self._view[0]:
-            raise ValueError(f"detections are of camera {view[0]}, those before were of {self._view[0]}")
+        resized = self.state.view is not None and view[1:] != self.state.view[1:]
+        if self.state.view is not None and view[0] != self.state.view[0]:
+            raise ValueError(f"detections are of camera {view[0]}, those before were of {self.state.view[0]}")
         if resized:
-            self._counts["image sizes changed"] += 1
-            self._tracker.forget()
-        self._view = view
+            self.state.counts["image sizes changed"] += 1
+            self.state.tracker.forget()
+        self.state.view = view
         boxes = detections.boxes.astype(np.float64)
         usable = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
         rows = np.flatnonzero(usable)
-        tracks = self._tracker.update(
+        tracks = self.state.tracker.update(
             detections.stamp,
             boxes[rows],
             detections.scores[rows].astype(np.float64),
@@ -92,48 +98,31 @@ class MultiObjectTracker(Operator):
         )
         counts = Counter(t.state.name.lower() for t in tracks)
         counts["unusable boxes"] = detections.count - len(rows)
-        self._counts.update({"images": 1, "detections": detections.count, "unusable boxes": counts["unusable boxes"]})
-        self._counts["tracks ended"] += counts["ended"]
+        self.state.counts.update(
+            {"images": 1, "detections": detections.count, "unusable boxes": counts["unusable boxes"]}
+        )
+        self.state.counts["tracks ended"] += counts["ended"]
         return {"tracks": self._message(detections, tracks), "status": _status(detections.stamp, counts, resized)}
 
     def on_reset(self, input: str) -> None:
         """The clock behind an input began anew: tracks of the time before mean nothing now."""
-        self._tracker.forget()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        view = None if self._view is None else list(self._view)
-        return {
-            "tracker": self._tracker.snapshot(),
-            "view": view,
-            "classes": self._classes,
-            "counts": dict(self._counts),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._tracker.restore(state["tracker"])
-        self._view = None if state["view"] is None else (state["view"][0], int(state["view"][1]), int(state["view"][2]))
-        self._classes = list(state["classes"])
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
+        self.state.tracker.forget()
 
     def _class_ids(self, detections: Detections2D) -> NDArray[np.int32]:
         """Returns ids (N,) in the tracker's own list of classes, which grows with the names that arrive."""
         if not detections.class_names:
             return detections.class_ids
         for name in detections.class_names:
-            if name not in self._classes:
-                self._classes.append(name)
-        own = np.array([self._classes.index(name) for name in detections.class_names], np.int32)
+            if name not in self.state.classes:
+                self.state.classes.append(name)
+        own = np.array([self.state.classes.index(name) for name in detections.class_names], np.int32)
         return own[detections.class_ids]
 
     def _vectors(
         self, detections: Detections2D, features: FeatureVector | None, rows: NDArray[np.intp]
     ) -> Array | None:
         if features is None or features.stamp != detections.stamp or len(features.vectors) != detections.count:
-            self._counts["features not used"] += features is not None
+            self.state.counts["features not used"] += features is not None
             return None
         vectors = features.vectors[rows].astype(np.float64)
         return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
@@ -145,7 +134,7 @@ class MultiObjectTracker(Operator):
             frame=detections.frame,
             width=detections.width,
             height=detections.height,
-            class_names=tuple(self._classes),
+            class_names=tuple(self.state.classes),
             ids=np.array([t.id for t in tracks], np.int64),
             states=np.array([t.state for t in tracks], np.uint8),
             scores=np.array([t.score for t in tracks], np.float32),

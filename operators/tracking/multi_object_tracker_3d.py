@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,19 @@ from dataflow.messages.geometry import (
     transform_points,
     yaw_of,
 )
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.status import counted_status
 from operators.tracking.box_tracker_3d import BoxTracker3D, BoxTracker3DSettings, Solids, SolidTrack
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the tracks, what they are of, and the names of their classes in the order of their arrival."""
+
+    tracker: BoxTracker3D
+    frame: str | None = None
+    classes: list[str] = field(default_factory=list)
 
 
 class MultiObjectTracker3D(Operator):
@@ -49,13 +58,10 @@ class MultiObjectTracker3D(Operator):
     birth: float = Param(0.5, ge=0, le=1, doc="least score of a box that begins a track")
     confirm: float = Param(0.8, ge=0, doc="evidence that confirms a track, the sum of its boxes' log odds")
     memory: float = Param(2.0, gt=0, doc="a track ends that was not matched for so long", unit="s")
+    state: State
 
-    def setup(self) -> None:
-        self._counts: Counter[str] = Counter()
-        self._begin()
-
-    def _begin(self) -> None:
-        self._tracker = BoxTracker3D(
+    def initial_state(self) -> State:
+        tracker = BoxTracker3D(
             BoxTracker3DSettings(
                 position=self.position_noise,
                 acceleration=self.acceleration,
@@ -66,8 +72,7 @@ class MultiObjectTracker3D(Operator):
                 memory=self.memory,
             )
         )
-        self._frame: str | None = None
-        self._classes: list[str] = []
+        return State(tracker=tracker)
 
     def process(
         self, boxes: Boxes3D, pose: Pose | Odometry | None = None, extrinsics: Transforms | None = None
@@ -77,14 +82,14 @@ class MultiObjectTracker3D(Operator):
         if pose is not None and boxes.frame != pose.frame:
             T = pose.matrix() @ transform_between(extrinsics, boxes.frame, pose.child_frame)
             frame = pose.frame
-        if self._frame is not None and frame != self._frame:
-            raise ValueError(f"boxes are in {frame}, those before were in {self._frame}: give a pose of one frame")
-        self._frame = frame
+        if self.state.frame is not None and frame != self.state.frame:
+            raise ValueError(f"boxes are in {frame}, those before were in {self.state.frame}: give a pose of one frame")
+        self.state.frame = frame
         found, unusable = self._solids(boxes, T)
-        tracks = self._tracker.update(boxes.stamp, found)
+        tracks = self.state.tracker.update(boxes.stamp, found)
         states = Counter(t.state.name.lower() for t in tracks)
         counts = {s.name.lower(): states[s.name.lower()] for s in TrackState} | {"unusable boxes": unusable}
-        self._counts.update(
+        self.state.counts.update(
             {"messages": 1, "boxes": boxes.count, "unusable boxes": unusable, "tracks ended": states["ended"]}
         )
         text = ", ".join(f"{n} {name}" for name, n in counts.items())
@@ -96,24 +101,7 @@ class MultiObjectTracker3D(Operator):
 
     def on_reset(self, input: str) -> None:
         """The clock behind an input began anew: tracks of the time before mean nothing now."""
-        self._tracker.forget()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "tracker": self._tracker.snapshot(),
-            "frame": self._frame,
-            "classes": self._classes,
-            "counts": dict(self._counts),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._tracker.restore(state["tracker"])
-        self._frame, self._classes = state["frame"], list(state["classes"])
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
+        self.state.tracker.forget()
 
     def _solids(self, boxes: Boxes3D, T: Any) -> tuple[Solids, int]:
         """Returns the usable boxes in the tracking frame, and how many are not."""
@@ -141,16 +129,16 @@ class MultiObjectTracker3D(Operator):
         if not boxes.class_names:
             return boxes.class_ids
         for name in boxes.class_names:
-            if name not in self._classes:
-                self._classes.append(name)
-        return np.array([self._classes.index(name) for name in boxes.class_names], np.int32)[boxes.class_ids]
+            if name not in self.state.classes:
+                self.state.classes.append(name)
+        return np.array([self.state.classes.index(name) for name in boxes.class_names], np.int32)[boxes.class_ids]
 
     def _message(self, now: int, frame: str, tracks: list[SolidTrack]) -> Tracks:
         means = np.array([t.mean for t in tracks]).reshape(-1, 6)
         return Tracks(
             stamp=now,
             frame=frame,
-            class_names=tuple(self._classes),
+            class_names=tuple(self.state.classes),
             ids=np.array([t.id for t in tracks], np.int64),
             states=np.array([t.state for t in tracks], np.uint8),
             scores=np.array([t.score for t in tracks], np.float32),

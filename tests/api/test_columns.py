@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 import pytest
 from analysed import MS, START
 
 import dataflow
 from dataflow.api.columns import column, expanded
 from dataflow.messages import Odometry, WheelTicks
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    import pandas as pd
 
 
 def test_vectors_scalars_and_timestamps_are_arrays(recording: dataflow.RecordedStreams) -> None:

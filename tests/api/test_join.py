@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import pandas as pd
 import pytest
 from analysed import imu
 from hypothesis import given
@@ -11,6 +12,9 @@ from hypothesis import strategies as st
 
 import dataflow
 from dataflow.api.asof import NONE, Direction, asof
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    import pandas as pd
 
 stamps = st.lists(st.integers(-20, 20), max_size=12)
 

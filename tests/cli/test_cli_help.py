@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -38,20 +39,6 @@ def test_the_help_documents_the_exit_codes_and_lists_every_command(dataflow) -> 
         "echo",
         "hz",
     } <= set(COMMANDS)
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_examples_that_stay_on_lines_of_their_own(dataflow, monkeypatch, command: str) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    lines = [line.strip() for line in dataflow(command, "--help").stdout.splitlines()]
-
-    examples = [line for line in lines[lines.index("Examples:") :] if line.startswith("dataflow ")]
-    assert examples
-    assert all(line.startswith(f"dataflow {command}") for line in examples)
-    documented = Commands()[command].help
-    assert [line.strip() for line in documented.splitlines() if "dataflow " in line and line.startswith("  ")] == (
-        examples
-    )
 
 
 def test_the_version_is_that_of_the_package(dataflow) -> None:
@@ -96,43 +83,40 @@ def test_a_fault_of_ours_is_one_message_and_code_2(monkeypatch, capsys, asked: s
     assert ("Traceback" in told) == (asked == "1")
 
 
-def every_command() -> list[tuple[str, ...]]:
-    """All commands and groups with their subcommands, of plug-ins too, as the words that call them."""
+def every_command() -> Iterator[tuple[str, ...]]:
+    """Yields the words that call each command, group and subcommand, of plug-ins too."""
     group = get_command(app)
     context = Context(group)
-    found: list[tuple[str, ...]] = []
     for name in group.list_commands(context):
         inner = group.get_command(context, name)
-        found += [(name,), *((name, each) for each in getattr(inner, "commands", {}))]
-    return found
+        yield from ((name,), *((name, each) for each in getattr(inner, "commands", {})))
 
 
-@pytest.mark.parametrize("words", every_command(), ids=" ".join)
-def test_every_command_and_subcommand_has_indented_examples_of_itself(dataflow, words: tuple[str, ...]) -> None:
-    lines = dataflow(*words, "--help").stdout.splitlines()
+def test_every_help_has_examples_of_its_command_and_explains_options_without_types(dataflow, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for words in every_command():
+        told = dataflow(*words, "--help").stdout
+        lines = told.splitlines()
+        examples = [line.strip() for line in lines if line.startswith("   dataflow ")]  # one space is the page's margin
+        assert any(line.strip() == "Examples:" for line in lines), words
+        assert examples, words
+        assert all(line.split()[1 : 1 + len(words)] == list(words) for line in examples), words
+        if words in [(command,) for command in COMMANDS]:  # each stays on a line
+            documented = Commands()[words[0]].help.splitlines()
+            assert examples == [line.strip() for line in documented if "dataflow " in line and line.startswith("  ")]
 
-    examples = [line for line in lines if line.startswith("   dataflow ")]  # one space is the page's margin
-    assert any(line.strip() == "Examples:" for line in lines)
-    assert examples
-    assert all(line.split()[1 : 1 + len(words)] == list(words) for line in examples)
+        options = told[told.index("─ Options") :]
+        assert "--help" in options, words
+        assert not [kind for kind in ("<int", "<float", "<str", "<path", "<bool") if kind in options], words
+        assert not [
+            word for word in ("[default: None]", "bool", "--install-completion", "--show-completion") if word in told
+        ], words
 
 
-@pytest.mark.parametrize("words", every_command(), ids=" ".join)
-def test_no_option_is_explained_by_a_type(dataflow, words: tuple[str, ...]) -> None:
-    told = dataflow(*words, "--help").stdout
-
-    options = told[told.index("─ Options") :]
-    assert not [kind for kind in ("<int", "<float", "<str", "<path", "<bool") if kind in options]
-    assert "[default: None]" not in told
-
-
-@pytest.mark.parametrize("words", [["run"], ["param", "set"], ["train"], ["evaluate", "detector"], []])
-def test_help_shows_no_type_beside_flags_and_no_completion(dataflow, words: list[str]) -> None:
-    told = dataflow(*words, "--help").stdout
-
+def test_the_help_of_the_program_offers_no_completion(dataflow) -> None:
+    told = dataflow("--help").stdout
     assert "--help" in told
-    assert "bool" not in told
-    assert "-completion" not in told
+    assert not [word for word in ("bool", "--install-completion", "--show-completion") if word in told]
 
 
 def test_options_by_their_former_names_work_and_say_so(dataflow, small: Path) -> None:

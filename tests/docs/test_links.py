@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.util
 import re
@@ -24,24 +25,26 @@ PAGES = sorted(
 PROGRAM = typer.main.get_command(app)
 
 
-def _plugins() -> Iterator[tuple[str, Any]]:
-    """The commands of perception, which the engine finds by entry points."""
+@functools.cache
+def all_commands() -> dict[str, Any]:
+    """The commands of the engine, and those of perception, which it finds by entry points."""
+    commands = dict(PROGRAM.commands)  # type: ignore[attr-defined]
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for name, value in project["entry-points"]["dataflow.commands"].items():
         module, _, attribute = value.partition(":")
-        yield name, typer.main.get_command(getattr(importlib.import_module(module), attribute))
+        commands[name] = typer.main.get_command(getattr(importlib.import_module(module), attribute))
+    return commands
 
 
-COMMANDS: dict[str, Any] = {**PROGRAM.commands, **dict(_plugins())}  # type: ignore[attr-defined]
 GLOBAL_OPTIONS = {"--help", "-h", *(option for parameter in PROGRAM.params for option in parameter.opts)}
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 FENCED = re.compile(r"^```[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OURS = re.compile(
     r"\b(?:graphs|recordings|benchmarks|operators|dataflow|tests|docs)/[\w./-]*\w\.(?:yaml|mcap|py|md|png)\b"
 )
 
-each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
-
+@functools.cache
 def text_of(page: Path) -> str:
     return page.read_text(encoding="utf-8")
 
@@ -61,6 +64,7 @@ def code_of(page: Path) -> Iterator[str]:
     yield from (" ".join(code.split()) for code in re.findall(r"`([^`]+)`", rest))
 
 
+@functools.cache
 def anchors_of(page: Path) -> set[str]:
     """What GitHub calls the headings of a page."""
     headings = re.findall(r"^#+ (.+)$", FENCED.sub("", text_of(page)), re.MULTILINE)
@@ -76,9 +80,8 @@ def commands_of(page: Path) -> Iterator[list[str]]:
                 yield shlex.split(found[1], comments=True)
 
 
-@each_page
-def test_every_relative_link_leads_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)\s]+)\)", prose_of(page)):
+def test_every_relative_link_leads_somewhere() -> None:
+    for page, target in ((each, found) for each in PAGES for found in LINK.findall(prose_of(each))):
         if re.match(r"[a-z]+:", target):
             continue
         path, _, anchor = target.partition("#")
@@ -87,9 +90,8 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors_of(linked), f"{page.name}: link to {target}: no such heading"
 
 
-@each_page
-def test_every_quoted_command_exists_with_its_options(page: Path) -> None:
-    for words in commands_of(page):
+def test_every_quoted_command_exists_with_its_options() -> None:
+    for page, words in ((each, words) for each in PAGES for words in commands_of(each)):
         if words[0] not in GLOBAL_OPTIONS:
             problem = fault_of(words)
             assert problem is None, f"{page.name}: dataflow {' '.join(words)}: {problem}"
@@ -97,7 +99,7 @@ def test_every_quoted_command_exists_with_its_options(page: Path) -> None:
 
 def fault_of(words: list[str]) -> str | None:
     """What is wrong with the arguments of a `dataflow` command, as far as its parser can tell without values."""
-    command, known = None, COMMANDS
+    command, known = None, all_commands()
     name, *rest = words
     while True:
         if name not in known:
@@ -116,24 +118,23 @@ def fault_of(words: list[str]) -> str | None:
     return "too many arguments" if left else None
 
 
-@each_page
-def test_every_file_of_ours_that_is_named_exists(page: Path) -> None:
-    for code in code_of(page):
+def test_every_file_of_ours_that_is_named_exists() -> None:
+    for page, code in ((each, code) for each in PAGES for code in code_of(each)):
         for name in OURS.findall(code):
             assert (REPOSITORY / name).exists(), f"{page.name} names {name}"
         for module in re.findall(r"\bpython3? -m ([\w.]+)", code):
             assert importlib.util.find_spec(module), f"{page.name} names the module {module}"
 
 
-@each_page
-def test_no_page_names_a_place_on_somebodys_machine(page: Path) -> None:
-    found = re.search(r"(?<![\w.])/(?:home|root|Users|work|tmp)/\S*", text_of(page))
-    assert found is None, f"{page.name}: {found and found[0]}"
+def test_no_page_names_a_place_on_one_machine() -> None:
+    for page in PAGES:
+        found = re.search(r"(?<![\w.])/(?:home|root|Users|work|tmp)/\S*", text_of(page))
+        assert found is None, f"{page.name}: {found and found[0]}"
 
 
 def test_the_page_of_commands_lists_every_command() -> None:
     listed = set(re.findall(r"^\| `dataflow (\w+)", text_of(REPOSITORY / "docs" / "commands.md"), re.MULTILINE))
-    assert listed == set(COMMANDS)
+    assert listed == set(all_commands())
 
 
 def test_the_quick_start_is_two_marked_blocks() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -51,7 +52,7 @@ def again(made: Node, ran: Collector, messages: Iterable[Entry], **fields: Any) 
     messages = list(messages)
     inputs = {STREAM: {(m.incarnation, m.seq): m.digest for m in messages}}
     runner = RecordedRunner(
-        made, Collector(), **{"static": frozenset(), "records": ran.records, "inputs": inputs, **fields}
+        made, Collector(), **{"static": frozenset(), "records": lambda: ran.records, "inputs": inputs, **fields}
     )
     runner.setup()
     for message in messages:
@@ -111,9 +112,8 @@ def test_an_operator_that_was_restarted_with_changed_parameters_is_identical() -
     made = dice(shared=True, restart=Restart(max=1, backoff=0))
     collector = Collector()
     errors = iter([None, Fails("once"), None])
-    runner = LiveRunner(
-        made, collector, static=frozenset(), event_clock=lambda: 10**6, fault=lambda firing: next(errors, None)
-    )
+    faults: Any = SimpleNamespace(before=lambda firing: next(errors, None))
+    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 10**6, faults=faults)
     runner.setup()
     messages = [entry(STREAM, 100 * seq, seq) for seq in range(1, 4)]
     for message in messages:
@@ -186,7 +186,7 @@ def test_done_rises_with_every_firing_that_is_repeated() -> None:
     messages = [entry(STREAM, 100 + seq, seq) for seq in range(3)]
     ran = live_run_echo(made, messages)
     records: list[FiringRecord] = ran.records
-    runner = RecordedRunner(made, Collector(), static=frozenset(), records=records, inputs={})
+    runner = RecordedRunner(made, Collector(), static=frozenset(), records=lambda: records, inputs={})
     runner.setup()
     for message in messages:
         runner.push(STREAM, message)

@@ -46,7 +46,18 @@ from dataflow.recording import Recording, RecordingError, RecordingWriter
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
-EXACT = {"Pose", "Twist", "Imu", "MagneticField", "PointCloud", "Text", "Switch", "Alarm", "Transforms"}
+EXACT = {
+    "CompressedVideo",
+    "Pose",
+    "Twist",
+    "Imu",
+    "MagneticField",
+    "PointCloud",
+    "Text",
+    "Switch",
+    "Alarm",
+    "Transforms",
+}
 
 
 def write(path: Path, streams: dict[str, list[Message]], static: tuple[str, ...] = ()) -> Path:

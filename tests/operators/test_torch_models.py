@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from typing import TYPE_CHECKING
 
 import pytest
 
-torch = pytest.importorskip("torch")
+from operators.torch_models import Runner
 
-from operators.torch_models import Runner  # noqa: E402
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch")
 
 
 def test_where_the_memory_of_the_gpu_does_not_suffice_the_cpu_does_the_work_and_it_is_counted(

@@ -84,6 +84,21 @@ def test_a_long_recording_reads_as_a_short_one(path: Path, step: int, monkeypatc
     assert content(path) == expected
 
 
+@pytest.mark.parametrize("size", [1, 300, 2000])
+def test_so_does_one_of_many_messages_however_few_of_them_are_looked_up_together(
+    path: Path, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the number of its chunks: a day of small messages has few, and tens of millions of messages."""
+    expected = content(path)
+    monkeypatch.setattr(summary, "LONG_BYTES", 0)
+    monkeypatch.setattr(message_index, "STEP_BYTES", size)
+    monkeypatch.setattr(message_index, "SAMPLED_BYTES", size)
+
+    assert content(path) == expected
+    with Recording(path) as recording:
+        assert isinstance(recording._file.index, message_index.LongIndex)
+
+
 def test_a_summary_is_read_in_blocks_of_any_size(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = content(path)
     for size in (150, 300, 1000):  # less than some records take, and some of them

@@ -21,6 +21,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from dataflow.messages import (
     CameraInfo,
     CompressedImage,
+    CompressedVideo,
     DepthImage,
     Image,
     LaserScan,
@@ -236,6 +237,7 @@ def test_well_known_types_read_the_same_with_mcap_alone(every_type: tuple[Path, 
             and same_depth(m, p)
         ),
         CompressedImage: lambda m, p: (p.format, p.data) == (m.format, m.data.tobytes()),
+        CompressedVideo: lambda m, p: (p.format, p.data) == (m.format, m.data.tobytes()),
         CameraInfo: lambda m, p: list(p.K) == m.K.ravel().tolist() and len(p.R) == 9 and len(p.P) == 12,
         PointCloud: same_cloud,
         Pose: same_pose,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -56,9 +57,10 @@ def write(path: Path, *, told: bool = True, changed_at: int | None = None, looks
                 writer.write_event(PARAMETERS, stamp, {"operator": "op", "name": "gain"})
 
 
-def log_of(path: Path, *, stateful: Sequence[str] = ("op",)) -> FiringLog:
+@contextmanager
+def log_of(path: Path, *, stateful: Sequence[str] = ("op",)) -> Iterator[FiringLog]:
     with Recording(path) as recording:
-        return records_from(recording, MAKERS, EPOCH + 100 * SECOND, stateless=(), stateful=stateful)
+        yield records_from(recording, MAKERS, EPOCH + 100 * SECOND, stateless=(), stateful=stateful)
 
 
 @pytest.fixture(autouse=True)
@@ -69,9 +71,8 @@ def _near(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_records_before_the_window_are_not_read_and_a_cut_stands_for_them(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path)
-    log = log_of(path)
-
-    kept, lost = whole(log.of("op"))
+    with log_of(path) as log:
+        kept, lost = whole(log.of("op"))
     assert [r.kind for r in kept[:3]] == ["setup", "cut", "fire"]
     assert not lost
     assert kept[2].stamp == EPOCH + 92 * SECOND
@@ -94,9 +95,9 @@ def test_the_window_has_what_is_needed_or_all_is_read(
 ) -> None:
     path = tmp_path / "a.mcap"
     write(path, **options)  # type: ignore[arg-type]
-    log = log_of(path)
-    if first is None:
-        assert not log.begins
-        assert len(log.of("op")) == 133
-    else:
-        assert next(r.stamp for r in log.of("op")[2:]) == EPOCH + first * SECOND
+    with log_of(path) as log:
+        if first is None:
+            assert not log.begins
+            assert len(log.of("op")) == 133
+        else:
+            assert next(r.stamp for r in log.of("op")[2:]) == EPOCH + first * SECOND

@@ -27,6 +27,7 @@ from dataflow.sync import (
     RunRef,
     SampledSpec,
     TriggerSpec,
+    Uses,
     refs_of,
 )
 
@@ -181,21 +182,26 @@ def test_a_live_run_with_forced_frontiers_is_driven_again_by_its_written_records
     written = [encode_batch(records[k : k + 7]) for k in range(0, len(records), 7)]
     read = [record.firing() for data in written for record in decode_batch(data).records]
 
-    driven = RecordedAligner(SPEC, read)
+    uses = Uses()
+    for record in read:
+        uses.add(record.inputs)
+    driven, left = RecordedAligner(SPEC, uses), list(read)
     dice = random.Random(order)
     waiting = {name: list(entries) for name, entries in streams.items()}
     again: list[Firing] = []
     while True:
-        while (firing := driven.poll()) is not None:
+        while left and (firing := driven.take(left[0])) is not None:
             again.append(firing)
-        left = [n for n, entries in waiting.items() if entries]
-        if not left:
+            del left[0]
+        open_ = [n for n, entries in waiting.items() if entries]
+        if not open_:
             break
-        name = dice.choice(left)
+        name = dice.choice(open_)
         driven.push(name, waiting[name].pop(0))
 
     assert again == firings
-    assert driven.ended()
+    assert not left
+    assert not any(driven.buffered().values())
     values = [[e.value for e in _entries(f)] for f in firings]
     assert [[e.value for e in _entries(f)] for f in again] == values
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.execution.snapshots import StateError, pack_state, unpack_state
+from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.state import StateError
 
 arrays = hnp.arrays(
     st.one_of(

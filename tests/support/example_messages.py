@@ -175,6 +175,11 @@ def _compressed_image(values: Values, rng: Rng) -> None:
     values["data"] = _encoded(extension, rng.integers(0, 256, (6, 9, 3), dtype=np.uint8))
 
 
+def _compressed_video(values: Values, rng: Rng) -> None:
+    delimiter = {"h264": b"\0\0\0\1\x09", "h265": b"\0\0\0\1\x46\1"}[values["format"]]
+    values["data"] = np.frombuffer(delimiter + rng.bytes(int(rng.integers(1, 40))), np.uint8)
+
+
 def _compressed_depth(values: Values, rng: Rng) -> None:
     values["data"] = _encoded(".png", rng.integers(0, 2**16, (6, 9), dtype=np.uint16))
 
@@ -360,6 +365,7 @@ _REPAIRS: dict[str, Callable[[Values, Rng], None]] = {
     "Clusters": _clusters,
     "CompressedDepth": _compressed_depth,
     "CompressedImage": _compressed_image,
+    "CompressedVideo": _compressed_video,
     "Detections2D": _detections,
     "Diagnostics": _diagnostics,
     "FeatureVector": _feature_vector,

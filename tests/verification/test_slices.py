@@ -45,9 +45,9 @@ def divided(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     seen: list[dict[str, Any]] = []
     answer = slices.answer
 
-    def noted(graph: Any, log: Any, answers: Any) -> Any:
+    def noted(books: Any, answers: Any) -> Any:
         seen.extend(each["slices"] for each in answers)
-        return answer(graph, log, answers)
+        return answer(books, answers)
 
     monkeypatch.setattr(slices, "answer", noted)
     return seen

@@ -12,7 +12,7 @@ digests = st.binary(min_size=1, max_size=1)
 
 
 def check(recorded: dict[tuple[int, int], bytes], *, static: bool = False, whole: bool = True) -> StoredCheck:
-    return StoredCheck("s/out", "s", recorded, static=static, whole=whole)
+    return StoredCheck("s/out", "s", sorted(d for d in recorded.items() if d[0][1] >= 0), static=static, whole=whole)
 
 
 @given(st.dictionaries(places, digests), st.lists(st.tuples(places, digests)), st.randoms())

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
-from dataflow.view import ViewOptions
-from dataflow.view.visualizers.cameras import _in_blocks
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    from dataflow.view import ViewOptions
+    from dataflow.view.visualizers.cameras import _in_blocks
 
 
 @pytest.mark.parametrize("shape", [(4, 6), (5, 7), (1, 1)])

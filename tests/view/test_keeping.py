@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import rerun as rr
-from rrd_rows import at, rows
 
 from dataflow.messages import Message, Odometry, PointCloud
-from dataflow.view import SceneState, ViewOptions, visualize
 from dataflow.view.keeping import KeptPoints, Points
 from dataflow.view.layout import layout
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    import rerun as rr
+    from rrd_rows import at, rows
+
+    from dataflow.view import SceneState, ViewOptions, visualize
 
 
 def still(frame: str, stamp: int) -> Points:

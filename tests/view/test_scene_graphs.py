@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
-from rrd_rows import Row, at, rows
 
 from dataflow.messages import Activity, Message, SceneGraph
 from dataflow.messages.scene_summary import summarize
-from dataflow.view import SceneState, visualize
 from dataflow.view.layout import layout
-from dataflow.view.visualizers.scene_tree import arranged
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    import rerun as rr
+    from rrd_rows import Row, at, rows
+
+    from dataflow.view import SceneState, visualize
+    from dataflow.view.visualizers.scene_tree import arranged
 
 CLASSES = ("room", "floor", "table", "mug", "chair", "person", "book")
 

@@ -6,11 +6,10 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import rerun.blueprint as rrb
-from rrd_rows import at, blueprint_rows, rows
 
 from dataflow.graph.model import Bundle, Graph, Live, Node
 from dataflow.graph.sections import Record, View
@@ -29,19 +28,24 @@ from dataflow.messages import (
     array,
 )
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.view import (
-    Connect,
-    Save,
-    Serve,
-    Spawn,
-    ViewerError,
-    ViewerSink,
-    from_recording,
-    parse_target,
-    visualizer,
-)
-from dataflow.view.backlog import Bounds
-from dataflow.view.blueprint import blueprint
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    import rerun.blueprint as rrb
+    from rrd_rows import at, blueprint_rows, rows
+
+    from dataflow.view import (
+        Connect,
+        Save,
+        Serve,
+        Spawn,
+        ViewerError,
+        ViewerSink,
+        from_recording,
+        parse_target,
+        visualizer,
+    )
+    from dataflow.view.backlog import Bounds
+    from dataflow.view.blueprint import blueprint
 
 STAMP = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -60,14 +64,18 @@ class Slow(Message, schema="test.view.Slow"):
 gate = threading.Event()
 
 
-@visualizer(Unwilling, "log")
 def _unwilling(canvas: object, message: Unwilling) -> None:
     raise RuntimeError(f"no, not {message.stamp}")
 
 
-@visualizer(Slow, "log")
 def _slow(canvas: object, message: Slow) -> None:
     assert gate.wait(30)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _visualizers(_late_imports: None) -> None:
+    visualizer(Unwilling, "log")(_unwilling)
+    visualizer(Slow, "log")(_slow)
 
 
 def imu(stamp: int) -> Imu:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
 from dataflow.view.frames import Rank
-from dataflow.view.scene import SceneState
 from dataflow.view.viewpoint import Outlook
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    from dataflow.view.scene import SceneState
 
 
 def in_image(looked: Outlook, points: np.ndarray) -> np.ndarray:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import permutations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import rerun as rr
 from example_messages import example
-from rrd_rows import Row, at, rows
+from made_video import PERIOD, clip, decoded
 from scipy.spatial.transform import Rotation
 
 from dataflow import messages
@@ -19,6 +19,7 @@ from dataflow.messages import (
     Boxes3D,
     CameraInfo,
     CompressedDepth,
+    CompressedVideo,
     DepthImage,
     Detections2D,
     Diagnostics,
@@ -40,9 +41,14 @@ from dataflow.messages import (
     scalar,
 )
 from dataflow.messages.declaration import Declaration, generic_type
-from dataflow.view import SceneState, ViewOptions, colors, visualize
-from dataflow.view.drawing import roles_of
 from dataflow.view.layout import layout
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    import rerun as rr
+    from rrd_rows import Row, at, rows
+
+    from dataflow.view import SceneState, ViewOptions, colors, visualize
+    from dataflow.view.drawing import roles_of
 
 TYPES = [
     value
@@ -91,6 +97,25 @@ def test_an_image_is_sent_as_jpeg_or_as_it_is(tmp_path: Path) -> None:
     found = draw(tmp_path, ("camera/image", image), options=ViewOptions(jpeg_quality=None))
     (buffer,) = at(found, "/camera/image", "Image:buffer")
     assert bytes(buffer.values[0]) == image.data.tobytes()
+
+
+@pytest.mark.parametrize("step", [0, 4 * PERIOD])
+def test_video_is_decoded_and_what_is_lost_is_not_shown(step: int, tmp_path: Path) -> None:
+    packets = [
+        CompressedVideo(stamp=k * PERIOD, frame="camera", format="h264", data=np.frombuffer(packet, np.uint8))
+        for k, packet in enumerate(clip("h264"))
+    ]
+    pixels = {m.stamp: frame for m, frame in zip(packets, decoded("h264", clip("h264")), strict=True)}
+    del packets[10]
+    sent = [("camera/video", packet) for packet in packets]
+    found = draw(tmp_path, *sent, options=ViewOptions(jpeg_quality=None, image_step=step))
+    shown = {row.stamp: bytes(row.values[0]) for row in at(found, "/camera/video", "Image:buffer")}
+    lost = [k * PERIOD for k in range(11, 16)]
+    assert list(shown) == [s for s in pixels if s // PERIOD not in range(10, 16) and (not step or s % step == 0)]
+    assert all(buffer == pixels[stamp].tobytes() for stamp, buffer in shown.items())
+    assert [row.stamp for row in at(found, "/camera/video", "Clear:is_recursive")] == lost
+    (notice,) = at(found, "/viewer/log", "TextLog:text")
+    assert "frame 3 follows frame 1" in notice.values[0]
 
 
 def test_depth_survives_to_the_millimetre_and_no_return_stays_none(tmp_path: Path) -> None:

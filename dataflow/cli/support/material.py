@@ -122,6 +122,6 @@ def print_unknown(operators: Collection[str]) -> None:
     if operators:
         say(
             f"[yellow]no recorded state at or before the cut:[/] {escape(', '.join(sorted(operators)))}: they begin "
-            "afresh, and are not verified before their next recorded state (`record: {snapshots: 10s}` records what "
-            "`snapshot()` gives; an operator without a state sets `stateless = True`)"
+            "afresh, and are not verified before their next recorded state (`record: {snapshots: 10s}` records an "
+            "operator's `state`; an operator without a state sets `stateless = True`)"
         )

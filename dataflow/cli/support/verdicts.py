@@ -253,7 +253,7 @@ def _left_out(v: Verification) -> Iterator[str]:
     if v.unknown:
         yield (
             f"{v.operator}: {plural(v.unknown, 'firing')} could not be repeated: the recording was cut there, and "
-            "holds no state of it at or before the cut (`record: {snapshots: 10s}` records what `snapshot()` gives; an "
+            "holds no state of it at or before the cut (`record: {snapshots: 10s}` records an operator's `state`; an "
             "operator without a state sets `stateless = True`)"
         )
     if v.unaccounted:

@@ -9,9 +9,10 @@ import numpy as np
 
 from dataflow.interop.ros.values import first, known, optional
 from dataflow.interop.seen import lose
-from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, Image16
-from dataflow.messages.images import PNG_SIGNATURE
+from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, CompressedVideo, DepthImage, Image, Image16
+from dataflow.messages.images import PNG_SIGNATURE, START_CODES
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.streams.foxglove.images import video_format
 from dataflow.recording.streams.pixels import as_depth, as_image, as_image16, is_16_bit, is_depth, stored_rows
 
 _DEPTH_HEADER = struct.Struct("<iff")
@@ -51,9 +52,12 @@ def image(message: Any, stamp: int) -> Image | Image16 | DepthImage:
     return Image(stamp=stamp, frame=frame, data=as_image(message.encoding, rows))
 
 
-def compressed_image(message: Any, stamp: int) -> CompressedImage | CompressedDepth:
-    """sensor_msgs/CompressedImage, those of compressed_depth_image_transport too."""
+def compressed_image(message: Any, stamp: int) -> CompressedImage | CompressedDepth | CompressedVideo:
+    """sensor_msgs/CompressedImage, those of compressed_depth_image_transport and packets of video too."""
     data = np.asarray(message.data, np.uint8)
+    if data[:4].tobytes().startswith(START_CODES):
+        format_ = video_format(message.format)
+        return CompressedVideo(stamp=stamp, frame=message.header.frame_id, format=format_, data=data)
     return compressed(message.format, data, message.header.frame_id, stamp)
 
 
@@ -73,6 +77,19 @@ def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedIma
         return CompressedDepth(stamp=stamp, frame=frame, scale=_DEPTH_UNIT, data=data)
     kind = "jpeg" if head.startswith(_JPEG) else "png" if head.startswith(PNG_SIGNATURE) else "webp"
     return CompressedImage(stamp=stamp, frame=frame, format=kind, data=data)
+
+
+def compressed_video(message: Any, stamp: int) -> CompressedVideo:
+    """foxglove_msgs/CompressedVideo: a picture in Annex B form."""
+    data = np.asarray(message.data, np.uint8)
+    return CompressedVideo(stamp=stamp, frame=message.frame_id, format=video_format(message.format), data=data)
+
+
+def ffmpeg_packet(message: Any, stamp: int) -> CompressedVideo:
+    """ffmpeg_image_transport_msgs/FFMPEGPacket; its size, time and flags stand in the packet itself."""
+    data = np.asarray(message.data, np.uint8)
+    _ = message.width, message.height, message.flags, message.is_bigendian
+    return CompressedVideo(stamp=stamp, frame=message.header.frame_id, format=video_format(message.encoding), data=data)
 
 
 def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> CompressedDepth:

@@ -31,6 +31,9 @@ _VISION = {
 }
 """vision_msgs 4, which the library does not have."""
 
+_VIDEO = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+"""foxglove_msgs/CompressedVideo, neither."""
+
 
 @cache
 def typestore() -> Typestore:
@@ -38,6 +41,7 @@ def typestore() -> Typestore:
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in _VISION.items():
         store.register(get_types_from_msg(text, name))
+    store.register(get_types_from_msg(_VIDEO, "foxglove_msgs/msg/CompressedVideo"))
     return store
 
 

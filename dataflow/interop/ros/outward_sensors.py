@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.interop.ros.made import Made, as_bytes, header_of, make, matrix, quaternion, vector
+from dataflow.interop.ros.made import Made, as_bytes, header_of, make, matrix, quaternion, time, vector
 from dataflow.messages import (
     CameraInfo,
     CompressedDepth,
     CompressedImage,
+    CompressedVideo,
     DepthImage,
     Image,
     Image16,
@@ -62,6 +63,16 @@ def compressed(m: CompressedImage | CompressedDepth) -> Made:
         data = np.concatenate([np.frombuffer(head, np.uint8), m.data])
     return "sensor_msgs/msg/CompressedImage", make(
         "sensor_msgs/CompressedImage", header=header_of(m.stamp, m.frame), format=format_, data=as_bytes(data)
+    )
+
+
+def compressed_video(m: CompressedVideo) -> Made:
+    return "foxglove_msgs/msg/CompressedVideo", make(
+        "foxglove_msgs/CompressedVideo",
+        timestamp=time(m.stamp),
+        frame_id=m.frame,
+        data=as_bytes(m.data),
+        format=m.format,
     )
 
 

@@ -16,9 +16,14 @@ from dataflow.recording.mcap.rawfile import RECORD, RawFile
 from dataflow.recording.mcap.seals import Seal, seal_of
 
 STEP = 4096
-"""Chunks whose messages are looked up together: what the messages of a long file take in memory meanwhile."""
+"""Chunks whose messages are looked up together, at most."""
+STEP_BYTES = 2**22
+"""Bytes of their message indexes, 16 a message, beyond which no further chunk is: so much of a long file is in memory
+meanwhile."""
 SAMPLED = 1024
-"""Chunks of a long file by which the sizes of its streams are estimated."""
+"""Chunks of a long file by which the sizes of its streams are estimated, at most."""
+SAMPLED_BYTES = 2**23
+"""Bytes of their message indexes, about."""
 
 _NONE = Entries(*(np.empty(0, np.int64) for _ in range(3)))
 
@@ -78,7 +83,7 @@ class LoadedIndex:
 
 
 class LongIndex:
-    """The messages of a file of very many chunks, whose message indexes are read as they are needed.
+    """The messages of a long file, whose message indexes are read as they are needed.
 
     `counts`: messages by channel, where the file's statistics count them. Damage found on reading is noted in `damage`.
     """
@@ -149,8 +154,17 @@ class LongIndex:
             numbers = np.concatenate([np.empty(0, np.int64), *found])
             found = iter([numbers[np.argsort(self._indexes.firsts[numbers], kind="stable")]])
         for numbers in found:
-            for at in range(0, len(numbers), STEP):
-                yield numbers[at : at + STEP]
+            yield from self._steps(numbers)
+
+    def _steps(self, numbers: Column) -> Iterator[Column]:
+        """Divides chunks into such as are looked up together."""
+        sizes = np.cumsum(self._indexes.index_lengths[numbers], dtype=np.int64)
+        at = 0
+        while at < len(numbers):
+            before = int(sizes[at - 1]) if at else 0
+            end = min(max(int(np.searchsorted(sizes, before + STEP_BYTES, "right")), at + 1), at + STEP)
+            yield numbers[at:end]
+            at = end
 
     @cached_property
     def _ordered(self) -> bool:
@@ -159,12 +173,15 @@ class LongIndex:
     def in_file_order(
         self, channels: Collection[int], start: int | None = None, end: int | None = None
     ) -> Iterator[Mapping[int, Entries]]:
-        for numbers in self._indexes.holding(list(channels), start, end):
-            for at in range(0, len(numbers), STEP):
-                yield self._load(numbers[at : at + STEP], channels)
+        for found in self._indexes.holding(list(channels), start, end):
+            for numbers in self._steps(found):
+                yield self._load(numbers, channels)
 
     def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
-        numbers = np.unique(np.linspace(0, len(self._indexes) - 1, SAMPLED).astype(np.int64))
+        lengths = self._indexes.index_lengths
+        fitting = SAMPLED_BYTES * len(lengths) // max(int(lengths.sum(dtype=np.int64)), 1)
+        count = min(SAMPLED, max(fitting, 1))
+        numbers = np.unique(np.linspace(0, len(self._indexes) - 1, count).astype(np.int64))
         return self._load(numbers, np.unique(self._indexes.channels).tolist()), numbers
 
     def _load(self, numbers: Column, channels: Collection[int]) -> dict[int, Entries]:

@@ -27,6 +27,9 @@ BLOCK_BYTES = 2**24
 """Of the summary, in memory at a time."""
 LONG = 2**14
 """Chunks of a file beyond which its message indexes are read as they are needed: all would take seconds."""
+LONG_BYTES = 2**24
+"""Bytes of its message indexes, 16 a message, beyond which they are so too: in memory all would take half as much
+again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +64,8 @@ def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Summary | No
     """Returns the summary; None where it does not suffice to find every message.
 
     Raises `DamagedError` where it fails its checksum or contradicts itself or the file. Chunks, message indexes and
-    metadata must not overlap, so that what is read is bounded by the size of the file. The message indexes of a file of
-    many chunks (`LONG`) are read and checked as they are needed, those of others at once.
+    metadata must not overlap, so that what is read is bounded by the size of the file. The message indexes of a long
+    file (`LONG`, `LONG_BYTES`) are read and checked as they are needed, those of others at once.
     """
     if not footer.summary_start:
         if footer.crc and zlib.crc32(footer.head) != footer.crc:
@@ -95,7 +98,8 @@ def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Summary | No
     ):
         return None
     contents.chunks.adopt(indexes.starts, indexes.lengths, indexes.sizes)
-    found = _long(contents, indexes, statistics, sealed) if len(indexes) > LONG else _loaded(contents, indexes, sealed)
+    long = len(indexes) > LONG or int(indexes.index_lengths.sum(dtype=np.int64)) > LONG_BYTES
+    found = _long(contents, indexes, statistics, sealed) if long else _loaded(contents, indexes, sealed)
     if found is None or contents.undeclared():
         return None
     _compare(contents, statistics, found)

@@ -14,6 +14,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import FORMAT, RECORDING, Kind
 from dataflow.recording.mcap.attachments import Attachment
 from dataflow.recording.mcap.index import McapFile, RawMessage
+from dataflow.recording.mcap.rawfile import Watch
 from dataflow.recording.streams.access import StreamIndex
 from dataflow.recording.streams.codecs import codec_for
 from dataflow.recording.streams.entries import Event, RawRecord, Recorded
@@ -41,10 +42,13 @@ class Recording:
     MCAP or is damaged.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, watch: Watch | None = None) -> None:
+        """`watch` is called before every read of the file: a sign of progress while a long one is opened or read."""
         self.path = Path(path)
         parts = parts_in(self.path) if self.path.is_dir() else []
-        self._file: McapFile | PartedFile = PartedFile(self.path, parts) if parts else McapFile(self.path)
+        self._file: McapFile | PartedFile = (
+            PartedFile(self.path, parts, watch=watch) if parts else McapFile(self.path, watch=watch)
+        )
         try:
             self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
             _check_format(self.path, self.metadata)
@@ -142,9 +146,12 @@ class Recording:
             yield record
             del record
 
-    def firings(self, operator: str | None = None, start: int | None = None) -> Iterator[tuple[str, bytes]]:
+    def firings(
+        self, operator: str | None = None, start: int | None = None, *, skip: int = 0
+    ) -> Iterator[tuple[str, bytes]]:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order: all of them,
-        or those with log times from `start` (ns) on, which are those of a batch's last record.
+        or those with log times from `start` (ns) on, which are those of a batch's last record, without the first
+        `skip`.
 
         One pass: they lie in separate chunks, without the messages of streams (in older recordings among them).
         """
@@ -153,7 +160,7 @@ class Recording:
             for c in self._channels_of(Kind.FIRINGS)
             if operator is None or c.metadata.get("operator", "") == operator
         }
-        for raw in self._in_file_order(list(channels), start):
+        for raw in self._in_file_order(list(channels), start, skip=skip):
             yield channels[raw.channel], bytes(raw.data)
 
     def firing_batches(self) -> Mapping[str, int]:
@@ -300,12 +307,15 @@ class Recording:
         return ((ordered[i], row) for i, row in merged(cursors))
 
     def _in_file_order(
-        self, channels: list[int], start: int | None = None, end: int | None = None
+        self, channels: list[int], start: int | None = None, end: int | None = None, *, skip: int = 0
     ) -> Iterator[RawMessage]:
         for part in self._file.index.in_file_order(channels, start, end):
             for place in in_file_order(list(part.items())):
                 if (start is None or place[3] >= start) and (end is None or place[3] <= end):
-                    yield self._file.read(*place)
+                    if skip:
+                        skip -= 1
+                    else:
+                        yield self._file.read(*place)
 
 
 def _merged(records: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, str]]:

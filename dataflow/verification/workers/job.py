@@ -9,32 +9,36 @@ from typing import Any
 from dataflow.execution.memory import MemoryGuard
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
+from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
-from dataflow.reexecution.engine import Feeding, Recomputation, plan_feeding
+from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.sync import Entry
 from dataflow.verification.compare import Comparer
 from dataflow.verification.stored import StoredCheck
 from dataflow.verification.workers.board import Board
-from dataflow.verification.workers.mail import records_of
 
 
 def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     """Re-executes the operators of one part. Runs in a worker.
 
     The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
-    `incomplete` (recorded streams to be made again), `records` and `batches` (see `letters.shared_records`), `begin`
-    (stamp, or None), `tolerance`, `slices` (by operator the stamps between which its calls are made), `until`
+    `incomplete` (recorded streams to be made again), `records` (see `FiringLog.to_wire`), `begin` (stamp, or None),
+    `tolerance`, `slices` (by operator the stamps between which its calls are made), `until`
     (operators: once each of them has differed, the rest is left), `guard` (watch over messages in every call).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
     stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: `operator` and `work` of
     those that are not repeated as a whole.
     """
     graph = Graph.from_json(request["graph"])
-    with Recording(request["path"]) as recording:
+    with Recording(request["path"], watch=board.goes_on) as recording:
         feeding = plan_feeding(recording, graph, request["operators"], incomplete=request["incomplete"])
         feeding = feeding.reading(request["checks"])
-        log = _records(request, graph, feeding)
-        comparer = Comparer(recording, graph, log, feeding.operators, request["tolerance"])
+        log = FiringLog.from_wire(request["records"], recording)
+
+        def repeated(operator: str) -> FiringRecord | None:
+            return work.runners[operator].record
+
+        comparer = Comparer(recording, graph, feeding.operators, request["tolerance"], repeated)
         checks = _checks(recording, graph, log, request)
 
         def read(stream: str, entry: Entry) -> None:
@@ -56,6 +60,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         until = [work.runners[name].result for name in request["until"]]
         results = work.run(until=lambda: bool(until) and all(result.first is not None for result in until))
         compared = comparer.close(results)
+        stored = [check.result().to_wire() for check in checks.values()]
     slices = request["slices"]
     counts = {
         name: [r.firings, r.ports.emitted, 0, r.work.cpu_ns, r.done, r.work.wall_ns] for name, r in work.runners.items()
@@ -64,7 +69,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         "operators": {name: result.to_wire() for name, result in results.items() if name not in slices},
         "slices": {name: {"operator": results[name].to_wire(), "work": counts[name]} for name in slices},
         "comparisons": {name: asdict(comparison) for name, comparison in compared.items() if name not in slices},
-        "stored": [check.result().to_wire() for check in checks.values()],
+        "stored": stored,
         "digests": {
             state.stream: [state.digest.count, state.digest.hexdigest()]
             for name, runner in work.runners.items()
@@ -77,23 +82,14 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     }
 
 
-def _records(request: Mapping[str, Any], graph: Graph, feeding: Feeding) -> FiringLog:
-    """The firing records of the operators, and of those that made what they take."""
-    taken = {s for name in feeding.operators for given in graph.nodes[name].inputs.values() for s in given}
-    makers = {graph.streams[stream].node for stream in taken.union(feeding.streams, feeding.besides)}
-    return records_of(request["records"], request["batches"], makers.union(feeding.operators), request["path"])
-
-
 def _checks(recording: Recording, graph: Graph, log: FiringLog, request: Mapping[str, Any]) -> dict[str, StoredCheck]:
-    streams = request["checks"]
-    digests = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in streams}], streams)
     return {
         stream: StoredCheck(
             stream,
             graph.streams[stream].node,
-            digests[stream],
+            log.emissions(graph.nodes[graph.streams[stream].node], stream),
             static=recording.streams[stream].static,
             whole=request["begin"] is None,
         )
-        for stream in streams
+        for stream in request["checks"]
     }

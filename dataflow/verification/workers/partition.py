@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from dataflow.graph.model import Graph
 from dataflow.records.reading import FiringLog
+from dataflow.verification.books import Books
 from dataflow.verification.workers import slices
 from dataflow.verification.workers.slices import Slice
 
@@ -31,6 +32,7 @@ class Job:
 def planned(
     graph: Graph,
     log: FiringLog,
+    books: Books,
     operators: Collection[str],
     *,
     held: Collection[str],
@@ -43,11 +45,11 @@ def planned(
     `held` are the streams that the recording can feed operators with; `divide` lets several workers make the calls of
     one operator.
     """
-    work = {name: sum(r.duration + PER_FIRING_NS for r in log.of(name)) for name in operators}
+    work = {n: books.of(n).duration + PER_FIRING_NS * books.of(n).records for n in operators}
     jobs = jobs or jobs_for(work, cores)
     whole = units(graph, held, operators)
     alone = {name: work[name] for name in whole if divide and jobs > 1 and not _takes_its_own(graph, held, name)}
-    divided = {name: (work[name], whole.pop(name)) for name in slices.divisible(graph, log, alone)}
+    divided = {name: (work[name], whole.pop(name)) for name in slices.divisible(graph, books, alone)}
     level = sum(work.values()) // jobs if divided else 0
     parts = [set(part) for part in balanced(list(whole.values()), work, jobs, level)]
     if divided:
@@ -59,7 +61,7 @@ def planned(
         {name: ns for name, (ns, _) in divided.items()},
     )
     for name, of in poured.items():
-        each = slices.cut(list(log.of(name)), [ns for _, ns in of], PER_FIRING_NS)
+        each = slices.cut(log.ordered(graph.nodes[name]), [ns for _, ns in of], PER_FIRING_NS)
         for (part, _), one in zip(of, each, strict=False):
             parts[part] |= divided[name][1]
             if len(each) > 1:

@@ -6,18 +6,17 @@ serve only to show that all is as recorded: an operator of which one shows anyth
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from functools import reduce
 from itertools import accumulate, pairwise
 from typing import Any
 
 from dataflow.graph.model import Graph
-from dataflow.messages.digest import StreamDigest
 from dataflow.records.comparison import Verification
-from dataflow.records.firing import CALLS, WITHHELD, FiringRecord
-from dataflow.records.reading import FiringLog, whole
+from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.supervision.core.report import OperatorCounts
+from dataflow.verification.books import Book, Books
 
 LEAST_NS = 300_000_000
 """Work (ns) that is worth a separate slice."""
@@ -34,18 +33,13 @@ class Slice:
     end: int | None
 
 
-def divisible(graph: Graph, log: FiringLog, work: Mapping[str, int]) -> list[str]:
+def divisible(graph: Graph, books: Books, work: Mapping[str, int]) -> list[str]:
     """Chooses those of the operators in `work` whose calls may be divided, heaviest first.
 
     They are without state, worth dividing, and nothing has happened to them but calls.
     """
     found = [name for name, ns in work.items() if ns >= 2 * LEAST_NS and graph.nodes[name].operator.stateless]
-    return sorted((name for name in found if _only_calls(log.of(name))), key=lambda name: (-work[name], name))
-
-
-def _only_calls(records: Sequence[FiringRecord]) -> bool:
-    kept, lost = whole(records)
-    return bool(kept) and not lost and kept[0].kind == "setup" and all(r.kind in CALLS for r in kept[1:])
+    return sorted((name for name in found if books.of(name).only_calls), key=lambda name: (-work[name], name))
 
 
 def shares(loads: Sequence[int], makers: Mapping[str, int], work: Mapping[str, int]) -> Mapping[str, list[Share]]:
@@ -72,52 +66,42 @@ def shares(loads: Sequence[int], makers: Mapping[str, int], work: Mapping[str, i
     return poured
 
 
-def cut(records: Sequence[FiringRecord], amounts: Sequence[int], per_call: int) -> list[Slice]:
-    """Cuts an operator's records into slices of about these amounts of its work (ns), in this order; fewer where one
-    would be without a call."""
-    calls = [record for record in whole(records)[0] if record.kind in CALLS]
+def cut(records: Iterable[FiringRecord], amounts: Sequence[int], per_call: int) -> list[Slice]:
+    """Cuts an operator's records, in the order of its calls, into slices of about these amounts of its work (ns), in
+    this order; fewer where one would be without a call."""
+    calls = (record for record in records if record.kind in CALLS)
     due = list(accumulate(amounts[:-1]))
     bounds: list[int] = []
-    done, latest = 0, calls[0].stamp
+    done, latest = 0, None
     for before, record in pairwise(calls):
+        if len(bounds) == len(due):
+            break
         done += before.duration + per_call
-        latest = max(latest, before.stamp)
-        if len(bounds) < len(due) and done >= due[len(bounds)] and record.stamp > latest:
+        latest = before.stamp if latest is None else max(latest, before.stamp)
+        if done >= due[len(bounds)] and record.stamp > latest:
             bounds.append(record.stamp)
     return [Slice(begin, end) for begin, end in pairwise([None, *bounds, None])]
 
 
-def together(found: Sequence[Mapping[str, Any]], records: Sequence[FiringRecord]) -> Mapping[str, Any] | None:
+def together(found: Sequence[Mapping[str, Any]], book: Book) -> Mapping[str, Any] | None:
     """Makes the verification (as on the wire) of an operator of those of its slices; None where they do not show that
     every call was repeated as recorded."""
     verifications = [Verification.from_wire(values) for values in found]
-    calls = sum(record.kind in CALLS for record in records)
     verified = sum(v.verified for v in verifications)
-    if any(v.verdict != "identical" or v.firings != v.verified for v in verifications) or verified != calls:
+    if any(v.verdict != "identical" or v.firings != v.verified for v in verifications) or verified != book.calls:
         return None
-    made = sum(emission is not None for record in records for emission in record.outputs)
-    return {**found[0], "firings": calls, "verified": calls, "outputs": made, "began": "start"}
+    return {**found[0], "firings": verified, "verified": verified, "outputs": book.outputs, "began": "start"}
 
 
-def digests(graph: Graph, name: str, records: Sequence[FiringRecord]) -> Mapping[str, list[Any]]:
-    """Computes, by stream, number and digest of the messages of an operator that makes what was recorded."""
-    found = {stream: StreamDigest() for stream in graph.nodes[name].outputs.values()}
-    for record in records:
-        for digest, emission in zip(found.values(), record.outputs, strict=False):  # a failed call has none
-            if emission is not None and emission.seq != WITHHELD:
-                digest.update(emission.digest)
-    return {stream: [digest.count, digest.hexdigest()] for stream, digest in found.items()}
-
-
-def answer(graph: Graph, log: FiringLog, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], set[str]]:
+def answer(books: Books, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], set[str]]:
     """Puts together what `answers` say of divided operators, as one answer more; names those to verify as a whole."""
     told: dict[str, Any] = {"operators": {}, "work": {}, "digests": {}, "comparisons": {}, "stored": []}
     told |= {"reading": 0, "wall": 0.0}
     left = set[str]()
     for name in {name for each in answers for name in each["slices"]}:
-        records = list(log.of(name))
+        book = books.of(name)
         of = [each["slices"][name] for each in answers if name in each["slices"]]
-        verification = together([each["operator"] for each in of], records)
+        verification = together([each["operator"] for each in of], book)
         if verification is None:
             left.add(name)
             continue
@@ -125,5 +109,5 @@ def answer(graph: Graph, log: FiringLog, answers: Sequence[Mapping[str, Any]]) -
         told["work"][name] = astuple(
             reduce(lambda base, one: one.after(base), (OperatorCounts(*e["work"]) for e in of))
         )
-        told["digests"] |= digests(graph, name, records)
+        told["digests"] |= {stream: [digest.count, digest.hexdigest()] for stream, digest in book.digests.items()}
     return told, left

@@ -6,7 +6,17 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, Image16, RelativeDepth
+from dataflow.messages import (
+    CameraInfo,
+    CompressedDepth,
+    CompressedImage,
+    CompressedVideo,
+    DepthImage,
+    Image,
+    Image16,
+    RelativeDepth,
+)
+from dataflow.video.decoder import PacketDecoder
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 
@@ -67,6 +77,22 @@ def compressed_image(canvas: Canvas, message: CompressedImage) -> None:
     canvas.draw(
         "", canvas.plane, rr.EncodedImage(contents=message.data.tobytes(), media_type=f"image/{message.format}")
     )
+
+
+@visualizer(CompressedVideo, "image")
+def compressed_video(canvas: Canvas, message: CompressedVideo) -> None:
+    """The decoded image, the first in each step of the options; nothing where packets are lost, until a key frame."""
+    decoder = canvas.scene.videos.get(canvas.stream)
+    if decoder is None or decoder.format != message.format:
+        decoder = canvas.scene.videos[canvas.stream] = PacketDecoder(message.format)
+    pixels = decoder.decode(message.data.tobytes())
+    if pixels is None:
+        canvas.notice(f"pictures are not shown until the next key frame: {decoder.lost}")
+        canvas.clear("")
+        return
+    step = canvas.scene.options.image_step
+    if step == 0 or canvas.scene.changed(canvas.entity, "step", message.stamp // step):
+        image(canvas, Image(stamp=message.stamp, frame=message.frame, data=pixels))
 
 
 @visualizer(DepthImage, "image")

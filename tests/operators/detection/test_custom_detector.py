@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from operators.detection.custom.anchors import fit_anchors, mean_best_iou, size_
 from operators.detection.custom.augmentation import view
 from operators.detection.custom.dataset import DataError, labelled
 from operators.detection.custom.decode import decode_grid, find_boxes
+from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.custom.folder import read_detection_data
 from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
@@ -27,11 +29,10 @@ from operators.detection.nms import intersection_over_union
 from operators.learning.augmentation import NONE, Variation, fitted, tensor_of, warp
 from operators.weights import NetworkFileError, open_network, open_second, shipped
 
-torch = pytest.importorskip("torch", reason="training needs the extra [train]")
-
-from operators.detection.custom.evaluation import ScoredImage, score_detections  # noqa: E402
-from operators.detection.custom.loss import Truth, assign, complete_iou, decode_maps, detection_loss  # noqa: E402
-from operators.detection.custom.network import STRIDES, GridDetector  # noqa: E402
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+    from operators.detection.custom.loss import Truth, assign, complete_iou, decode_maps, detection_loss
+    from operators.detection.custom.network import STRIDES, GridDetector
 
 COLORS = {"crate": (200, 60, 40), "ball": (40, 90, 210)}
 

@@ -6,6 +6,7 @@ import base64
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,26 +18,26 @@ from numpy.typing import NDArray
 from dataflow.messages import Image
 from operators.detection import CustomDetector
 from operators.detection.custom.closeup import closeups, moved, numbers, places, windows
+from operators.detection.custom.dataset import DetectionData, LabelledImage, labelled
 from operators.detection.custom.first_look import FirstLook, Looked
 from operators.detection.custom.refiner import Look, Refiner, look_again
 from operators.detection.custom.surroundings import GRID, surroundings
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
 from operators.image.letterbox import Fit
+from operators.learning.augmentation import Variation
+from operators.training.options import ImageTraining
+from operators.training.refining import add_second
 from operators.weights import NetworkFileError, open_network
 
-torch = pytest.importorskip("torch", reason="training needs the extra [train]")
-
-from operators.detection.custom.dataset import DetectionData, LabelledImage, labelled  # noqa: E402
-from operators.detection.custom.network import STRIDES, GridDetector  # noqa: E402
-from operators.detection.custom.refiner_training import RefinerTask, astray, matched  # noqa: E402
-from operators.learning.augmentation import Variation  # noqa: E402
-from operators.learning.export import attach_second, export_network, without_second  # noqa: E402
-from operators.learning.files import TrainingFileError, load_safely  # noqa: E402
-from operators.learning.loop import Settings, train  # noqa: E402
-from operators.training.options import ImageTraining  # noqa: E402
-from operators.training.quantization import quantize_network  # noqa: E402
-from operators.training.refining import add_second  # noqa: E402
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+    from operators.detection.custom.network import STRIDES, GridDetector
+    from operators.detection.custom.refiner_training import RefinerTask, astray, matched
+    from operators.learning.export import attach_second, export_network, without_second
+    from operators.learning.files import TrainingFileError, load_safely
+    from operators.learning.loop import Settings, train
+    from operators.training.quantization import quantize_network
 
 CLASSES = ("crate", "ball")
 GENTLE = Variation(flip=0.5, color=0.1, noise=3, blur=0)

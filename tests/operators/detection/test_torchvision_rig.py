@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -20,8 +20,9 @@ from dataflow.testing import play
 from operators.detection import TorchvisionDetector, TorchvisionRigDetector
 from operators.segmentation import TorchvisionRigSegmenter, TorchvisionSegmenter
 
-torch = pytest.importorskip("torch", reason="needs the extra [torch]")
-models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="needs the extra [torch]")
+    models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
 
 SSD, RCNN, LRASPP = (
     "ssdlite320_mobilenet_v3_large",

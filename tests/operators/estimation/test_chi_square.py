@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
 from operators.estimation.chi_square import quantile
 
 
 def test_quantiles_are_those_of_scipy_bit_by_bit() -> None:
+    from scipy.stats import chi2  # takes a second
+
     rng = np.random.default_rng(0)
     share, freedom = rng.uniform(size=5000), rng.integers(1, 5000, 5000)
 

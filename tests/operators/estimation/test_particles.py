@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
 import pytest
-from filterpy.monte_carlo import systematic_resample
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.stats import chi2
 
 from operators.estimation.particles import (
     bins_of,
@@ -23,6 +22,9 @@ from operators.estimation.particles import (
     systematic,
     wrapped,
 )
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    from filterpy.monte_carlo import systematic_resample
 
 WEIGHTS = arrays(np.float64, st.integers(1, 40), elements=st.floats(0.001, 1.0)).map(lambda w: w / w.sum())
 
@@ -49,6 +51,8 @@ def test_effective_size_lies_between_one_and_all(weights: np.ndarray) -> None:
 
 
 def test_number_of_particles_is_that_of_the_chi_square_bound() -> None:
+    from scipy.stats import chi2  # takes a second
+
     for bins in (5, 50, 500):
         assert particles_needed(bins, 0.05) == pytest.approx(chi2.ppf(0.99, bins - 1) / 0.1, rel=0.01)
 

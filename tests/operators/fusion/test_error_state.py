@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from made_motion import GRAVITY, Motion
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from operators.fusion.error_state import (
     POSITION,
@@ -177,6 +176,8 @@ def _nees(error: Array, covariance: Array, block: slice) -> float:
 
 
 def test_errors_are_as_large_as_the_covariance_says() -> None:
+    from scipy.stats import chi2  # takes a second
+
     checks = [1.5, 3.0, 4.48, 5.4]
     found = np.array([run(seed, checks, outage=(3.5, 4.5))[0] for seed in range(50)])  # runs, times, blocks
     low, high = chi2.ppf([0.025 / 8, 1 - 0.025 / 8], 3 * 50) / 50  # 95 % for all eight figures together

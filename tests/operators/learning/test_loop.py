@@ -5,18 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+    from torch import Tensor, nn
 
-from torch import Tensor, nn  # noqa: E402
-
-from operators.learning.backbone import MobileNetV2, load_backbone, start_from  # noqa: E402
-from operators.learning.files import TrainingFileError, load_safely, save_atomically  # noqa: E402
-from operators.learning.loop import Settings, Silent, batches, schedule, train  # noqa: E402
+    from operators.learning.backbone import MobileNetV2, load_backbone, start_from
+    from operators.learning.files import TrainingFileError, load_safely, save_atomically
+    from operators.learning.loop import Settings, Silent, batches, schedule, train
 
 
 class Line:
@@ -64,17 +64,22 @@ class Stop(Exception):
     """A crash at a chosen moment."""
 
 
-class Crash(Silent):
-    def __init__(self, epoch: int, step: int) -> None:
-        self.left, self.at = step, epoch
+def crash(at: int, steps: int) -> Silent:
+    """Returns a progress that stops the training in a step of an epoch."""
 
-    def step(self, epoch: int, losses: Mapping[str, float]) -> None:
-        self.left -= epoch == self.at
-        if epoch == self.at and self.left <= 0:
-            raise Stop
+    class Crash(Silent):
+        left = steps
+
+        def step(self, epoch: int, losses: Mapping[str, float]) -> None:
+            self.left -= epoch == at
+            if epoch == at and self.left <= 0:
+                raise Stop
+
+    return Crash()
 
 
-SETTINGS = Settings(epochs=6, batch=6, learning_rate=0.02, threads=1, device="cpu")
+def settings(**changes: Any) -> Settings:
+    return Settings(**{"epochs": 6, "batch": 6, "learning_rate": 0.02, "threads": 1, "device": "cpu"} | changes)
 
 
 def weights(file: Path) -> dict[str, Tensor]:
@@ -84,10 +89,10 @@ def weights(file: Path) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize(("epoch", "step"), [(1, 1), (3, 3), (5, 2)])
 def test_a_run_that_was_interrupted_ends_with_the_same_bits(tmp_path: Path, epoch: int, step: int) -> None:
-    train(Line(), SETTINGS, tmp_path / "whole.onnx")
+    train(Line(), settings(), tmp_path / "whole.onnx")
     with pytest.raises(Stop):
-        train(Line(), SETTINGS, tmp_path / "halved.onnx", progress=Crash(epoch, step))
-    outcome = train(Line(), SETTINGS, tmp_path / "halved.onnx", resume=True)
+        train(Line(), settings(), tmp_path / "halved.onnx", progress=crash(epoch, step))
+    outcome = train(Line(), settings(), tmp_path / "halved.onnx", resume=True)
     whole, halved = weights(tmp_path / "whole.pt"), weights(tmp_path / "halved.pt")
     assert all(torch.equal(whole[name], halved[name]) for name in whole)
     assert (tmp_path / "whole.onnx").read_text() == (tmp_path / "halved.onnx").read_text()
@@ -96,8 +101,8 @@ def test_a_run_that_was_interrupted_ends_with_the_same_bits(tmp_path: Path, epoc
 
 def test_what_is_trained_on_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     one, many = Line(), Line()
-    train(one, SETTINGS, tmp_path / "one.onnx")
-    train(many, Settings(**{**vars(SETTINGS), "workers": 4}), tmp_path / "many.onnx")
+    train(one, settings(), tmp_path / "one.onnx")
+    train(many, settings(workers=4), tmp_path / "many.onnx")
     assert sorted(one.seen) == sorted(many.seen)
     a, b = weights(tmp_path / "one.pt"), weights(tmp_path / "many.pt")
     assert all(torch.equal(a[name], b[name]) for name in a)
@@ -116,23 +121,23 @@ def test_a_single_sample_left_over_joins_the_batch_before(tmp_path: Path) -> Non
         samples = 19
 
     task = Odd()
-    train(task, SETTINGS, tmp_path / "odd.onnx")
-    assert sorted(s for s, _ in task.seen) == sorted([*range(19)] * SETTINGS.epochs)
+    train(task, settings(), tmp_path / "odd.onnx")
+    assert sorted(s for s, _ in task.seen) == sorted([*range(19)] * settings().epochs)
     with pytest.raises(ValueError, match=r"at least 2 images a step \(now 1\)"):
-        train(Odd(), Settings(**{**vars(SETTINGS), "batch": 1}), tmp_path / "ones.onnx")
+        train(Odd(), settings(batch=1), tmp_path / "ones.onnx")
 
 
 def test_the_seed_decides_the_order(tmp_path: Path) -> None:
     orders = []
     for seed in (0, 0, 1):
         task = Line()
-        train(task, Settings(**{**vars(SETTINGS), "seed": seed, "workers": 1}), tmp_path / f"{len(orders)}.onnx")
+        train(task, settings(seed=seed, workers=1), tmp_path / f"{len(orders)}.onnx")
         orders.append(task.seen)
     assert orders[0] == orders[1] != orders[2]
 
 
 def test_the_file_is_that_of_the_best_epoch(tmp_path: Path) -> None:
-    outcome = train(Line(), SETTINGS, tmp_path / "line.onnx")
+    outcome = train(Line(), settings(), tmp_path / "line.onnx")
     best = max(outcome.history, key=lambda row: row["score"])
     assert outcome.best_epoch == best["epoch"]
     assert (tmp_path / "line.onnx").read_text() == f"{outcome.best_epoch} {best['score']}"
@@ -140,13 +145,13 @@ def test_the_file_is_that_of_the_best_epoch(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_of_another_training_is_refused_with_the_difference(tmp_path: Path) -> None:
-    train(Line(), SETTINGS, tmp_path / "line.onnx")
+    train(Line(), settings(), tmp_path / "line.onnx")
     with pytest.raises(TrainingFileError, match=r"line\.pt cannot be resumed: its classes is 'a', this run's is 'b'"):
-        train(Line("b"), SETTINGS, tmp_path / "line.onnx", resume=True)
+        train(Line("b"), settings(), tmp_path / "line.onnx", resume=True)
     with pytest.raises(TrainingFileError, match=r"epochs was 6 and is 7; to train longer, .*--from .*line\.pt"):
-        train(Line(), Settings(**{**vars(SETTINGS), "epochs": 7}), tmp_path / "line.onnx", resume=True)
+        train(Line(), settings(epochs=7), tmp_path / "line.onnx", resume=True)
     with pytest.raises(FileNotFoundError, match=r"none\.pt"):
-        train(Line(), SETTINGS, tmp_path / "none.onnx", resume=True)
+        train(Line(), settings(), tmp_path / "none.onnx", resume=True)
 
 
 def test_a_loss_that_is_not_a_number_ends_training_and_keeps_the_checkpoint(tmp_path: Path) -> None:
@@ -156,7 +161,7 @@ def test_a_loss_that_is_not_a_number_ends_training_and_keeps_the_checkpoint(tmp_
             return {"squares": parts["squares"] * (float("nan") if len(self.seen) > 45 else 1)}
 
     with pytest.raises(FloatingPointError, match=r"epoch 3.*lower the learning rate"):
-        train(Diverging(), Settings(**{**vars(SETTINGS), "workers": 1, "batch": 20}), tmp_path / "line.onnx")
+        train(Diverging(), settings(workers=1, batch=20), tmp_path / "line.onnx")
     assert all(torch.isfinite(value).all() for value in weights(tmp_path / "line.pt").values())
 
 

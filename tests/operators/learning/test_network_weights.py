@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+from operators.detection.custom.folder import read_detection_data
+from operators.learning.augmentation import fitted, tensor_of, warp
+from operators.segmentation.dataset import read_segmentation_data
+from operators.simulator.classes import CLASSES, THINGS
+from operators.weights import open_network, read_facts, shipped, trained_in_simulation
 
-from torch import nn  # noqa: E402
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+    from torch import nn
 
-from operators.detection.custom.folder import read_detection_data  # noqa: E402
-from operators.detection.custom.network import FINE_STRIDES, GridHead  # noqa: E402
-from operators.detection.custom.training import DetectorTask  # noqa: E402
-from operators.learning.augmentation import fitted, tensor_of, warp  # noqa: E402
-from operators.learning.backbone import SmallResNet  # noqa: E402
-from operators.learning.files import TrainingFileError  # noqa: E402
-from operators.learning.loop import Settings, train  # noqa: E402
-from operators.learning.network_weights import begin_with, sample_images  # noqa: E402
-from operators.segmentation.dataset import read_segmentation_data  # noqa: E402
-from operators.segmentation.network import ClassDecoder  # noqa: E402
-from operators.segmentation.training import SegmenterTask  # noqa: E402
-from operators.simulator.classes import CLASSES, THINGS  # noqa: E402
-from operators.training.pair import PairTask  # noqa: E402
-from operators.weights import open_network, read_facts, shipped, trained_in_simulation  # noqa: E402
+    from operators.detection.custom.network import FINE_STRIDES, GridHead
+    from operators.detection.custom.training import DetectorTask
+    from operators.learning.backbone import SmallResNet
+    from operators.learning.files import TrainingFileError
+    from operators.learning.loop import Settings, train
+    from operators.learning.network_weights import begin_with, sample_images
+    from operators.segmentation.network import ClassDecoder
+    from operators.segmentation.training import SegmenterTask
+    from operators.training.pair import PairTask
 
 SIZE = (160, 128)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,23 +15,23 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Image
 from operators.image.letterbox import Fit
+from operators.learning.augmentation import Variation
 from operators.segmentation import Segmenter
 from operators.segmentation.borders import BLOCK, Blocks, best_cells, found_blocks, look_again, worked
+from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
+from operators.training.options import ImageTraining
+from operators.training.refining import add_second
 from operators.weights import NetworkFileError, open_network
 
-torch = pytest.importorskip("torch", reason="training needs the extra [train]")
-
-from operators.learning.augmentation import Variation  # noqa: E402
-from operators.learning.export import attach_second, export_network, without_second  # noqa: E402
-from operators.learning.files import TrainingFileError  # noqa: E402
-from operators.learning.loop import Settings, train  # noqa: E402
-from operators.segmentation.border_training import BorderTask  # noqa: E402
-from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData  # noqa: E402
-from operators.segmentation.network import DeployedSegmenter, ScoringSegmenter, SegmentationNetwork  # noqa: E402
-from operators.segmentation.training import SegmenterTask  # noqa: E402
-from operators.training.options import ImageTraining  # noqa: E402
-from operators.training.quantization import quantize_network  # noqa: E402
-from operators.training.refining import add_second  # noqa: E402
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+    from operators.learning.export import attach_second, export_network, without_second
+    from operators.learning.files import TrainingFileError
+    from operators.learning.loop import Settings, train
+    from operators.segmentation.border_training import BorderTask
+    from operators.segmentation.network import DeployedSegmenter, ScoringSegmenter, SegmentationNetwork
+    from operators.segmentation.training import SegmenterTask
+    from operators.training.quantization import quantize_network
 
 CLASSES = ("wall", "floor", "ball")
 COLORS = np.array([[170, 160, 150], [90, 70, 50], [40, 90, 210]], np.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,17 +16,17 @@ from operators.detection.custom.dataset import DataError
 from operators.inference import ModelError
 from operators.learning.augmentation import Variation
 from operators.segmentation import Segmenter
+from operators.segmentation.assessment import assess
 from operators.segmentation.dataset import VOID, read_segmentation_data
 from operators.segmentation.score import class_iou, confusion, mean_iou
 from operators.weights import NetworkFileError
 
-torch = pytest.importorskip("torch", reason="training needs the extra [train]")
-
-from operators.learning.export import export_network  # noqa: E402
-from operators.learning.loop import Settings, train  # noqa: E402
-from operators.segmentation.assessment import assess  # noqa: E402
-from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork, enlarged  # noqa: E402
-from operators.segmentation.training import SegmenterTask, class_weights, dice_loss  # noqa: E402
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+    from operators.learning.export import export_network
+    from operators.learning.loop import Settings, train
+    from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork, enlarged
+    from operators.segmentation.training import SegmenterTask, class_weights, dice_loss
 
 
 def scene(seed: int) -> tuple[np.ndarray, np.ndarray]:

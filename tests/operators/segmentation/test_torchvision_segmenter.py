@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from dataflow.messages import Image, SegmentationMap
 from dataflow.testing import play
 from operators.segmentation import TorchvisionSegmenter
 
-torch = pytest.importorskip("torch", reason="needs the extra [torch]")
-models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="needs the extra [torch]")
+    models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
 
 NAME = "lraspp_mobilenet_v3_large"
 CLASSES = ("__background__", "floor", "wall")

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+from operators.detection import CustomDetector
+from operators.detection.custom.dataset import DataError
+from operators.detection.custom.folder import read_detection_data
+from operators.learning.augmentation import Variation
+from operators.segmentation import Segmenter
+from operators.segmentation.dataset import VOID, read_segmentation_data
+from operators.simulator.classes import CLASSES
+from operators.training import simulated_worlds
 
-from operators.detection import CustomDetector  # noqa: E402
-from operators.detection.custom.dataset import DataError  # noqa: E402
-from operators.detection.custom.folder import read_detection_data  # noqa: E402
-from operators.learning.augmentation import Variation  # noqa: E402
-from operators.learning.backbone import SmallResNet  # noqa: E402
-from operators.learning.loop import Settings, train  # noqa: E402
-from operators.segmentation import Segmenter  # noqa: E402
-from operators.segmentation.dataset import VOID, read_segmentation_data  # noqa: E402
-from operators.simulator.classes import CLASSES  # noqa: E402
-from operators.training import simulated_worlds  # noqa: E402
-from operators.training.pair import PairTask  # noqa: E402
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+    from operators.learning.backbone import SmallResNet
+    from operators.learning.loop import Settings, train
+    from operators.training.pair import PairTask
 
 SIZE = (160, 128)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -19,16 +20,15 @@ from operators.recognition.sensed_people import SensedTrack, write_tracks
 from operators.recognition.silhouette import MIDDLE, SIDE
 from operators.simulator.classes import ACTIVITIES
 from operators.training import simulated_postures
+from operators.training.commands import train
 from operators.training.made_worlds import worlds
 from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, write_episodes
-from operators.weights import NetworkFileError
+from operators.weights import NetworkFileError, trained_in_simulation
 
-pytest.importorskip("torch", reason="training needs the extra [train]")
-
-from operators.learning.balance import class_weights
-from operators.recognition.posture_training import PostureTask, mirrored
-from operators.training.commands import train
-from operators.weights import trained_in_simulation
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    pytest.importorskip("torch", reason="training needs the extra [train]")
+    from operators.learning.balance import class_weights
+    from operators.recognition.posture_training import PostureTask, mirrored
 
 
 def made(seed: int) -> Episode:

@@ -5,26 +5,28 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-torch = pytest.importorskip("torch", reason="training needs the extra [train]")
-pytest.importorskip("torchvision", reason="needs the extra [torch]")
+from dataflow.messages import Image
+from operators.detection import TorchvisionDetector
+from operators.detection.custom.folder import read_detection_data
+from operators.learning.augmentation import NONE
+from operators.segmentation import TorchvisionSegmenter
+from operators.torch_models import family_of, new_model
+from operators.training.commands import train
 
-from dataflow.messages import Image  # noqa: E402
-from operators.detection import TorchvisionDetector  # noqa: E402
-from operators.detection.custom.folder import read_detection_data  # noqa: E402
-from operators.learning.augmentation import NONE  # noqa: E402
-from operators.learning.files import TrainingFileError, load_safely  # noqa: E402
-from operators.learning.loop import Settings, Silent  # noqa: E402
-from operators.learning.loop import train as loop  # noqa: E402
-from operators.segmentation import TorchvisionSegmenter  # noqa: E402
-from operators.torch_models import family_of, new_model  # noqa: E402
-from operators.training.commands import train  # noqa: E402
-from operators.training.torchvision_tasks import TorchvisionDetectorTask, weights_in  # noqa: E402
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch", reason="training needs the extra [train]")
+    pytest.importorskip("torchvision", reason="needs the extra [torch]")
+    from operators.learning.files import TrainingFileError, load_safely
+    from operators.learning.loop import Settings, Silent
+    from operators.learning.loop import train as loop
+    from operators.training.torchvision_tasks import TorchvisionDetectorTask, weights_in
 
 DETECTOR, SEGMENTER = "ssdlite320_mobilenet_v3_large", "lraspp_mobilenet_v3_large"
 NAMES = ("block", "disc")

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-pytest.importorskip("torch", reason="training needs the extra [train]")
-
 from dataflow.cli.main import app
 from operators.detection.custom.folder import read_detection_data
-from operators.learning.files import TrainingFileError
-from operators.learning.loop import Settings, train
 from operators.segmentation.dataset import read_segmentation_data
-from operators.training.pair import PairTask
-from operators.training.quantization import quantize_network
-from operators.training.trunk import share_trunk
 from operators.weights import Network, open_network, read_facts
+
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    pytest.importorskip("torch", reason="training needs the extra [train]")
+    from operators.learning.files import TrainingFileError
+    from operators.learning.loop import Settings, train
+    from operators.training.pair import PairTask
+    from operators.training.quantization import quantize_network
+    from operators.training.trunk import share_trunk
 
 SIZE = (160, 128)
 

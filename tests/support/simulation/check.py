@@ -13,7 +13,7 @@ import functools
 import importlib
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from dataflow.graph import Graph
 from dataflow.graph.load import load_bundle
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.parts import Storage
+from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.core.report import RunReport
@@ -201,11 +202,20 @@ Place = tuple[str, int, int]
 """Stream, incarnation and number of a message."""
 
 
+Records = Mapping[str, Sequence[FiringRecord]]
+
+
+def _records(path: Path, graph: Graph) -> Records:
+    """The firing records of a recording, by operator."""
+    with Recording(path) as recording:
+        log = FiringLog.read(recording)
+        return {name: log.of(name) for name in graph.nodes}
+
+
 def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) -> int:
     """Every message that was made is taken by each trigger it reaches, or dropped or missed and counted."""
     counted = 0
-    with Recording(path) as recording:
-        log = FiringLog.read(recording)
+    records = _records(path, graph)
     for name, node in graph.nodes.items():
         if node.source or report.restarts.get(name):
             continue
@@ -213,7 +223,7 @@ def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) ->
         taken: set[Place] = set()
         drops: Counter[str] = Counter()
         unlisted = 0
-        for record in log.of(name):
+        for record in records[name]:
             for value in record.inputs.values():
                 taken |= {(m.stream, m.incarnation, m.seq) for m in messages_of(value)}
             for drop in record.drops:
@@ -222,11 +232,11 @@ def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) ->
             unlisted += sum(number for _, _, number in record.detail.get("unlisted_drops", ()))
         counted += drops.total() + unlisted
         missed = sum(n for _, why, n in report.drops.get(name, ()) if why in ("missed", "reset"))
-        last = max((record.stamp for record in log.of(name) if record.kind in ("fire", "tick")), default=None)
-        over = any(record.kind == "finish" for record in log.of(name))
+        last = max((record.stamp for record in records[name] if record.kind in ("fire", "tick")), default=None)
+        over = any(record.kind == "finish" for record in records[name])
         for input_name in triggers:
             for stream in node.inputs.get(input_name, ()):
-                made = _made(graph, log, stream, report)
+                made = _made(graph, records, stream, report)
                 if over and node.spec.inputs[input_name].kind == "batch":  # what comes after its end is for nothing
                     made = {p: stamp for p, stamp in made.items() if not live and last is not None and stamp <= last}
                 lost = made.keys() - taken
@@ -238,14 +248,14 @@ def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) ->
     return counted
 
 
-def _made(graph: Graph, log: FiringLog, stream: str, report: RunReport) -> dict[Place, int]:
+def _made(graph: Graph, records: Records, stream: str, report: RunReport) -> dict[Place, int]:
     """The messages of a stream with their stamps, by its maker's records; none of a static stream, or of a maker that
     was restarted."""
     made = graph.streams[stream]
     if made.static or report.restarts.get(made.node):
         return {}
     port = list(graph.nodes[made.node].outputs.values()).index(stream)
-    outputs = ((r.incarnation, r.outputs[port]) for r in log.of(made.node) if port < len(r.outputs))
+    outputs = ((r.incarnation, r.outputs[port]) for r in records[made.node] if port < len(r.outputs))
     return {(stream, life, m.seq): m.stamp for life, m in outputs if m is not None and m.seq >= 0}
 
 
@@ -259,19 +269,18 @@ def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunRepor
         if graph.name in NO_LOOK_AHEAD:
             raise Violation(f"the window of graph {graph.name!r} had to grow, which looks no stamp ahead")
         return
-    with Recording(path) as recording:
-        log = FiringLog.read(recording)
+    records = _records(path, graph)
     worked = [
         (record.stamp, record.wall_start + record.duration)
         for name, node in graph.nodes.items()
-        for record in log.of(name)
+        for record in records[name]
         if not node.source and record.kind in ("fire", "tick")
     ]
     for label, nodes in graph.processes(scenario.placement).items():
         given = sorted(
             (record.wall_start, record.stamp, sum(1 for made in record.outputs if made is not None))
             for name in nodes
-            for record in log.of(name)
+            for record in records[name]
             if graph.nodes[name].source and record.kind == "fire"
         )
         for now, stamp, _ in given:

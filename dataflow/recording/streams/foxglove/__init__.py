@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage as CompressedImageProto
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo as CompressedVideoProto
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan as LaserScanProto
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
@@ -22,6 +23,7 @@ from dataflow.messages import (
     Alarm,
     CameraInfo,
     CompressedImage,
+    CompressedVideo,
     DepthImage,
     Image,
     Image16,
@@ -47,6 +49,7 @@ FOXGLOVE_SCHEMAS: dict[type[Message], FoxgloveSchema] = {
         FoxgloveSchema(Image16, RawImage, images.encode_image16, images.decode_image16),
         FoxgloveSchema(DepthImage, RawImage, images.encode_depth, images.decode_depth),
         FoxgloveSchema(CompressedImage, CompressedImageProto, images.encode_compressed, images.decode_compressed),
+        FoxgloveSchema(CompressedVideo, CompressedVideoProto, images.encode_video, images.decode_video),
         FoxgloveSchema(
             CameraInfo,
             CameraCalibration,

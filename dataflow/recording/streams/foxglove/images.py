@@ -8,9 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage as CompressedImageProto
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo as CompressedVideoProto
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from dataflow.messages import CameraInfo, CompressedImage, DepthImage, Image, Image16
+from dataflow.messages import CameraInfo, CompressedImage, CompressedVideo, DepthImage, Image, Image16
+from dataflow.messages.images import VIDEO_FORMATS
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.foxglove.values import Fields, Parts, frozen, matrix, timestamp_of, with_field
 from dataflow.recording.streams.pixels import as_depth, as_image, as_image16, as_millimetres, stored_rows
@@ -103,6 +105,34 @@ def decode_compressed(proto: CompressedImageProto) -> Fields:
     data = np.frombuffer(proto.data, np.uint8)
     named = proto.format.lower().removeprefix("image/")
     return {"frame": proto.frame_id, "format": "jpeg" if named == "jpg" else named, "data": data}
+
+
+def encode_video(message: CompressedVideo) -> tuple[Parts, tuple[str, ...]]:
+    proto = CompressedVideoProto(timestamp=timestamp_of(message.stamp), frame_id=message.frame, format=message.format)
+    return with_field(proto, "data", message.data), ()
+
+
+def decode_video(proto: CompressedVideoProto) -> Fields:
+    return {
+        "frame": proto.frame_id,
+        "format": video_format(proto.format),
+        "data": np.frombuffer(proto.data, np.uint8),
+    }
+
+
+def video_format(named: str) -> str:
+    """The format of a video by another program's name of it or of its encoder; raises `RecordingError`."""
+    name = named.lower().partition(";")[0].strip()
+    found = next((format_ for format_, part in _VIDEO_NAMES if part in name), None)
+    if found is None:
+        raise RecordingError(
+            f"video of format {named!r} is not read: those known are {' and '.join(VIDEO_FORMATS)}. OpenCV's wheels "
+            "decode neither AV1 nor other formats packet by packet; encode it anew as one of these"
+        )
+    return found
+
+
+_VIDEO_NAMES = (("h264", "264"), ("h264", "avc"), ("h265", "265"), ("h265", "hevc"))
 
 
 def encode_camera(message: CameraInfo) -> tuple[Parts, tuple[str, ...]]:

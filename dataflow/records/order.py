@@ -1,0 +1,151 @@
+"""The order of an operator's calls, where its firing records lie in a file otherwise.
+
+They mostly lie in that order. When a process dies, records that it had not sent are stored after those of others, and
+some of them a second time. The file is then a few *runs*, each in order, which are merged.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dataflow.records.cuts import held_by
+from dataflow.records.firing import FiringRecord
+
+Place = tuple[int, int]
+"""(incarnation, number) of a message in its stream, or (incarnation, index) of a record."""
+Read = Callable[[int, int | None], Iterator[FiringRecord]]
+"""Reads the records of the batches from one number to before another."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """The batches `begin` to `end` - 1 of an operator, whose records are in order; `first` is the place of the first of
+    them."""
+
+    begin: int
+    end: int
+    first: Place
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """The layout of an operator's records in a file. `scattered`: streams whose messages do not increase in number from
+    record to record, or of which records contradict each other."""
+
+    runs: tuple[Run, ...] = ()
+    scattered: frozenset[str] = frozenset()
+
+    def to_wire(self) -> dict[str, Any]:
+        return {"runs": [(r.begin, r.end, *r.first) for r in self.runs], "scattered": sorted(self.scattered)}
+
+    @staticmethod
+    def from_wire(values: Mapping[str, Any]) -> Outline:
+        runs = tuple(Run(begin, end, (incarnation, index)) for begin, end, incarnation, index in values["runs"])
+        return Outline(runs, frozenset(values["scattered"]))
+
+
+class Outliner:
+    """Finds the outline of the records of one operator with the streams `outputs`, in declared order."""
+
+    def __init__(self, outputs: Sequence[str]) -> None:
+        self._outputs = outputs
+        self._runs: list[Run] = []
+        self._last: Place = (-1, -1)
+        self._first: Place = (-1, -1)
+        self._begin = self._end = 0
+        self._newest: dict[str, Place] = dict.fromkeys(outputs, (-1, -1))
+        self._scattered: set[str] = set()
+
+    @property
+    def in_order(self) -> bool:
+        """Returns whether all records so far are in order, until `done`."""
+        return not self._runs
+
+    def take(self, number: int, record: FiringRecord) -> None:
+        """Takes the next record of the file, which is in batch `number`."""
+        place = (record.incarnation, record.index)
+        if place <= self._last:
+            self._runs.append(Run(self._begin, number, self._first))
+            self._begin, self._first = number, place
+        elif self._last == (-1, -1):
+            self._begin, self._first = number, place
+        self._last, self._end = place, number + 1
+        self._rise(record)
+
+    def _rise(self, record: FiringRecord) -> None:
+        newest = self._newest
+        if record.kind == "cut":
+            sent = [(stream, at) for stream, at, _ in emitted(record, self._outputs)]
+        else:
+            life = record.incarnation
+            made = zip(self._outputs, record.outputs)  # noqa: B905 - a failed call has none
+            sent = [(stream, (life, e.seq)) for stream, e in made if e is not None and e.seq >= 0]
+        for stream, at in sent:
+            if at <= newest[stream]:
+                self._scattered.add(stream)
+            newest[stream] = at
+
+    def done(self, read: Read) -> Outline:
+        """Returns the outline. `read` is needed where there are several runs."""
+        if self._end:
+            self._runs.append(Run(self._begin, self._end, self._first))
+        if len(self._runs) > 1:
+            self._newest = dict.fromkeys(self._outputs, (-1, -1))
+            self._scattered = set()
+            before: FiringRecord | None = None
+            for record in merged(self._runs, read):
+                if before is not None and (record.incarnation, record.index) == (before.incarnation, before.index):
+                    if (record.outputs, record.detail) != (before.outputs, before.detail):
+                        self._scattered.update(self._outputs)
+                    continue
+                before = record
+                self._rise(record)
+        return Outline(tuple(self._runs), frozenset(self._scattered))
+
+
+def emitted(record: FiringRecord, outputs: Sequence[str]) -> Iterator[tuple[str, Place, bytes]]:
+    """(stream, place, digest) of every message that a record accounts for as sent."""
+    for stream, emission in zip(outputs, record.outputs, strict=False):  # a failed call has none
+        if emission is not None and emission.seq >= 0:
+            yield stream, (record.incarnation, emission.seq), emission.digest
+    if record.kind == "cut":
+        for held in held_by(record):
+            if held.stream in outputs:
+                yield held.stream, held.place, held.digest
+
+
+def merged(runs: Sequence[Run], read: Read) -> Iterator[FiringRecord]:
+    """The records of some runs by (incarnation, index); of equal ones, that of the earlier run first."""
+    if len(runs) == 1:
+        yield from read(runs[0].begin, runs[0].end)
+        return
+    waiting = deque(sorted(enumerate(runs), key=lambda item: (item[1].first, item[0])))
+    heads: list[tuple[Place, int, FiringRecord, Iterator[FiringRecord]]] = []
+
+    def push(number: int, left: Iterator[FiringRecord]) -> None:
+        record = next(left, None)
+        if record is not None:
+            heapq.heappush(heads, ((record.incarnation, record.index), number, record, left))
+
+    while waiting or heads:
+        while waiting and (not heads or waiting[0][1].first <= heads[0][0]):
+            number, run = waiting.popleft()
+            push(number, read(run.begin, run.end))
+        _, number, record, left = heapq.heappop(heads)
+        yield record
+        push(number, left)
+
+
+def in_order(runs: Sequence[Run], read: Read) -> Iterator[FiringRecord]:
+    """The records of some runs by (incarnation, index), each once: handed over twice are those of a process that
+    died."""
+    last: Place = (-1, -1)
+    for record in merged(runs, read):
+        place = (record.incarnation, record.index)
+        if place > last:
+            last = place
+            yield record

@@ -1,0 +1,308 @@
+"""State of operators as typed data: a snapshot and its restoration follow from the annotations.
+
+    @dataclass
+    class State:
+        last: Pose | None = None
+        tracks: dict[int, Track] = field(default_factory=dict)
+        counts: Counter[str] = field(default_factory=Counter, metadata=KEPT)
+
+    class Tracker(Operator):
+        state: State
+
+`plain` turns a value into numbers, strings, bytes, None, arrays, lists and mappings with string keys; `typed` turns
+that back into a value of the annotated type. Two references to one object become two objects.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import enum
+import types
+import typing
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dataflow.messages.base import Message, MessageError, message_type
+
+KEPT: Mapping[str, bool] = types.MappingProxyType({"kept": True})
+"""Metadata of a dataclass field that a reset of the clock leaves as it is, such as counts for the summary."""
+
+_SCALARS: dict[Any, tuple[type, ...]] = {
+    int: (int,),
+    float: (float, int),
+    bool: (bool,),
+    str: (str,),
+    bytes: (bytes,),
+    types.NoneType: (types.NoneType,),
+}
+_SEQUENCES: dict[Any, Callable[[Iterable[Any]], Any]] = {
+    list: list,
+    set: set,
+    frozenset: frozenset,
+    collections.abc.Sequence: list,
+}
+_MAPPINGS = (dict, collections.abc.Mapping, collections.OrderedDict, Counter, defaultdict)
+
+
+class StateError(ValueError):
+    """A value that a snapshot cannot hold, or a snapshot that does not fit the state it is restored into."""
+
+
+@dataclasses.dataclass
+class Counts:
+    """A state of counts, which a reset leaves alone and the summary shows; a base for states that have more."""
+
+    counts: Counter[str] = dataclasses.field(default_factory=Counter, metadata=KEPT)
+
+
+class Remembered:
+    """A base for parts of a state that have settings besides: the annotated attributes of the class are the state.
+
+        class Walls(Remembered):
+            weight: float
+
+            def __init__(self, settings: Settings) -> None:
+                self._settings, self.weight = settings, 0.0
+
+    Attributes without an annotation in the class body, and `ClassVar`s, are not part of it.
+    """
+
+    def snapshot(self) -> Any:
+        """Returns the annotated attributes as plain values. Raises `StateError` for a value of another type."""
+        place = type(self).__name__
+        return {name: plain(getattr(self, name), f"{place}.{name}") for name in _hints(type(self))}
+
+    def restore(self, state: Any) -> None:
+        """Takes over the attributes that `snapshot` gave, then calls `restored`. Raises `StateError`."""
+        take_over(self, _hints(type(self)), state)
+        self.restored()
+
+    def restored(self) -> None:
+        """Derives what is not part of the state; called after the attributes were restored."""
+
+
+class StateOf:
+    """The attribute `state` of an operator class: made by `initial_state()` when it is first asked for."""
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        if instance is None:
+            return self
+        made = vars(instance)["state"] = instance.initial_state()
+        return made
+
+
+def fresh_state(cls: type, hint: Any) -> Any:
+    """Returns a state of the annotated class `hint`, every field as by default. Raises `StateError`."""
+    if not dataclasses.is_dataclass(hint):
+        raise StateError(f"{cls.__name__}.state is annotated {hint!r}; a state is a dataclass")
+    try:
+        return hint()  # type: ignore[operator]
+    except TypeError as error:
+        raise StateError(
+            f"{cls.__name__}.state: {error}; give every field a default, or define initial_state()"
+        ) from error
+
+
+def reset_state(old: Any, new: Any) -> None:
+    """Hands the fields that a reset leaves alone on to the new state."""
+    for each in dataclasses.fields(old):
+        if each.metadata.get("kept"):
+            setattr(new, each.name, getattr(old, each.name))
+
+
+def plain(value: Any, place: str = "state") -> Any:
+    """Returns a value as a snapshot holds it. Raises `StateError` for one of another type, with its place."""
+    match value:
+        case enum.Enum():
+            return value.name
+        case None | bool() | int() | float() | str() | bytes() | np.ndarray() | np.generic():
+            return value
+        case complex():
+            return [value.real, value.imag]
+        case Message():
+            content = {f.name: plain(getattr(value, f.name), f"{place}.{f.name}") for f in type(value).FIELDS}
+            return {"schema": value.SCHEMA, "stamp": value.stamp, **content}
+        case _ if hasattr(value, "snapshot"):
+            return value.snapshot()
+        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return {f.name: plain(getattr(value, f.name), f"{place}.{f.name}") for f in dataclasses.fields(value)}
+        case deque():
+            return [value.maxlen, [plain(item, f"{place}[{k}]") for k, item in enumerate(value)]]
+        case Mapping():
+            return [[plain(key, place), plain(item, f"{place}[{key!r}]")] for key, item in value.items()]
+        case set() | frozenset():
+            return sorted(plain(item, place) for item in value)
+        case list() | tuple():
+            return [plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
+        case _:
+            raise StateError(
+                f"{place} is a {type(value).__name__}; a state holds numbers, strings, bytes, None, numpy arrays, "
+                "enums, messages, dataclasses, objects with snapshot() and restore(), and collections of these"
+            )
+
+
+def typed(hint: Any, value: Any, place: str = "state") -> Any:
+    """Returns the value of type `hint` that `plain` turned into `value`. Raises `StateError` where it does not fit."""
+    origin, arguments = typing.get_origin(hint) or hint, typing.get_args(hint)
+    if origin in _SCALARS:
+        return _scalar(origin, value, place)
+    if origin in (typing.Union, types.UnionType):
+        return _one_of(arguments, value, place)
+    if origin is typing.Annotated:
+        return typed(arguments[0], value, place)
+    if origin in (Any, object, typing.Literal):
+        return value
+    if origin in _SEQUENCES:
+        return _SEQUENCES[origin](_items(arguments[:1], value, place))
+    if origin is tuple:
+        return _tuple(arguments, value, place)
+    if origin is deque:
+        longest, items = _listed(value, place, 2)
+        return deque(_items(arguments, items, place), maxlen=longest)
+    if origin in _MAPPINGS:
+        return _mapping(origin, arguments, value, place)
+    if origin is complex:
+        return complex(*_listed(value, place, 2))
+    if isinstance(origin, type):
+        return _object(origin, value, place)
+    raise StateError(f"{place}: a {hint!r} cannot be restored")
+
+
+def take_over(target: Any, hints: Mapping[str, Any], state: Any) -> None:
+    """Sets the attributes `hints` of `target` as `state` holds them; objects with `restore()` are restored in place.
+
+    Raises `StateError` where `state` lacks one or has others: it is of another version.
+    """
+    name = type(target).__name__
+    _check_names(name, hints, state)
+    for attribute, hint in hints.items():
+        current: Any = getattr(target, attribute, None)
+        place = f"{name}.{attribute}"
+        if hasattr(current, "restore") and state[attribute] is not None:
+            current.restore(state[attribute])
+        else:
+            setattr(target, attribute, typed(hint, state[attribute], place))
+
+
+_HINTS: dict[type, dict[str, Any]] = {}
+
+
+def _hints(cls: type) -> dict[str, Any]:
+    hints = _HINTS.get(cls)
+    if hints is None:
+        found = typing.get_type_hints(cls)
+        hints = _HINTS[cls] = {name: hint for name, hint in found.items() if typing.get_origin(hint) is not ClassVar}
+    return hints
+
+
+def state_hints(state: Any) -> dict[str, Any]:
+    """Returns the fields of a dataclass and their types."""
+    hints = _hints(type(state))
+    return {each.name: hints[each.name] for each in dataclasses.fields(state)}
+
+
+def _check_names(name: str, hints: Iterable[str], state: Any) -> None:
+    if not isinstance(state, Mapping):
+        raise StateError(f"snapshot of another version: {name} is a {type(state).__name__}, expected its fields")
+    wanted, given = set(hints), set(state)
+    if wanted != given:
+        lacks = ", ".join(sorted(wanted - given)) or "nothing"
+        more = ", ".join(sorted(given - wanted)) or "nothing"
+        raise StateError(f"snapshot of another version: {name} lacks {lacks} and has {more} besides")
+
+
+def _scalar(kind: type, value: Any, place: str) -> Any:
+    if isinstance(value, np.ndarray) and value.shape == ():
+        value = value.item()
+    if not isinstance(value, _SCALARS[kind]) or (kind is int and isinstance(value, bool)):
+        raise StateError(f"{place}: expected a {kind.__name__}, got a {type(value).__name__}")
+    return None if value is None else kind(value)
+
+
+def _one_of(members: Sequence[Any], value: Any, place: str) -> Any:
+    faults = []
+    for member in members:
+        try:
+            return typed(member, value, place)
+        except StateError as error:
+            faults.append(str(error))
+    raise StateError(faults[0] if len(faults) == 1 else f"{place}: fits none of its types ({'; '.join(faults)})")
+
+
+def _listed(value: Any, place: str, length: int | None = None) -> Any:
+    if not isinstance(value, list) or (length is not None and len(value) != length):
+        what = "items" if length is None else f"{length} items"
+        raise StateError(f"{place}: expected a list of {what}, got {value!r:.60}")
+    return value
+
+
+def _items(arguments: Sequence[Any], value: Any, place: str) -> list[Any]:
+    kind = arguments[0] if arguments else Any
+    return [typed(kind, item, f"{place}[{k}]") for k, item in enumerate(_listed(value, place))]
+
+
+def _tuple(arguments: Sequence[Any], value: Any, place: str) -> tuple[Any, ...]:
+    if not arguments or arguments[-1] is Ellipsis:
+        return tuple(_items(arguments[:1], value, place))
+    items = _listed(value, place, len(arguments))
+    return tuple(typed(kind, item, place) for kind, item in zip(arguments, items, strict=True))
+
+
+def _mapping(origin: Any, arguments: Sequence[Any], value: Any, place: str) -> Any:
+    of_key, of_item = (arguments[0] if arguments else Any), (arguments[1] if len(arguments) > 1 else int)
+    pairs = [_listed(pair, place, 2) for pair in _listed(value, place)]
+    made: Any = Counter() if origin is Counter else {}
+    if origin is defaultdict:
+        made = defaultdict(typing.get_origin(of_item) or of_item)
+    for key, item in pairs:
+        made[typed(of_key, key, place)] = typed(of_item, item, f"{place}[{key!r}]")
+    return made
+
+
+def _object(kind: type, value: Any, place: str) -> Any:
+    """An array, number of numpy, enum, message, dataclass or object with `restore()`."""
+    if issubclass(kind, np.ndarray | np.generic):
+        if not isinstance(value, np.ndarray | np.generic):
+            raise StateError(f"{place}: expected an array, got a {type(value).__name__}")
+        return np.array(value) if issubclass(kind, np.ndarray) else value.dtype.type(value.item())
+    if issubclass(kind, enum.Enum):
+        if value not in kind.__members__:
+            raise StateError(f"{place}: {value!r} is none of {', '.join(kind.__members__)}")
+        return kind[value]
+    if issubclass(kind, Message):
+        return _message(value, place)
+    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
+        hints = _hints(kind)
+        return kind(*_tuple([hints[name] for name in kind._fields], value, place))
+    if hasattr(kind, "restore"):
+        made: Any = kind()
+        made.restore(value)
+        return made
+    if dataclasses.is_dataclass(kind):
+        return _dataclass(kind, value, place)
+    raise StateError(f"{place}: a {kind.__name__} cannot be restored")
+
+
+def _message(value: Any, place: str) -> Message:
+    if not isinstance(value, Mapping) or "schema" not in value:
+        raise StateError(f"{place}: expected a message, got a {type(value).__name__}")
+    content = {key: item for key, item in value.items() if key != "schema"}
+    try:
+        return message_type(value["schema"])(**content)
+    except (MessageError, TypeError) as error:
+        raise StateError(f"{place}: {error}") from error
+
+
+def _dataclass(kind: Any, value: Any, place: str) -> Any:
+    hints, fields = _hints(kind), dataclasses.fields(kind)
+    _check_names(f"{place} ({kind.__name__})", [each.name for each in fields], value)
+    restored = {each.name: typed(hints[each.name], value[each.name], f"{place}.{each.name}") for each in fields}
+    made = kind(**{each.name: restored[each.name] for each in fields if each.init})
+    for each in fields:
+        if not each.init:
+            object.__setattr__(made, each.name, restored[each.name])
+    return made

@@ -1,0 +1,129 @@
+"""Decodes a stream of packets, each as soon as it comes, and finds those that cannot be decoded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.video.bits import PacketError, VideoError
+from dataflow.video.capture import Capture
+from dataflow.video.h264 import H264Headers
+from dataflow.video.h264 import is_key as is_h264_key
+from dataflow.video.h265 import H265Headers
+from dataflow.video.h265 import is_key as is_h265_key
+from dataflow.video.picture import Headers, Picture
+
+MAX_GROUP = 64 << 20
+"""Bytes of packets since a key frame that are kept for a snapshot."""
+_HEADERS: dict[str, Callable[[], Headers]] = {"h264": H264Headers, "h265": H265Headers}
+
+
+def is_key(format_: str, data: bytes) -> bool:
+    """Tells whether decoding can begin with a packet: a key frame with its parameter sets."""
+    return is_h264_key(data) if format_ == "h264" else is_h265_key(data)
+
+
+class PacketDecoder:
+    """Decodes the packets of one stream in their order, one picture each.
+
+    Decoding begins with a key frame. A packet that cannot be decoded, since others are lost or it is damaged, gives no
+    frame, nor do those after it until the next key frame: their pixels would be wrong. Frames depend on the packets
+    since the key frame alone.
+
+    `lost`: the reason why the last packet gave no frame; empty where it gave one.
+    """
+
+    def __init__(self, format_: str, max_pixels: int = 64_000_000) -> None:
+        """`format_`: h264 or h265; `max_pixels`: a stream with larger pictures is refused."""
+        self.format, self.max_pixels = format_, max_pixels
+        self.lost = ""
+        self._headers: Headers = _HEADERS[format_]()
+        self._sets = b""
+        self._capture: Capture | None = None
+        self._group: list[bytes] | None = []
+        """Packets since the key frame; None where they are more than are kept."""
+        self._group_bytes = 0
+
+    def decode(self, data: bytes) -> NDArray[np.uint8] | None:
+        """Returns the pixels (H, W, 3) of a packet, RGB; None where it cannot be decoded.
+
+        Raises `VideoError` for a stream that is not decoded at all (B-frames), TimeoutError where OpenCV hangs.
+        """
+        try:
+            picture = self._headers.read(data)
+        except PacketError as error:
+            return self._lose(str(error))
+        if picture.pixels > self.max_pixels:
+            raise VideoError(f"its pictures have {picture.pixels} pixels, more than max_pixels={self.max_pixels}")
+        new_sets = self._take_sets(picture)
+        if picture.missing:
+            return self._lose(picture.missing)
+        if picture.key:
+            return self._begin(data if picture.whole else self._sets + data, new_sets)
+        if self._capture is None:
+            return self._lose(self.lost)
+        self._keep(data)
+        return self._only(self._capture.feed(data))
+
+    def state(self) -> Mapping[str, Any] | None:
+        """Returns a value from which `take_up` goes on alike; None where that were too many bytes."""
+        if self._group is None:
+            return None
+        return {"format": self.format, "sets": self._sets, "group": list(self._group), "lost": self.lost}
+
+    def take_up(self, state: Mapping[str, Any]) -> None:
+        """Takes over the `state` of another decoder of this format, by decoding its packets since the key frame."""
+        self._headers.learn(state["sets"])
+        self._sets = bytes(state["sets"])
+        for packet in state["group"]:
+            self.decode(packet)
+        self.lost = str(state["lost"])
+
+    def close(self) -> None:
+        """Ends OpenCV's decoder. Idempotent."""
+        if self._capture is not None:
+            self._capture.close()
+            self._capture = None
+
+    def _take_sets(self, picture: Picture) -> bool:
+        """Keeps the parameter sets of a packet; returns whether they are others than before."""
+        if picture.sets in (b"", self._sets):
+            return False
+        self._sets = picture.sets if picture.whole else self._sets + picture.sets
+        return True
+
+    def _begin(self, packet: bytes, new_sets: bool) -> NDArray[np.uint8] | None:
+        """Decodes a key frame, by a new decoder where pictures may have another form."""
+        self._group, self._group_bytes = [], 0
+        self._keep(packet)
+        if self._capture is not None and not new_sets:
+            return self._only(self._capture.feed(packet))
+        self.close()
+        self._capture = Capture(self.format, packet)
+        return self._only([self._capture.first])
+
+    def _keep(self, packet: bytes) -> None:
+        if self._group is not None:
+            self._group.append(packet)
+            self._group_bytes += len(packet)
+            if self._group_bytes > MAX_GROUP:
+                self._group = None
+
+    def _only(self, frames: list[NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
+        import cv2
+
+        if len(frames) != 1:
+            return self._lose(f"the decoder gave {len(frames)} frames for one packet: it is damaged")
+        self.lost = ""
+        return np.asarray(cv2.cvtColor(frames[0], cv2.COLOR_BGR2RGB), np.uint8)
+
+    def _lose(self, reason: str) -> NDArray[np.uint8] | None:
+        """Waits for the next key frame; the first reason stands until then."""
+        if self._capture is not None or not self.lost:
+            self.lost = reason
+        self._group = []
+        self.close()
+        return None

@@ -1,0 +1,160 @@
+"""How a camera is held or mounted, from what it sees, as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Diagnostics, Imu, Odometry, PointCloud, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import matrix_to_quaternion
+from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
+from operators.cloud.held import accelerated, held
+from operators.cloud.vertical import Vertical, find_vertical
+from operators.geometry.extrinsics import transform_between
+from operators.status import counted_status
+
+Array = NDArray[np.float64]
+
+_RIVAL = 0.1  # likelihood of another direction, from which a view does not decide
+_SURE = np.radians(4.0)  # standard deviation from which it does not either
+
+
+class CameraMount(Operator):
+    """Completes the extrinsics of a camera by its base: a frame that is level, on the ground below, and looks ahead.
+
+    The vertical comes from the level and upright surfaces of a view, and from the accelerometer where there is one; the
+    ground is the lowest level surface. The first view that shows them without doubt decides, for the map's frame begins
+    with it; after `patience` the best one so far does, with a warning. The base is level where the camera's odometry
+    began. Extrinsics that hold the base are passed on as they are: `GravityCheck` compares them with what is seen.
+    """
+
+    cloud: In[PointCloud] = In(doc="points of a depth camera in its optical frame: x right, y down, z ahead")
+    extrinsics: Sampled[Transforms] = Sampled(required=False, doc="transforms between the sensors")
+    imu: Sampled[Imu] = Sampled(required=False, doc="an accelerometer that the extrinsics relate to the cloud's frame")
+    motion: Sampled[Odometry] = Sampled(
+        required=False, doc="the camera since its odometry began: a view that decides later counts from there"
+    )
+    completed: Out[Transforms] = Out(doc="the extrinsics with the camera on its base, from when that is known")
+    status: Out[Diagnostics] = Out(
+        doc="how the camera looked at first, with standard deviations; a warning where that is a guess"
+    )
+
+    base_frame: str = Param("base_link", min_length=1, doc="frame of the base: x ahead, z up")
+    patience: Duration = Param("2s", ge=0, doc="time after which a view decides that shows little")
+
+    def setup(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        self._done = False
+        self._first: int | None = None
+        self._best: Vertical | None = None
+        self._counts: Counter[str] = Counter()
+        self._figures: dict[str, float] = {}
+
+    def process(
+        self,
+        cloud: PointCloud,
+        extrinsics: Transforms | None = None,
+        imu: Imu | None = None,
+        motion: Odometry | None = None,
+    ) -> dict[str, Any] | None:
+        """Raises ValueError where the extrinsics do not relate the accelerometer to the cloud."""
+        if self._done:
+            return None
+        if extrinsics is not None and self.base_frame in (*extrinsics.frames, *extrinsics.child_frames):
+            self._done = True
+            text = f"{self.base_frame} is given"
+            return {"completed": extrinsics, "status": counted_status("camera_mount", cloud.stamp, text, Level.OK, {})}
+        self._counts["views"] += 1
+        self._first = cloud.stamp if self._first is None else self._first
+        expected, information = held()
+        if imu is not None:
+            R = transform_between(extrinsics, imu.frame, cloud.frame)[:3, :3]
+            expected, information = accelerated(R @ imu.linear_acceleration)
+        found = find_vertical(cloud.points, expected, information)
+        if found is not None and motion is not None:
+            found = found.before(motion.matrix())
+        if found is not None and (self._best is None or _doubt(found) < _doubt(self._best)):
+            self._best = found
+        patient = cloud.stamp - self._first < self.patience
+        if patient and (found is None or _doubt(found) > 1):
+            return None
+        if self._best is None:
+            self._best = Vertical(expected, np.linalg.inv(information), 1.0, None)
+        self._done = True
+        return self._decided(cloud, extrinsics, self._best)
+
+    def _decided(self, cloud: PointCloud, extrinsics: Transforms | None, found: Vertical) -> dict[str, Any]:
+        T = _on_base(found)
+        down, roll = np.degrees(np.arcsin(-found.up[2])), np.degrees(np.arctan2(found.up[0], -found.up[1]))
+        self._figures = {"looks down (°)": round(float(down), 1), "roll (°)": round(float(roll), 1)}
+        self._figures |= {"sigma (°)": round(float(np.degrees(found.sigma)), 1), "height (m)": round(T[2, 3], 3)}
+        guess = _doubt(found) > 1
+        ground = "no ground in sight" if found.height is None else f"{found.height:.2f} m above the ground"
+        text = f"the camera looks {down:.0f}° down, turned by {roll:.0f}°, {ground}"
+        text = f"few surfaces show where up is; taken so: {text}" if guess else text
+        self._counts["guesses"] += guess
+        made = _with(extrinsics, cloud, self.base_frame, T)
+        level = Level.WARN if guess else Level.OK
+        figures = {key: f"{value:g}" for key, value in self._figures.items()}
+        return {"completed": made, "status": counted_status("camera_mount", cloud.stamp, text, level, figures)}
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew: the camera may have been carried elsewhere."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        best = self._best
+        return {
+            "done": self._done,
+            "first": self._first,
+            "best": None if best is None else [best.up, best.covariance, best.rival, best.height],
+            "counts": dict(self._counts),
+            "figures": self._figures,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._done, self._first = bool(state["done"]), state["first"]
+        if state["best"] is not None:
+            up, covariance, rival, height = state["best"]
+            self._best = Vertical(np.array(up), np.array(covariance), float(rival), height)
+        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
+        self._figures = {key: float(value) for key, value in state["figures"].items()}
+
+    def summary(self) -> Mapping[str, float | int]:
+        return {**self._counts, **self._figures}
+
+
+def _doubt(found: Vertical) -> float:
+    """Returns how much is lacking to a decision: up to 1 nothing is."""
+    return max(found.rival / _RIVAL, found.sigma / _SURE)
+
+
+def _on_base(found: Vertical) -> Array:
+    """Returns the pose (4, 4) of the camera on its base."""
+    ahead = np.array([0.0, 0.0, 1.0]) if abs(found.up[2]) < 0.99 else np.array([0.0, -1.0, 0.0])
+    x = ahead - (ahead @ found.up) * found.up
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(found.up, x), found.up])
+    T[2, 3] = 0.0 if found.height is None else found.height
+    return T
+
+
+def _with(extrinsics: Transforms | None, cloud: PointCloud, base_frame: str, T: Array) -> Transforms:
+    """Returns the extrinsics with one transform more: `T` of the cloud's frame on the base."""
+    old = extrinsics
+    place, turn = T[None, :3, 3], matrix_to_quaternion(T)[None]
+    return Transforms(
+        stamp=cloud.stamp,
+        frames=(*(() if old is None else old.frames), base_frame),
+        child_frames=(*(() if old is None else old.child_frames), cloud.frame),
+        translations=place if old is None else np.concatenate([old.translations, place]),
+        rotations=turn if old is None else np.concatenate([old.rotations, turn]),
+    )

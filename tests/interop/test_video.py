@@ -1,0 +1,155 @@
+"""Video of other programs becomes packets that decode; formats that are not decoded are named."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo as Proto
+from google.protobuf.timestamp_pb2 import Timestamp
+from made_bags import ROS2, SECOND, header, made, ros, write_ros2
+from made_video import PERIOD, clip, decoded
+from mcap.writer import Writer
+
+from dataflow.interop.opening import open_bag
+from dataflow.interop.streams import BagStreams, Played
+from dataflow.interop.topics import Reading
+from dataflow.recording.streams.foxglove import file_descriptor_set
+from dataflow.testing import play
+from operators.codec import VideoDecoder
+
+START = 5 * SECOND
+
+
+def ffmpeg(number: int, data: bytes, encoding: str) -> Any:
+    return ros(
+        "ffmpeg_image_transport_msgs/FFMPEGPacket",
+        header=header(START + number * PERIOD, "cam"),
+        width=96,
+        height=64,
+        encoding=encoding,
+        pts=number,
+        flags=int(number % 8 == 0),
+        data=np.frombuffer(data, np.uint8),
+    )
+
+
+def foxglove(number: int, data: bytes, encoding: str) -> Any:
+    stamp = START + number * PERIOD
+    time = made(ROS2, "builtin_interfaces/msg/Time", {"sec": stamp // SECOND, "nanosec": stamp % SECOND})
+    flat = np.frombuffer(data, np.uint8)
+    return ros("foxglove_msgs/CompressedVideo", timestamp=time, frame_id="cam", data=flat, format=encoding)
+
+
+def compressed(number: int, data: bytes, encoding: str) -> Any:
+    stamp, flat = header(START + number * PERIOD, "cam"), np.frombuffer(data, np.uint8)
+    return ros("sensor_msgs/CompressedImage", header=stamp, format=encoding, data=flat)
+
+
+def images_of(path: Path) -> list[np.ndarray]:
+    """Decodes the one topic of a bag; its stamps are those of the frames."""
+    with BagStreams(path, {"video": Played("/video", "CompressedVideo")}) as bag:
+        packets = [recorded.message for recorded in bag.messages()]
+    assert [m.stamp for m in packets] == [START + k * PERIOD for k in range(24)]
+    assert all(m.frame == "cam" for m in packets)
+    return [image.data for image in play(VideoDecoder(), {"video": packets})["image"]]
+
+
+@pytest.mark.parametrize(
+    ("make", "encoding", "format_"),
+    [
+        (ffmpeg, "libx264", "h264"),
+        (ffmpeg, "hevc_nvenc", "h265"),
+        (ffmpeg, "h264;yuv420p;bgr8;bgr8", "h264"),
+        (foxglove, "h264", "h264"),
+        (foxglove, "h265", "h265"),
+        (compressed, "h264", "h264"),
+    ],
+)
+def test_packets_of_ros_bags_decode(make: Any, encoding: str, format_: str, tmp_path: Path) -> None:
+    packets = clip(format_)
+    rows = [("/video", START + k * PERIOD + 999, make(k, data, encoding)) for k, data in enumerate(packets)]
+    found = images_of(write_ros2(tmp_path / "bag", rows))
+    assert all(map(np.array_equal, found, decoded(format_, packets)))
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_packets_of_foxglove_files_decode(encoding: str, tmp_path: Path) -> None:
+    packets = clip("h264")
+    with (tmp_path / "video.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(
+            "foxglove.CompressedVideo",
+            "protobuf" if encoding == "protobuf" else "jsonschema",
+            file_descriptor_set(Proto) if encoding == "protobuf" else b"{}",
+        )
+        channel = writer.register_channel("/video", encoding, schema)
+        for k, packet in enumerate(packets):
+            stamp = START + k * PERIOD
+            seconds, rest = divmod(stamp, SECOND)
+            proto = Proto(
+                timestamp=Timestamp(seconds=seconds, nanos=rest), frame_id="cam", format="h264", data=packet
+            ).SerializeToString()
+            text = {
+                "timestamp": {"sec": seconds, "nsec": rest},
+                "frame_id": "cam",
+                "format": "h264",
+                "data": base64.b64encode(packet).decode(),
+            }
+            writer.add_message(
+                channel, stamp + 1, proto if encoding == "protobuf" else json.dumps(text).encode(), stamp + 1
+            )
+        writer.finish()
+    assert all(map(np.array_equal, images_of(tmp_path / "video.mcap"), decoded("h264", packets)))
+
+
+@pytest.mark.parametrize(("make", "encoding"), [(ffmpeg, "libsvtav1"), (foxglove, "av1"), (foxglove, "vp9")])
+def test_other_formats_are_refused_with_a_reason(make: Any, encoding: str, tmp_path: Path) -> None:
+    rows = [("/video", START + k * PERIOD, make(k, b"\x12\0\x0a\x0b", encoding)) for k in range(3)]
+    bag = open_bag(write_ros2(tmp_path / "bag", rows))
+    reading = Reading(bag, bag.topics["/video"])
+    bag.close()
+    assert not reading.playable
+    assert f"'{encoding}' is not read: those known are h264 and h265" in reading.reason
+    assert "AV1" in reading.reason
+
+
+def rerun_file(path: Path, codec: rr.VideoCodec, packets: Sequence[bytes], **timeline: str) -> Path:
+    with rr.RecordingStream("test", recording_id="test") as recording:
+        recording.save(path)
+        recording.log("cam/video", rr.VideoStream(codec=codec), static=True)
+        for k, packet in enumerate(packets):
+            stamp = START + k * PERIOD
+            if timeline["of"] == "timestamp":
+                recording.set_time("frame time", timestamp=np.datetime64(stamp, "ns"))
+            else:
+                recording.set_time("frame time", duration=np.timedelta64(stamp, "ns"))
+            recording.log("cam/video", rr.VideoStream.from_fields(sample=packet))
+        recording.log("cam/points", rr.Points3D([[0, 0, 1]]))
+    return path
+
+
+@pytest.mark.parametrize(("codec", "format_"), [(rr.VideoCodec.H264, "h264"), (rr.VideoCodec.H265, "h265")])
+@pytest.mark.parametrize("of", ["timestamp", "duration"])
+def test_video_streams_of_rerun_files_decode(codec: rr.VideoCodec, format_: str, of: str, tmp_path: Path) -> None:
+    packets = clip(format_)
+    path = rerun_file(tmp_path / "video.rrd", codec, packets, of=of)
+    with BagStreams(path, {"video": Played("/cam/video", "CompressedVideo")}) as bag:
+        found = [recorded.message for recorded in bag.messages()]
+        assert "/cam/video is stamped by its timeline 'frame time'" in bag.notes
+    assert [m.stamp for m in found] == [START + k * PERIOD for k in range(24)]
+    images = play(VideoDecoder(), {"video": found})["image"]
+    assert all(np.array_equal(m.data, frame) for m, frame in zip(images, decoded(format_, packets), strict=True))
+
+
+def test_av1_of_a_rerun_file_is_refused_with_a_reason(tmp_path: Path) -> None:
+    path = rerun_file(tmp_path / "video.rrd", rr.VideoCodec.AV1, [b"\x12\0\x0a\x0b"] * 3, of="timestamp")
+    bag = open_bag(path)
+    assert "video of format 'av1' is not read" in Reading(bag, bag.topics["/cam/video"]).reason

@@ -1,0 +1,235 @@
+"""States declared as data: snapshots, restoration and resets follow from the annotations."""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter, defaultdict, deque
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.messages import Number, Odometry
+from dataflow.operator import KEPT, In, Operator, Out, Param, Remembered
+from dataflow.state import StateError, plain, typed
+
+
+class Mode(enum.Enum):
+    SEARCH = 1
+    FOLLOW = 2
+
+
+class Place(NamedTuple):
+    stamp: int
+    xyz: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Track:
+    id: int
+    mean: npt.NDArray[np.float64]
+    label: str | None = None
+    mode: Mode = Mode.SEARCH
+
+
+class Window(Remembered):
+    values: list[float]
+
+    def __init__(self, length: int = 3) -> None:
+        self.length, self.values = length, []
+        self.restored()
+
+    def restored(self) -> None:
+        self.total = sum(self.values)
+
+    def add(self, value: float) -> None:
+        self.values = [*self.values, value][-self.length :]
+        self.restored()
+
+
+@dataclass
+class State:
+    window: Window = field(default_factory=Window)
+    tracks: dict[int, Track] = field(default_factory=dict)
+    places: deque[Place] = field(default_factory=lambda: deque(maxlen=2))
+    seen: set[str] = field(default_factory=set)
+    pairs: dict[tuple[int, str], float] = field(default_factory=dict)
+    by_id: defaultdict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
+    last: Odometry | None = None
+    kind: Literal["a", "b"] = "a"
+    raw: bytes = b""
+    phase: complex = 0j
+    single: np.float32 = field(default_factory=np.float32)
+    spare: tuple[float, ...] = ()
+    windows: dict[str, Window] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter, metadata=KEPT)
+
+
+class Averager(Operator):
+    value: In[Number]
+    mean: Out[Number]
+    size: int = Param(3, ge=1, doc="how many values")
+    state: State
+
+    def initial_state(self) -> State:
+        return State(window=Window(self.size))
+
+    def process(self, value: Number) -> Number:
+        self.state.window.add(value.value)
+        self.state.counts["values"] += 1
+        return Number(stamp=value.stamp, value=self.state.window.total / len(self.state.window.values))
+
+
+def number(stamp: int) -> Number:
+    return Number(stamp=stamp, value=float(stamp))
+
+
+def filled() -> State:
+    odometry = Odometry(stamp=7, frame="odom", child_frame="base", position=np.arange(3.0), orientation=np.eye(4)[3])
+    state = State(last=odometry, raw=b"\0\1", phase=1 + 2j, single=np.float32(0.1), spare=(1.0, 2.5), kind="b")
+    state.tracks = {9: Track(9, np.arange(3.0), "cup", Mode.FOLLOW), 2: Track(2, np.zeros((0, 3)))}
+    state.places.extend(Place(k, np.full(3, k, float)) for k in range(3))
+    state.seen, state.pairs = {"b", "a"}, {(1, "near"): 0.5}
+    state.by_id[4].append(1.5)
+    state.windows["left"] = Window()
+    state.windows["left"].add(2.0)
+    state.counts["seen"] = 2
+    return state
+
+
+def round_trip(state: State) -> State:
+    restored: State = typed(State, unpack_state(pack_state(plain(state))))
+    return restored
+
+
+def test_every_kind_of_field_comes_back_as_it_was() -> None:
+    state = filled()
+
+    back = round_trip(state)
+
+    assert plain_bytes(back) == plain_bytes(state)
+    assert list(back.tracks) == [9, 2]  # the order of a mapping is part of it
+    assert back.tracks[9].mode is Mode.FOLLOW
+    assert back.places.maxlen == 2
+    assert [type(back.by_id[5]), type(back.counts), back.counts["none"]] == [list, Counter, 0]
+    assert back.last is not None
+    assert back.last.digest() == state.last.digest()  # type: ignore[union-attr]
+    assert type(back.single) is np.float32
+    assert back.windows["left"].total == 2.0
+
+
+def plain_bytes(state: State) -> bytes:
+    return pack_state(plain(state))
+
+
+@settings(max_examples=60)
+@given(st.lists(st.integers(0, 100), min_size=1, max_size=12), st.integers(1, 5), st.integers(0, 12))
+def test_an_operator_restored_anywhere_goes_on_alike(stamps: list[int], length: int, cut: int) -> None:
+    whole, begun, later = (Averager(size=length) for _ in range(3))
+    expected = [whole.process(number(s)).digest() for s in stamps]
+    first = [begun.process(number(s)).digest() for s in stamps[:cut]]
+    snapshot = begun.snapshot()
+    assert snapshot is not None
+
+    later.restore(unpack_state(pack_state(snapshot)))
+
+    assert first + [later.process(number(s)).digest() for s in stamps[cut:]] == expected
+    assert later.state.window.length == length
+
+
+def test_a_reset_begins_anew_but_for_what_is_kept() -> None:
+    operator = Averager()
+    operator.process(number(3))
+
+    operator.on_reset("value")
+
+    assert (operator.state.window.values, operator.state.counts) == ([], {"values": 1})
+
+
+def test_states_of_two_operators_share_nothing() -> None:
+    one, other = Averager(), Averager()
+    one.process(number(1))
+
+    assert other.state.counts == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"kind": ...}, "snapshot of another version: State lacks kind and has nothing besides"),
+        ({"older": 1}, "snapshot of another version: State lacks nothing and has older besides"),
+        ({"raw": 3}, "State.raw: expected a bytes, got a int"),
+        ({"spare": [1.0, "x"]}, r"State.spare\[1\]: expected a float, got a str"),
+        ({"tracks": [[1, {"id": 1}]]}, r"State.tracks\[1\] \(Track\) lacks label, mean, mode"),
+        ({"last": {"schema": "Nothing"}}, "unknown message schema"),
+        ({"windows": [["left", {}]]}, "Window lacks values"),
+    ],
+)
+def test_a_snapshot_that_does_not_fit_is_refused_with_the_field(change: dict[str, Any], words: str) -> None:
+    snapshot = {**plain(filled()), **change}
+    operator = Averager()
+
+    with pytest.raises(StateError, match=words):
+        operator.restore({key: value for key, value in snapshot.items() if value is not ...})
+
+
+def test_a_value_that_no_snapshot_can_hold_is_named_with_its_place() -> None:
+    state = State()
+    state.by_id[3] = [object()]  # type: ignore[list-item]
+
+    with pytest.raises(StateError, match=r"state.by_id\[3\]\[0\] is a object; a state holds numbers"):
+        plain(state)
+
+
+def test_a_state_whose_fields_have_no_defaults_is_named() -> None:
+    @dataclass
+    class Needs:
+        size: int
+
+    class Sized(Operator):
+        value: In[Number]
+        state: Needs
+
+        def process(self, value: Number) -> None:
+            self.state.size += 1
+
+    with pytest.raises(StateError, match=r"Sized\.state: .*size.*give every field a default, or define initial_state"):
+        Sized().process(number(1))
+
+
+def test_a_state_may_be_declared_within_the_operator_and_is_inherited() -> None:
+    class Outer(Operator):
+        @dataclass
+        class Seen:
+            numbers: list[int] = field(default_factory=list)
+
+        value: In[Number]
+        state: Seen
+
+        def process(self, value: Number) -> None:
+            self.state.numbers.append(value.stamp)
+
+    class Inner(Outer):
+        pass
+
+    operator = Inner()
+    operator.process(number(5))
+
+    assert operator.snapshot() == {"numbers": [5]}
+
+
+def test_an_operator_without_a_state_gives_no_snapshot() -> None:
+    class Plain(Operator):
+        value: In[Number]
+
+        def process(self, value: Number) -> None:
+            return None
+
+    assert Plain().snapshot() is None
+    with pytest.raises(NotImplementedError, match="Plain gives snapshots but cannot restore"):
+        Plain().restore({})
