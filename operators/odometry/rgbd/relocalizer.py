@@ -32,6 +32,8 @@ from operators.odometry.rgbd.uniqueness import unique
 PAIRS = 60  # features of one keyframe that are paired
 FEWEST = 8  # different features of a view that must agree on its pose for a look at what else supports it
 APART = 0.5  # metres between two places
+SHARED = 0.15  # of a view that the map must have seen to contradict it
+CONTRADICTED = 0.4  # of what a view and the map both see: less of it agrees only at a wrong place, or after a change
 VIEWS = 2  # keyframes that a recognised view is compared with
 SPARSE = 4  # patches of the view's surface between points by which these are chosen
 FEWEST_PIXELS = 7  # features that a pose may be solved from without depth
@@ -114,6 +116,15 @@ def believed(
     if not views or not gathered(frame, T_world_camera, views, camera, noise).certain:
         return None
     return views[-1] if unique(frame, T_world_camera, views, camera, noise) else None
+
+
+def contradicted(
+    frame: Frame, T_world_camera: Matrix, keyframes: Sequence[Keyframe], camera: RgbdCamera, noise: DepthNoise
+) -> bool | None:
+    """Returns whether most of a view at a pose lies elsewhere than on keyframes; nothing where these saw too little."""
+    views = seeing(frame.surface.points(SPARSE), T_world_camera, keyframes, VIEWS)
+    found = gathered(frame, T_world_camera, views, camera, noise)
+    return found.agreement < CONTRADICTED if found.overlap >= SHARED else None
 
 
 def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> list[Sighting]:

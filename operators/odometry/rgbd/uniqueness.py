@@ -34,7 +34,7 @@ HALF = 2.0  # metres, half the side of that grid at most
 SHIFTS = (0.3, 2.0)  # metres: the least and the largest period that is looked for
 ASIDE = 0.1  # metres by which a shift may leave the free directions
 SHARED = 0.1  # of the pattern that must still lie on the map for a shift to be judged
-JUDGED = 0.5  # share of the shifts that must be
+JUDGED = 1 / 3  # share of the shifts that must be
 REPEATS = 0.6  # of the likeness where the pose is: a shift that reaches it fits as well
 THICK = 0.05  # metres by which points of a plane may be off it
 SUPPORTERS = 200  # points by which the plane that holds the most is found
@@ -42,12 +42,11 @@ SUPPORTERS = 200  # points by which the plane that holds the most is found
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """A plane's axes (2, 3), its normal (3,), and its points in those coordinates (N, 2) about an origin (3,)."""
+    """A plane by two axes (2, 3), its normal (3,) and an origin (3,) on it."""
 
     axes: Array
     normal: Array
     origin: Array
-    points: Array
 
 
 def unique(
@@ -93,10 +92,7 @@ def _fullest(points: Points, normals: Array) -> _Plane:
     first = np.cross(normal, aside)
     first /= np.linalg.norm(first)
     axes = np.array([first, np.cross(normal, first)])
-    height = float(np.median(some[on[:, best]] @ normal))
-    held = points[(np.abs(points @ normal - height) < THICK) & (normals @ normal > ALIKE)]
-    middle = np.median(held @ axes.T, axis=0)
-    return _Plane(axes, normal, middle @ axes + height * normal, held @ axes.T - middle)
+    return _Plane(axes, normal, np.median(some[on[:, best]], axis=0))
 
 
 def _told_by_pattern(
@@ -104,24 +100,24 @@ def _told_by_pattern(
     camera: RgbdCamera, slack: float,
 ) -> bool:  # fmt: skip
     """Returns whether a plane's pattern fits nowhere else along the free directions (K, 3), as far as it is seen."""
-    half = np.minimum(np.abs(plane.points).max(axis=0), HALF)
+    seen = transform_points(T_world_camera, frame.surface.points(STRIDE)) - plane.origin
+    half = np.minimum(np.abs(seen[np.abs(seen @ plane.normal) < THICK] @ plane.axes.T).max(axis=0), HALF)
     a, b = (np.arange(-h, h + CELL, CELL) for h in half.tolist())
     grid = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2) @ plane.axes + plane.origin
     shape = len(a), len(b)
     here = _laid_out(grid, shape, frame.surface, levelled(frame.gray), T_world_camera, camera, slack)
-    likeness, shared = _shifted(
-        here,
-        [_laid_out(grid, shape, k.surface, levelled(k.gray), k.T_world_camera, camera, slack) for k in keyframes],
-    )
+    there = [_laid_out(grid, shape, k.surface, levelled(k.gray), k.T_world_camera, camera, slack) for k in keyframes]
+    fits, seen_by_both = _unshifted(here, there)
+    likeness, shared = _shifted(here, [*there, here])  # on itself, too: the map may hold little around what both show
     steps = [CELL * ((np.arange(n) + n // 2) % n - n // 2) for n in likeness.shape]
     shifts = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1) @ plane.axes
     length = np.linalg.norm(shifts, axis=-1)
     aside = np.linalg.norm(shifts - shifts @ free.T @ free, axis=-1)
     asked = (length > SHIFTS[0]) & (length < SHIFTS[1]) & (aside < ASIDE)
-    judged = asked & (shared > SHARED * shared[0, 0])
+    judged = asked & (shared > SHARED * seen_by_both)
     if np.count_nonzero(judged) < JUDGED * np.count_nonzero(asked):
         return False
-    return bool(likeness[judged].max(initial=0.0) < REPEATS * likeness[0, 0])
+    return bool(likeness[judged].max(initial=0.0) < REPEATS * fits)
 
 
 def _laid_out(
@@ -138,6 +134,14 @@ def _laid_out(
     seen = inside & (inverse > 0) & np.isfinite(brightness)
     seen &= np.abs(1.0 / np.where(inverse > 0, inverse, 1.0) - z) < NEAR + slack * z * z
     return np.where(seen, brightness, 0.0).reshape(shape), seen.astype(np.float64).reshape(shape)
+
+
+def _unshifted(one: tuple[Array, Array], others: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
+    """Returns what `_shifted` does for no shift."""
+    product = sum(float((one[0] * values).sum()) for values, _ in others)
+    here = sum(float((one[0] ** 2 * seen).sum()) for _, seen in others)
+    there = sum(float((values**2 * one[1]).sum()) for values, _ in others)
+    return product / float(np.sqrt(max(here * there, 1e-6))), sum(float((one[1] * seen).sum()) for _, seen in others)
 
 
 def _shifted(one: tuple[Array, Array], others: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:

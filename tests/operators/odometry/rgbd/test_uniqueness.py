@@ -110,6 +110,6 @@ def test_a_corridor_whose_pattern_does_not_repeat_is_evidence() -> None:
 
 def test_a_plane_of_which_too_little_is_seen_for_its_pattern_to_repeat_is_no_evidence() -> None:
     def strip(X: Array, Y: Array) -> Array:
-        return np.where(np.abs(Y) < 0.3, 2.0, 1e3)  # which is no return
+        return np.where(np.abs(Y) < 0.2, 2.0, 1e3)  # which is no return
 
     assert not taken_for(strip, 6.0, 0.1, 0.1)
