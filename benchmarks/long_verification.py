@@ -36,6 +36,8 @@ OPERATORS = STATEFUL + STATELESS
 PAIRS = list(zip(STATELESS, STATEFUL, strict=False))
 SNAPSHOT_SECONDS = 600
 LOOK_EVERY = 0.5
+CHUNK_NS = 1_000_000_000
+"""Event time after which a run writes what it has, however little that is."""
 GRAPH = "\n".join(
     [
         "graph: long",
@@ -79,6 +81,7 @@ def make(out: Path, seed: Path, steps: int, rate: float) -> None:
             writer.write_firings(name, EPOCH, encode_batch([decode_batch(payload).records[0]]))
         index = dict.fromkeys(streams, 1)
         period, snapshots = round(1e9 / rate), max(1, round(SNAPSHOT_SECONDS * rate))
+        flushed = EPOCH
         for k in range(steps):
             stamp = EPOCH + k * period
             given, made = numbered(stamp, k % 1000), numbered(stamp, (k + 1) % 1000)
@@ -103,6 +106,9 @@ def make(out: Path, seed: Path, steps: int, rate: float) -> None:
                     writer.write_firings(name, stamp, encode_batch([snapshot]))
                     index[name] += 1
                 writer.write(stream, given if first else made, seq=k)
+            if stamp - flushed >= CHUNK_NS:
+                writer.flush()
+                flushed = stamp
         for name in streams:
             last = FiringRecord(name, 0, index[name], "finish", FOREVER, outputs=(None,))
             writer.write_firings(name, EPOCH + steps * period, encode_batch([last], last=True))

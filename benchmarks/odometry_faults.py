@@ -9,9 +9,9 @@ depth is valid and changes, after SE(3) alignment; and that of those among them 
 tracking. *Tracked* is the share of these; *found again* after how many frames that follow the fault it does so first,
 within 10 cm of the truth by the first pose: so in the map from before.
 
-In simulated worlds, frames are missing. *Seen before* is how many frames that follow within 1 s show, by the truth,
-at least half of what one view before the gap saw. A pose that is claimed in the old map is *wrong* where it is 20 cm
-or 0.1 rad off, seen before or not.
+In simulated worlds, frames are missing: 52 gaps in each, of 1 to 8 s. A gap is *wrong* where a pose that is claimed in
+the old map within the next second is 20 cm or 0.1 rad off, else *found* where one is claimed, else *lost*. *Seen
+before* are those whose first frame shows, by the truth, at least half of what one view before the gap saw.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import odometry_gaps as gaps
 from numpy.typing import NDArray
+from odometry_gaps import WORLDS, table
 from visual_odometry import REPOSITORY, read, score
 
 from dataflow.messages.geometry import invert
@@ -106,7 +106,7 @@ def run(frames: list[Frame], truth: list[Any], camera: RgbdCamera, fault: Fault,
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["recorded", "worlds"], nargs="?", default="recorded")
-    parser.add_argument("worlds", nargs="*", default=list(gaps.WORLDS), help="KIND:SEED")
+    parser.add_argument("worlds", nargs="*", default=list(WORLDS), help="KIND:SEED")
     parser.add_argument("--cache", type=Path, default=Path("out") / "visual_odometry", help="folder of rendered drives")
     parser.add_argument("--data", type=Path, default=DATA, help="a 7-Scenes folder (default: the project's data)")
     parser.add_argument(
@@ -117,7 +117,7 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     if arguments.what == "worlds":
-        gaps.table(arguments.worlds, arguments.cache)
+        table(arguments.worlds, arguments.cache)
         return
     frames, truth = read(arguments.data)
     K_depth = np.loadtxt(arguments.data / "camera-intrinsics.txt")

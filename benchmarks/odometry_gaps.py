@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -19,67 +20,74 @@ from operators.odometry.tracking import MEASURED
 Array = NDArray[np.float64]
 
 WORLDS = ("office:823", "office:824", "corridor:823", "corridor:824", "table_top:823", "table_top:824")
-BEGINS = (60, 120, 180, 240)  # first frames that are missing
-LENGTHS = (20, 80)  # how many, at 10 Hz
+BEGINS = tuple(range(40, 300, 20))  # first frames that are missing
+LENGTHS = (10, 20, 40, 80)  # how many, at 10 Hz
 AFTER = 10  # frames that follow: 1 s
 SEEN, SAME = 0.5, 0.1  # share of a view, metres
 WRONG = (0.2, 0.1)  # metres, radians
 EARLIER = 5  # frames from one earlier view to the next that is compared
 
 
+@dataclass(frozen=True)
+class Gap:
+    """What came of a gap: the claims of the frames after it to be in the old map, right or wrong, and whether the first
+    of them shows what was seen before."""
+
+    seen: bool
+    right: tuple[bool, ...]
+    wrong: tuple[bool, ...]
+
+
 def table(worlds: list[str], cache: Path) -> None:
     """Prints what came of every gap, summed over each world."""
-    print("| world | gaps | frames seen before | tracked of them % | found at once | within 1 s | wrong |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
-    totals = np.zeros(6, np.int64)
+    print("| world | gaps | found | lost | wrong | seen before | of these found at once | within 1 s |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    totals = np.zeros(7, np.int64)
     for world in worlds:
-        counts = np.array(list(counted(rendered(cache, world)).values()), np.int64)
+        counts = np.array(summed(gaps(rendered(cache, world))), np.int64)
         totals += counts
         _show(world.replace(":", " "), counts)
     _show("all", totals)
 
 
-def counted(drive: Drive) -> dict[str, int]:
-    """Returns how many gaps end in sight of what was seen before, in how many frames it is, in how many of these the
-    camera is tracked, after how many gaps from the first on, after how many within a second, and false frames."""
-    totals = {"gaps": 0, "seen": 0, "tracked": 0, "at once": 0, "within": 0, "wrong": 0}
-    odometry = RgbdOdometry(drive.camera)
+def summed(every: list[Gap]) -> list[int]:
+    """Returns how many gaps there are, end in the right place within a second, in no place, and in a wrong one; how
+    many end in sight of what was seen before, and of these are found from the first frame on, and within a second."""
+    wrong = [any(gap.wrong) for gap in every]
+    found = [any(gap.right) and not off for gap, off in zip(every, wrong, strict=True)]
+    seen = [gap for gap in every if gap.seen]
+    return [
+        len(every), sum(found), len(every) - sum(found) - sum(wrong), sum(wrong),
+        len(seen), sum(gap.right[0] for gap in seen), sum(any(gap.right) for gap in seen),
+    ]  # fmt: skip
+
+
+def gaps(drive: Drive) -> list[Gap]:
+    """Returns what came of every gap in a drive."""
+    found, odometry = [], RgbdOdometry(drive.camera)
     for i in range(max(BEGINS) + 1):
         if i in BEGINS:
-            for length in LENGTHS:
-                for name, count in _gap(drive, odometry, i, length).items():
-                    totals[name] += count
+            found += [_gap(drive, odometry, i, length) for length in LENGTHS]
         odometry.track(drive.image[i], drive.depth[i], int(drive.stamps[i]))
-    return totals
+    return found
 
 
-def _gap(drive: Drive, before: RgbdOdometry, begins: int, length: int) -> dict[str, int]:
+def _gap(drive: Drive, before: RgbdOdometry, begins: int, length: int) -> Gap:
     odometry = RgbdOdometry(drive.camera)
     odometry.restore(before.snapshot())
     last = before.snapshot().motion
     assert last is not None
     T_world_truth = last.T_world_camera @ invert(drive.truth[begins - 1])
     segment = odometry.snapshot().keyframes[-1].segment
-    seen, right, wrong = [], [], 0
-    for i in range(begins + length, min(begins + length + AFTER, len(drive.stamps))):
+    right, wrong = [], []
+    for i in range(begins + length, begins + length + AFTER):
         result = odometry.track(drive.image[i], drive.depth[i], int(drive.stamps[i]))
-        joined = odometry.snapshot().keyframes[-1].segment == segment
-        claimed = joined and result.status in MEASURED
+        claimed = odometry.snapshot().keyframes[-1].segment == segment and result.status in MEASURED
         x = se3.log(invert(T_world_truth @ drive.truth[i]) @ result.T_world_camera)
         off = bool(np.linalg.norm(x[:3]) > WRONG[0] or np.linalg.norm(x[3:]) > WRONG[1])
-        wrong += claimed and off
-        seen.append(shared(drive, i, begins) >= SEEN)
         right.append(claimed and not off)
-    there = np.flatnonzero(seen)
-    found = [i for i in there if right[i]]
-    return {
-        "gaps": int(len(there) > 0),
-        "seen": len(there),
-        "tracked": len(found),
-        "at once": int(len(there) > 0 and right[there[0]]),
-        "within": int(len(found) > 0),
-        "wrong": wrong,
-    }
+        wrong.append(claimed and off)
+    return Gap(shared(drive, begins + length, begins) >= SEEN, tuple(right), tuple(wrong))
 
 
 def shared(drive: Drive, i: int, begins: int) -> float:
@@ -107,6 +115,4 @@ def _surface(drive: Drive, i: int) -> Surface:
 
 
 def _show(name: str, counts: NDArray[np.int64]) -> None:
-    gaps, seen, tracked, at_once, within, wrong = counts.tolist()
-    share = 100 * tracked / max(seen, 1)
-    print(f"| {name} | {gaps} | {seen} | {share:.1f} | {at_once} | {within} | {wrong} |", flush=True)
+    print(f"| {name} | {' | '.join(str(count) for count in counts.tolist())} |", flush=True)

@@ -27,7 +27,7 @@ class Declaration:
     """Collects what one class declares. `bases` are the classes whose own attributes are no declarations."""
 
     def __init__(self, cls: type, bases: tuple[type, ...], local: Mapping[str, Any]) -> None:
-        self.cls, self.bases = cls, bases
+        self.cls, self.bases, self._local = cls, bases, dict(local)
         self.inputs: dict[str, InputPort] = {}
         self.outputs: dict[str, OutputPort] = {}
         self.parameters: dict[str, Any] = {}
@@ -59,6 +59,7 @@ class Declaration:
             if period is None and not self._triggers():
                 raise self.fault("(inputs)", 'nothing makes it fire: declare an In[...] or give every="100ms"')
             taken = takes(self.inputs, self.fault)
+            self._check_returned()
         model = pydantic.create_model(
             f"{self.cls.__name__}Parameters",
             __config__=pydantic.ConfigDict(extra="forbid", frozen=True, validate_default=True),
@@ -145,6 +146,29 @@ class Declaration:
             raise self.fault(
                 many[0], "many=True on one of several joined inputs: use merge=True, or one stream an input"
             )
+
+    def _check_returned(self) -> None:
+        """Refuses a `process()` that is annotated to return messages which its outputs do not take."""
+        function = vars(self.cls).get("process")
+        if function is None:  # inherited, and looked at there
+            return
+        try:
+            hint = typing.get_type_hints(function, localns=self._local).get("return")
+        except (NameError, TypeError):  # a type that is imported for type checkers alone
+            return
+        members = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+        returned = [m for m in members if isinstance(m, type) and issubclass(m, Message) and m is not Message]
+        ports = [port for port in self.outputs.values() if not port.static]
+        if returned and len(ports) != 1:
+            names = ", ".join(port.name for port in ports) or "none"
+            raise self.fault(
+                "process", f"returns one message, but has {len(ports)} outputs ({names}): return a mapping"
+            )
+        for message in returned:
+            if not issubclass(message, ports[0].types):
+                raise self.fault(
+                    "process", f"returns {message.SCHEMA}, but {ports[0].name} emits {ports[0].type_text()}"
+                )
 
     def _check_source(self) -> None:
         if self.inputs:

@@ -230,16 +230,17 @@ class Operator:
         """
         return False
 
-    def use_file(self, path: str | Path) -> Path:
+    def use_file(self, path: str | Path, *, name: str | None = None) -> Path:
         """Notes the content hash of a file that the operator reads, for the firing record of `setup()`.
 
-        Raises FileNotFoundError that names the parameter's operator and the place looked at.
+        It is noted under `name`, by default the path. Raises FileNotFoundError that names the operator and the place
+        looked at.
         """
         file = Path(path).expanduser()
         if not file.is_file():
             raise FileNotFoundError(f"{type(self).__name__}: no file {str(path)!r} (looked for {file.absolute()})")
         with file.open("rb") as handle:
-            self.files[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()
+            self.files[name or str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()
         return file
 
 

@@ -11,13 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dataflow.arguments import checked
+from dataflow.execution.driver import Driver, HandOver
 from dataflow.execution.runner import OperatorRunner
 from dataflow.execution.source import SourceRunner
 from dataflow.graph.model import Live, Node
 from dataflow.messages.base import Message
 from dataflow.operator import Operator, Source
 from dataflow.records.firing import FiringRecord
-from dataflow.sync import Entry
+from dataflow.sync import NEVER, Entry
 
 NAMESPACE = "test"
 
@@ -38,22 +39,45 @@ class Played:
         return {port: [m.digest().hex() for m in messages] for port, messages in self.outputs.items()}
 
 
-class _Collector:
-    def __init__(self, node: Node) -> None:
+class _Collector(HandOver):
+    """Keeps what the operator emits."""
+
+    def __init__(self, driver: Driver, node: Node) -> None:
+        super().__init__(driver)
         self.ports = {stream: port for port, stream in node.outputs.items()}
         self.played = Played({port: [] for port in node.outputs}, [])
 
     def message(self, stream: str, entry: Entry) -> None:
         self.played.outputs[self.ports[stream]].append(entry.value)
 
-    def frontier(self, stream: str, frontier: int) -> None:
-        """No consumer waits for it."""
-
-    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        """No consumer waits for it."""
-
     def record(self, record: FiringRecord) -> None:
         self.played.records.append(record)
+
+
+class _Arrivals:
+    """Whole streams as a feed, one message at a time: static ones first, else the oldest stamp."""
+
+    def __init__(self, emitter: HandOver, streams: Mapping[str, Sequence[Message]], static: frozenset[str]) -> None:
+        self.firings, self.last, self.ended = 0, NEVER, False
+        self._emitter, self._streams = emitter, streams
+        arrivals = [(s not in static, m.stamp, s, seq, m) for s in streams for seq, m in enumerate(streams[s])]
+        self._left = sorted(arrivals, key=lambda arrival: arrival[:4], reverse=True)
+
+    def look_ahead(self) -> int | None:
+        return self._left[-1][1] if self._left else None
+
+    def admit(self) -> tuple[int, int]:
+        _, self.last, stream, seq, message = self._left.pop()
+        self._emitter.message(stream, Entry(message.stamp, message, seq, 0, message.digest(), stream))
+        return 1, 0
+
+    def promise(self) -> None:
+        """Promises nothing: firings wait for messages."""
+
+    def finish(self, reason: str) -> None:
+        self.ended = True
+        for stream, messages in self._streams.items():
+            self._emitter.end(stream, messages[-1].stamp if messages else None, reason)
 
 
 @checked
@@ -91,40 +115,23 @@ def play(
         tolerance=spec.tolerance,
         every=spec.every,
     )
-    collector = _Collector(node)
+    driver = Driver()
+    collector = _Collector(driver, node)
+    runner: OperatorRunner | None = None
     try:
         if isinstance(operator, Source):
-            _play_source(SourceRunner(node, collector, operator=operator, seed=seed))
-            return collector.played
-        statics = frozenset(stream for name in static for stream in wired.get(name, ()))
-        runner = OperatorRunner(node, collector, static=statics, seed=seed, paranoid=paranoid, operator=operator)
-        _play_operator(runner, {s: m for given in wired.values() for s, m in given.items()})
-        collector.played.drops = dict(runner.drops)
+            driver.sources.append(source := SourceRunner(node, collector, operator=operator, seed=seed))
+            driver.feeding.feeds.append(source)
+        else:
+            statics = frozenset(stream for name in static for stream in wired.get(name, ()))
+            runner = OperatorRunner(node, collector, static=statics, seed=seed, paranoid=paranoid, operator=operator)
+            driver.add(runner)
+            given = {stream: messages for streams in wired.values() for stream, messages in streams.items()}
+            driver.feeding.feeds.append(_Arrivals(HandOver(driver), given, statics))
+        driver.set_up()
+        while driver.turn():
+            pass
     finally:
         operator.close()
+    collector.played.drops = {} if runner is None else dict(runner.drops)
     return collector.played
-
-
-def _play_source(runner: SourceRunner) -> None:
-    runner.setup()
-    while runner.look_ahead() is not None:
-        runner.admit()
-    runner.finish()
-
-
-def _play_operator(runner: OperatorRunner, streams: Mapping[str, Sequence[Message]]) -> None:
-    runner.setup()
-    arrivals = sorted(
-        ((m.stamp, stream, seq, m) for stream, messages in streams.items() for seq, m in enumerate(messages)),
-        key=lambda arrival: arrival[:3],
-    )
-    static = runner.aligner.spec.static
-    arrivals.sort(key=lambda arrival: arrival[1] not in static)
-    for stamp, stream, seq, message in arrivals:
-        runner.push(stream, Entry(stamp, message, seq, 0, message.digest(), stream))
-        while runner.step():
-            pass
-    for stream, messages in streams.items():
-        runner.end(stream, messages[-1].stamp if messages else None, "end of test")
-    while runner.step():
-        pass

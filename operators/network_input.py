@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 
 Layout = Literal["nchw", "nhwc"]
 Color = tuple[int, int, int]
+
+NORMALIZATIONS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "none": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+    "unit": ((0.0, 0.0, 0.0), (255.0, 255.0, 255.0)),
+    "imagenet": ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375)),
+}
+"""Mean and scale of pixels from 0 to 255, red first, by their names."""
 
 _TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32,
@@ -71,13 +78,16 @@ def image_input(
     scale: Sequence[float],
     layouts: Sequence[Layout] = ("nchw", "nhwc"),
     types: Sequence[str] = tuple(_TYPES),
+    others: int = 0,
 ) -> ImageInput:
-    """Reads what the model's one input takes; `free` is the (width, height) where the model leaves an extent open.
+    """Reads what the model's input of an image takes; `free` is the (width, height) where an extent is left open.
+
+    The model may have so many `others` besides, after it.
 
     Raises ModelError for a model whose input is no image of three channels in one of the layouts and types.
     """
     inputs = session.get_inputs()
-    found = [each for each in layouts if _is_image(inputs[0].shape, each)] if len(inputs) == 1 else []
+    found = [each for each in layouts if _is_image(inputs[0].shape, each)] if 1 <= len(inputs) <= 1 + others else []
     if not found or inputs[0].type not in types:
         described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
         shapes = " or ".join({"nchw": "[1, 3, H, W]", "nhwc": "[1, H, W, 3]"}[each] for each in layouts)

@@ -152,7 +152,7 @@ def load(family: Family, name: str, weights: str, file: Path | None, device: str
         model = _empty(family, name, count, state)
         classes = classes or tuple(map(str, range(count)))
     else:
-        chosen = _choice(name, weights)
+        chosen = weights_of(name, weights)
         state = _cached(name, chosen)
         classes = tuple(chosen.meta["categories"])
         model = _empty(family, name, len(classes), state)
@@ -192,10 +192,11 @@ def cached_weights(name: str, weights: str) -> dict[str, Any]:
 
     Raises WeightsError with the places searched and how to get them.
     """
-    return _cached(name, _choice(name, weights))
+    return _cached(name, weights_of(name, weights))
 
 
-def _choice(name: str, weights: str) -> Any:
+def weights_of(name: str, weights: str) -> Any:
+    """Returns torchvision's weights of a model by name (`default`, `COCO_V1`). Raises WeightsError for a wrong name."""
     from torchvision.models import get_model_weights
 
     choices = get_model_weights(name)

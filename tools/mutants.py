@@ -121,8 +121,8 @@ def _is_type(node: ast.BinOp | ast.BoolOp) -> bool:
 
 
 def drawn(package: Path, count: int, seed: int) -> list[Mutant]:
-    """Returns `count` mutants of the files of a package, equal ones for equal sources and seeds."""
-    files = sorted(path for path in package.rglob("*.py"))
+    """Returns `count` mutants of a file or of those of a package, equal ones for equal sources and seeds."""
+    files = sorted(package.rglob("*.py")) if package.is_dir() else [package]
     every = [mutant for file in files for mutant in mutants_of(file, file.read_bytes())]
     return random.Random(seed).sample(every, min(count, len(every)))
 

@@ -126,7 +126,7 @@ class Pair:
             one.orders.released = True
             one.outlet.release()
             one.pace.begin(None, time.time())
-            one.runners.ready.wake_all()
+            one.driver.ready.wake_all()
             one.live.start()
         near, far = made
         with contextlib.suppress(ImportError):  # a checkout in which messages are made elsewhere and copied

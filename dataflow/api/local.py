@@ -5,29 +5,25 @@ Firings depend on timestamps and frontiers alone, so what comes out is what a ru
 
 from __future__ import annotations
 
-import functools
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any
 
-from dataflow.chaos.faults import OperatorFaults
-from dataflow.execution.calls import summary_of
+from dataflow.execution.driver import Driver, HandOver
 from dataflow.execution.failure import OperatorFailure
-from dataflow.execution.feeds.window import Window
-from dataflow.execution.protocol import Runner
 from dataflow.execution.threads import limited_threads
-from dataflow.graph.model import Graph, Node
+from dataflow.graph.model import Graph
+from dataflow.process.build import build
 from dataflow.process.config import ProcessConfig
-from dataflow.process.feeding import Feeding
-from dataflow.process.runners import Runners, make_log, make_runner, make_source
-from dataflow.process.streams.pace import Pace
+from dataflow.process.progress import counts_of, final_report
 from dataflow.records.firing import FiringRecord, encode_batch
 from dataflow.sinks.recorder import RecorderSink
+from dataflow.supervision.configs import replay_of, warm_start_of
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, RunReport, Status
 from dataflow.supervision.plan import LogPlan
 from dataflow.sync import FOREVER, NEVER, Entry
@@ -35,7 +31,6 @@ from dataflow.sync import FOREVER, NEVER, Entry
 BATCH_RECORDS = 64
 SHOW_EVERY = 0.2
 Watch = Callable[[Status], None]
-Made = TypeVar("Made")
 
 
 class Recorder:
@@ -72,26 +67,18 @@ class Recorder:
         return self._sink.close(outcome)
 
 
-class Emitting:
-    """Hands what an operator emits to those who take it, and to the recorder."""
+class Emitting(HandOver):
+    """Gives what operators emit to the recorder, too."""
 
-    def __init__(self, runners: Runners) -> None:
-        self._runners = runners
-        self.recorder: Recorder | None = None
+    recorder: Recorder | None = None
 
     def message(self, stream: str, entry: Entry) -> None:
-        for runner in self._runners.taking(stream):
-            runner.push(stream, entry)
+        super().message(stream, entry)
         if self.recorder is not None:
             self.recorder.message(stream, entry)
 
-    def frontier(self, stream: str, frontier: int) -> None:
-        for runner in self._runners.taking(stream):
-            runner.advance(stream, frontier)
-
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        for runner in self._runners.taking(stream):
-            runner.end(stream, final_stamp, reason)
+        super().end(stream, final_stamp, reason)
         if self.recorder is not None:
             self.recorder.end(stream, final_stamp, reason)
 
@@ -106,11 +93,8 @@ class LocalRun:
     def __init__(self, graph: Graph, *, log: LogPlan | None = None, paranoid: bool = False) -> None:
         self.graph, self._log = graph, log
         self._config = config_of(graph, log, paranoid=paranoid)
-        self._runners = Runners()
-        self._emitter = Emitting(self._runners)
-        window = Window(1, 1)
-        window.cover(FOREVER)  # one thread: a step is done before the next one is read
-        self._feeding = Feeding(window, Pace(None))
+        self._driver = Driver()
+        self._emitter = Emitting(self._driver)
         self._stopped = False
         self._first: int | None = None
 
@@ -127,9 +111,8 @@ class LocalRun:
         watch: Watch | None = None,
     ) -> RunReport:
         """Runs it to its end, or until Ctrl-C. Raises `RunFailed` with the first operator that fails."""
-        replaced = set() if self._log is None else {self.graph.streams[s].node for s in self._log.streams}
         logged = set() if self._log is None else set(self._log.streams)
-        made = {s for s, stream in self.graph.streams.items() if stream.node not in replaced} | logged
+        made = {s for s, stream in self.graph.streams.items() if stream.node in self._config.nodes} | logged
         if record is not None:
             record.parent.mkdir(parents=True, exist_ok=True)
             options = {"metadata": metadata or {}, "overwrite": overwrite}
@@ -139,7 +122,7 @@ class LocalRun:
         began = time.monotonic()
         try:
             with limited_threads(self.graph.threads), _interrupts(self.stop):
-                self._run(replaced, watch)
+                self._run(watch)
             outcome = "interrupted" if self._stopped else "complete"
         except OperatorFailure as failure:
             outcome = f"failed: {str(failure).splitlines()[0]}"
@@ -149,93 +132,46 @@ class LocalRun:
                 facts = self._emitter.recorder.close(outcome)
         return self._report(time.monotonic() - began, {} if record is None else {"recorder": facts})
 
-    def _run(self, replaced: set[str], watch: Watch | None) -> None:
+    def _run(self, watch: Watch | None) -> None:
         try:
-            self._make(replaced)
-            for maker in self._runners.all:
-                maker.setup()
-            for log in self._feeding.logs:
-                log.setup()
-            self._first = min(self._feeding.first_stamps(), default=None)
+            build(self._driver, self.graph, self._config, self._emitter)
+            self._driver.set_up()
+            self._first = min(self._driver.feeding.first_stamps(), default=None)
             self._work(watch)
         finally:
-            self._close()
-
-    def _make(self, replaced: set[str]) -> None:
-        for node in self.graph.nodes.values():
-            if node.name in replaced:
-                continue
-            if node.source:
-                source = _made(node, functools.partial(make_source, node, self.graph, self._config, self._emitter))
-                self._runners.sources.append(source)
-                self._feeding.feeds.append(source)
-            else:
-                make_here(node, self.graph, self._config, self._emitter, self._runners)
-        log = make_log(self.graph, self._config, self._emitter)
-        if log is not None:
-            self._feeding.play_back(log)
+            if failures := self._driver.close():
+                raise failures[0]
 
     def _work(self, watch: Watch | None) -> None:
-        """Runs what is decided, then reads the next step of the feeds, until nothing is left of either."""
         shown = time.monotonic()
-        while True:
+        while self._driver.turn():
             if self._stopped:
-                self._feeding.finish("interrupted")
-            if not (step_each(self._runners) or self._feeding.admit()):
-                self._feeding.promise()
-                if not step_each(self._runners):
-                    break
+                self._driver.feeding.finish("interrupted")
             if watch is not None and time.monotonic() - shown >= SHOW_EVERY:
                 shown = time.monotonic()
                 watch(Status(phase="running", operators=self._counts(), first=self._first))
         self._check_ended()
 
     def _check_ended(self) -> None:
-        held = {r.node.name: r.waiting() for r in self._runners.operators if not r.ended}
+        held = {r.node.name: r.waiting() for r in self._driver.operators if not r.ended}
         if held:
             name, (stamp, needs) = next(iter(held.items()))
             inputs = ", ".join(needs) or "its inputs"
             raise RunFailed(f"operator {name!r} can never fire again: it waits for {inputs} at stamp {stamp}")
 
-    def _close(self) -> None:
-        """Closes every operator; the first error is raised when all are closed."""
-        failures = self._runners.close(but=())
-        for log in self._feeding.logs:
-            log.close()
-        if failures:
-            raise failures[0]
-
     def _counts(self) -> dict[str, OperatorCounts]:
-        counts = {}
-        for source in self._runners.sources:
-            work = source.work
-            counts[source.node.name] = OperatorCounts(
-                source.firings, source.ports.emitted, 0, work.cpu_ns, source.last, work.wall_ns
-            )
-        for runner in self._runners.operators:
-            work, dropped = runner.work, sum(runner.drops.values())
-            counts[runner.node.name] = OperatorCounts(
-                runner.firings, runner.ports.emitted, dropped, work.cpu_ns, runner.done, work.wall_ns
-            )
-        return counts
+        rows = counts_of(self._driver, self._driver.operators)
+        return {name: OperatorCounts(*row) for name, row in rows.items() if name in self.graph.nodes}
 
     def _report(self, wall: float, files: Mapping[str, Mapping[str, Any]]) -> RunReport:
-        counts = self._counts()
-        streams: dict[str, tuple[int, str]] = {}
-        for maker in self._runners.all:
-            for state in maker.ports.states.values():
-                assert state.digest is not None
-                streams[state.stream] = (state.digest.count, state.digest.hexdigest())
-        for log in self._feeding.logs:
-            streams |= {name: (count, digest) for name, count, digest in log.counts()}
-        reached = [*(log.last for log in self._feeding.logs), *(c.done for c in counts.values())]
-        runners = self._runners.operators
+        found = final_report(self._driver, {})
+        reached = [row[4] for row in found["counts"].values()]
         return RunReport(
             graph=self.graph.name,
-            streams=dict(sorted(streams.items())),
-            operators=counts,
-            drops={r.node.name: _losses(r.drops) for r in runners if r.drops},
-            summaries={r.node.name: s for r in runners if (s := summary_of(r.operator, r.node.name))},
+            streams={name: (count, digest) for name, (count, digest) in sorted(found["streams"].items())},
+            operators=self._counts(),
+            drops=_rows(found["drops"]),
+            summaries=found["summaries"],
             transport={},
             files=files,
             first=self._first,
@@ -243,68 +179,32 @@ class LocalRun:
             wall=wall,
             interrupted=self._stopped,
             notes=(),
+            waits=_rows(found["waits"]),
         )
 
 
-def _losses(drops: Mapping[tuple[str, str], int]) -> tuple[tuple[str, str, int], ...]:
-    return tuple((name, reason, number) for (name, reason), number in sorted(drops.items()))
+def _rows(found: Mapping[str, Sequence[Sequence[Any]]]) -> dict[str, tuple[tuple[str, str, int], ...]]:
+    return {name: tuple((port, what, n) for port, what, n in rows) for name, rows in found.items() if rows}
 
 
-def config_of(graph: Graph, log: LogPlan | None, *, paranoid: bool) -> ProcessConfig:
-    """Returns the configuration that a separate process would get."""
-    replay: dict[str, Any] | None = None
+def config_of(graph: Graph, log: LogPlan | None, *, paranoid: bool = False, sources: bool = True) -> ProcessConfig:
+    """Returns the configuration that a separate process would get. Sources that the recording replaces are left out,
+    and without `sources` all of them."""
+    replaced = set() if sources else {node.name for node in graph.sources()}
     if log is not None:
-        span = {"start": log.start, "end": log.end}
-        made = {"path": str(log.path), "streams": list(log.streams), "finals": dict(log.finals)}
-        replay = {**made, **span, "bag": log.bag}
+        replaced = {graph.streams[stream].node for stream in log.streams}
     return ProcessConfig(
         label="here",
         graph={},
-        nodes=list(graph.nodes),
+        nodes=[name for name in graph.nodes if name not in replaced],
         publish={},
         subscribe=[],
         listen=[],
-        replay=replay,
+        replay=replay_of(log),
         paranoid=paranoid,
         snapshots=graph.record.snapshots,
-        warm=None
-        if log is None or log.start is None or log.bag is not None
-        else {"path": str(log.path), "stamp": log.start},
+        warm=warm_start_of(log),
     )
-
-
-def step_each(runners: Runners) -> bool:
-    """One step of every operator, last ones first, so that what is under way is done before more is begun."""
-    worked = False
-    for runner in reversed(runners.operators):
-        worked = runner.step() or worked
-    return worked
-
-
-def make_here(node: Node, graph: Graph, config: ProcessConfig, emitter: Emitting, runners: Runners) -> None:
-    """Makes the runner of an operator that is not a source. Raises `OperatorFailure`."""
-    faults = OperatorFaults()
-
-    def make() -> Runner:
-        return make_runner(
-            node, graph, config, emitter, faults=faults, event_clock=time.time_ns, on_failure=_cannot_restart
-        )
-
-    runners.add(_made(node, make))
-
-
-def _made(node: Node, make: Callable[[], Made]) -> Made:
-    try:
-        return make()
-    except OperatorFailure:
-        raise
-    except Exception as error:
-        raise OperatorFailure(node.name, "construction", error) from error
-
-
-def _cannot_restart(failure: OperatorFailure, pause: float) -> None:
-    """Restarts belong to live runs, which take processes."""
-    raise failure
 
 
 @contextmanager

@@ -9,14 +9,15 @@ from typing import Any, Self
 
 from dataflow.api.graphs import GraphLike, resolved
 from dataflow.api.handed import HandedFeed
-from dataflow.api.local import Emitting, Recorder, config_of, make_here, step_each
+from dataflow.api.local import Emitting, Recorder, config_of
 from dataflow.api.runs import metadata_of
 from dataflow.arguments import checked, require
 from dataflow.execution.calls import summary_of
+from dataflow.execution.driver import Driver
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.threads import limited_threads
 from dataflow.messages.base import Message
-from dataflow.process.runners import Runners
+from dataflow.process.build import build
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.sim_to_real import warn_of_gap
 from dataflow.sync import Entry
@@ -57,8 +58,8 @@ class Session:
         warn_of_gap(self.graph)
         self._names = self._chosen(outputs)
         self._made: dict[str, list[Message]] = {}
-        self._runners = Runners()
-        self._emitter = _Collecting(self._runners, self._names, self._made)
+        self._driver = Driver()
+        self._emitter = _Collecting(self._driver, self._names, self._made)
         self._feed = HandedFeed(self.graph, static or {}, self._emitter)
         self._closed = False
         self._outcome = "failed: it did not end in order"
@@ -72,12 +73,8 @@ class Session:
         self._open.callback(self._close_operators)
         self._open.enter_context(limited_threads(self.graph.threads))
         try:
-            config = config_of(self.graph, None, paranoid=False)
-            for node in self.graph.nodes.values():
-                if not node.source:
-                    make_here(node, self.graph, config, self._emitter, self._runners)
-            for runner in self._runners.operators:
-                runner.setup()
+            build(self._driver, self.graph, config_of(self.graph, None, sources=False), self._emitter)
+            self._driver.set_up()
             self._feed.setup()
         except BaseException as error:
             self._fail(error)
@@ -134,13 +131,13 @@ class Session:
 
     def summaries(self) -> dict[str, Mapping[str, Any]]:
         """Returns what the operators sum up, by operator."""
-        return {r.node.name: s for r in self._runners.operators if (s := summary_of(r.operator, r.node.name))}
+        return {r.node.name: s for r in self._driver.operators if (s := summary_of(r.operator, r.node.name))}
 
     def _work(self) -> None:
-        """Runs what is decided, until nothing is left of it; a frontier alone may decide something further down."""
+        """Runs what is decided, until nothing is left of it."""
         try:
-            while step_each(self._runners) or self._emitter.moved:
-                self._emitter.moved = False
+            while self._driver.turn():
+                pass
         except OperatorFailure as failure:
             raise RunFailed(str(failure), failure.traceback, failure.operator) from failure
 
@@ -158,13 +155,7 @@ class Session:
             error.add_note(str(failure))
 
     def _close_operators(self) -> None:
-        failures = []
-        for runner in self._runners.operators:
-            try:
-                runner.operator.close()
-            except Exception as error:
-                failures.append(OperatorFailure(runner.node.name, "close()", error))
-        if failures:
+        if failures := self._driver.close():
             raise failures[0]
 
     def __enter__(self) -> Self:
@@ -177,20 +168,11 @@ class Session:
 
 
 class _Collecting(Emitting):
-    """Also keeps the messages of chosen streams, and whether a frontier moved since it was asked last."""
+    """Also keeps the messages of chosen streams."""
 
-    def __init__(self, runners: Runners, names: Mapping[str, str], made: dict[str, list[Message]]) -> None:
-        super().__init__(runners)
+    def __init__(self, driver: Driver, names: Mapping[str, str], made: dict[str, list[Message]]) -> None:
+        super().__init__(driver)
         self._names, self._kept = names, made
-        self.moved = False
-
-    def frontier(self, stream: str, frontier: int) -> None:
-        super().frontier(stream, frontier)
-        self.moved = True
-
-    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        super().end(stream, final_stamp, reason)
-        self.moved = True
 
     def message(self, stream: str, entry: Entry) -> None:
         super().message(stream, entry)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from dataflow.editing.key_frames import with_key_frames
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.editing.spans import SpanRecords, Stamps, records_of_span
 from dataflow.graph import GraphError
@@ -29,7 +30,8 @@ from dataflow.reexecution.recorded_run import ReplayError, recorded_graph, resol
 class Part:
     """Names what is to be taken over: the span (ns, inclusive; None: not cut there), and streams (None: all).
 
-    `bare`: exactly the messages of the span, without firing records.
+    A file that is written of it begins with the key frames of its video, which may be earlier. `bare`: exactly the
+    messages of the span, without firing records.
     """
 
     start: int | None = None
@@ -54,6 +56,7 @@ def write_part(
 ) -> Edited:
     """Writes a part of `origin` into a separate file. Raises `RecordingError`."""
     done = Edited(str(out))
+    part = decodable([origin], part, done)
     firings = _firings(origin, part, done)
     needed = {} if firings is None else firings.needed
     kept = masks_of(origin, part, needed)
@@ -74,6 +77,16 @@ def write_part(
         done.notes.append(f"{origin.path} {NO_END}")
     done.notes += [f"{origin.path}: {note}" for note in origin.file.damage]
     return done
+
+
+def decodable(origins: Sequence[Origin], part: Part, done: Edited) -> Part:
+    """Returns the part from the key frames on with which the video in it can be decoded; notes that in `done`."""
+    if part.start is None or part.bare:
+        return part
+    start = with_key_frames(origins, part.start, part.streams)
+    if start < part.start:
+        done.notes.append(f"it begins {(part.start - start) * 1e-9:.3f} s earlier, with a key frame of its video")
+    return replace(part, start=start)
 
 
 def copy_messages(

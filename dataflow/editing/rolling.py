@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.editing.part import Part, copy_messages, kept_stamps, masks_of, outputs_of, write_firings
+from dataflow.editing.part import Part, copy_messages, decodable, kept_stamps, masks_of, outputs_of, write_firings
 from dataflow.editing.report import Edited
 from dataflow.editing.spans import records_of_span
 from dataflow.graph.model import Graph
@@ -41,6 +41,7 @@ def keep_span(
     done = Edited(str(out))
     with ExitStack() as stack:
         origins = [stack.enter_context(Origin(file)) for file in files]
+        part = decodable(origins, part, done)
         stored = {origin.stream(c) for origin in origins for c in origin.of_kind(Kind.STREAM).values()}
         chosen = records_of_span(records, outputs_of(graph), stored, part.start, part.end)
         told = _told(records, outputs_of(graph))

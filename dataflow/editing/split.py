@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dataflow.editing.key_frames import with_key_frames
 from dataflow.editing.part import Part, write_part
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.recording.errors import RecordingError
@@ -32,7 +33,7 @@ def split(
     `every`: event time of a part (ns); `size`: bytes in the file that a part takes of this one, what a part holds
     besides for its firings aside. Raises `RecordingError`.
     """
-    spans = by_time(origin, every) if every is not None else by_size(origin, size or 1)
+    spans = _from_key_frames(origin, by_time(origin, every) if every is not None else by_size(origin, size or 1))
     if len(spans) > MOST_PARTS:
         raise RecordingError(f"{origin.path} would become {len(spans):,} parts; at most {MOST_PARTS:,} are written")
     width = max(3, len(str(len(spans) - 1)))
@@ -43,6 +44,12 @@ def split(
     for k, (name, (start, end)) in enumerate(zip(names, spans, strict=True)):
         part = Part(start if k else None, end if k < len(spans) - 1 else None)
         yield write_part(origin, part, name, compression=compression, overwrite=overwrite, watch=watch)
+
+
+def _from_key_frames(origin: Origin, spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Returns spans that begin with the key frames of the video, where there is some; fewer where these are rare."""
+    starts = sorted({spans[0][0], *(with_key_frames([origin], start) for start, _ in spans[1:])})
+    return [*((a, b - 1) for a, b in pairwise(starts)), (starts[-1], spans[-1][1])]
 
 
 def by_time(origin: Origin, every: int) -> list[tuple[int, int]]:

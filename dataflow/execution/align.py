@@ -31,5 +31,5 @@ def align_spec(node: Node, spec: OperatorSpec, static: frozenset[str]) -> AlignS
         mode="merge" if merged else "join",
         tolerance=node.tolerance if joined else 0,
         every=node.every,
-        static=static & frozenset(s for streams in node.inputs.values() for s in streams),
+        static=static & node.taken,
     )

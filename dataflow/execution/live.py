@@ -19,6 +19,7 @@ from dataflow.execution.event_time import EventTime
 from dataflow.execution.failure import RAISED, OperatorFailure
 from dataflow.execution.log import FiringLog, unlisted
 from dataflow.execution.ports import Emitter
+from dataflow.execution.protocol import Faults
 from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.model import Node
@@ -29,9 +30,6 @@ from dataflow.sync.single import make_aligner
 MOST_TRIED = 256
 """Messages and waits that are over, none of which decides a firing, in one step. A timer that falls behind drops its
 ticks one by one, while new ones come due: its process would never look at anything else."""
-
-Fault = Callable[[Firing], BaseException | None]
-"""A fault on purpose: is asked before each firing, may take its time, and gives an error to fail with instead."""
 
 
 class LiveRunner(OperatorRunner):
@@ -56,7 +54,7 @@ class LiveRunner(OperatorRunner):
         clock: Clock | None = None,
         event_clock: EventClock = time.time_ns,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
-        fault: Fault = lambda firing: None,
+        faults: Faults | None = None,
     ) -> None:
         more: dict[str, Any] = {"paranoid": paranoid, "operator": operator, "snapshots": snapshots}
         super().__init__(node, emitter, static=static, seed=seed, lossy=True, **more)
@@ -77,7 +75,7 @@ class LiveRunner(OperatorRunner):
         self._earlier = EarlierCounts()
         self._static = static
         self._statics: dict[str, Entry] = {}
-        self._on_failure, self._fault = on_failure, fault
+        self._on_failure, self.faults = on_failure, faults
         self._seen: dict[str, tuple[int, int]] = {}  # stream → incarnation, last stamp that the aligner was given
         self._jumped: dict[str, int] = {}  # producer → incarnation since its clock jumped back
         self._changed: dict[str, Any] = {}
@@ -113,7 +111,7 @@ class LiveRunner(OperatorRunner):
         return [*mine, *theirs], more + Counter(others)
 
     def has_drops(self) -> bool:
-        return self._log.pending or self.aligner.has_drops()
+        return bool(self._log.pending) or self.aligner.has_drops()
 
     # What streams say
 
@@ -230,7 +228,7 @@ class LiveRunner(OperatorRunner):
         if self.absent:
             firing = without_absent(firing, self.node, self.absent)
         try:
-            if (error := self._fault(firing)) is not None:
+            if self.faults is not None and (error := self.faults.before(firing)) is not None:
                 self._fail_on_purpose(firing, error)
             super()._fire(firing)
         except OperatorFailure as failure:

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 from dataflow.execution.ports import Emitter, OutputPorts
 from dataflow.execution.work import Work
 from dataflow.graph.model import Node
 from dataflow.operator import Operator, OperatorSpec, ParameterError
-from dataflow.sync import NEVER, Entry
+from dataflow.sync import NEVER, Entry, Firing
+
+
+class Faults(Protocol):
+    """Faults of one operator on purpose."""
+
+    def begin(self, kind: str, fields: Mapping[str, Any], now: float) -> None:
+        """Plans a fault; `now`: on the steady clock, seconds."""
+
+    def before(self, firing: Firing) -> BaseException | None:
+        """Is asked before each firing: may take its time, and gives an error to fail with instead."""
 
 
 class Runner:
@@ -33,8 +43,10 @@ class Runner:
         self.working_stamp = NEVER
         self.absent: set[str] = set()
         """Streams whose operator is gone at the moment; only a live run asks."""
+        self.faults: Faults | None = None
+        """Faults on purpose; only a live run asks."""
         self.awake = True
-        """True when it is to be asked for a step; it stays so in a driver without `Ready`."""
+        """True when it is to be asked for a step."""
         self.place = 0
         self.wakes_in: list[Runner] = []
         """Its place in the graph and where it puts itself when it wakes (`dataflow.execution.ready`)."""

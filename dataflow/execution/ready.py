@@ -13,27 +13,27 @@ from dataflow.execution.protocol import Runner
 
 
 class Ready:
-    """The runners of one process, in graph order."""
+    """The runners of one process, in graph order.
 
-    def __init__(self, clock: Callable[[], float] | None = None) -> None:
-        self._clock = clock or time.monotonic
-        self._woken: list[Runner] = []
+    The last of the graph are asked first, so that what is under way is done before more is begun; with `in_order`, the
+    first ones.
+    """
+
+    def __init__(self, clock: Callable[[], float] | None = None, *, in_order: bool = False) -> None:
+        self._clock, self._last_first = clock or time.monotonic, not in_order
+        self.woken: list[Runner] = []
+        """Those that are to be asked next."""
         self._runners: list[Runner] = []
         self._due: dict[int, float] = {}
         """When a runner is to be asked again though it was given nothing, by its place."""
         self._soonest: list[tuple[float, int]] = []
         """The same as a heap; what `_due` does not confirm is outdated."""
 
-    @property
-    def any(self) -> bool:
-        """Returns whether a runner has woken."""
-        return bool(self._woken)
-
     def add(self, runner: Runner) -> None:
         """Takes a runner in; it is asked at once."""
         runner.place = len(self._runners)
         self._runners.append(runner)
-        runner.wakes_in, runner.awake = self._woken, False
+        runner.wakes_in, runner.awake = self.woken, False
         runner.wake()
 
     def wake_all(self) -> None:
@@ -42,16 +42,16 @@ class Ready:
             runner.wake()
 
     def step(self) -> bool:
-        """Makes one step of every runner that has something to do, the last of the graph first, so that what is under
-        way is done before more is begun. False when there was nothing to do."""
+        """Makes one step of every runner that has something to do. False when there was nothing to do, and nothing has
+        come of asking."""
         if self._soonest:
             self._wake_due()
-        if not self._woken:
+        if not self.woken:
             return False
-        asked = self._woken.copy()
-        self._woken.clear()
+        asked = self.woken.copy()
+        self.woken.clear()
         if len(asked) > 1:
-            asked.sort(key=_place, reverse=True)
+            asked.sort(key=_place, reverse=self._last_first)
         worked = False
         for runner in asked:
             runner.awake = False
@@ -59,7 +59,7 @@ class Ready:
                 worked = True
             elif runner.keeps_time:
                 self._note(runner)
-        return worked
+        return worked or bool(self.woken)  # a promise alone may decide something further down
 
     def next_due(self) -> float | None:
         """Seconds until a runner is to be asked though nothing arrives; None when none is."""

@@ -29,6 +29,16 @@ from dataflow.records.repetition import Repetition
 from dataflow.sync import FOREVER, NEVER, Entry, Firing, FiringInputs, MessageRef, RecordedAligner, Uses
 
 
+class Watcher:
+    """Is told what re-execution is about to do, and what it has done. Called for every step: it must be cheap."""
+
+    def begins(self, phase: str, operator: str) -> None:
+        """`phase`: setup, fire, read or close; `operator`: whose turn it is, empty for read."""
+
+    def stepped(self, runner: RecordedRunner) -> None:
+        """A runner has made a firing, or has ended."""
+
+
 class RecordedRunner(Runner):
     """One operator, re-executed by its records: `records` reads them in the order of its calls, each once. `inputs` are
     the digests of what it was given; `seeding` is the version by which the recorded run seeded its generators; `begin`
@@ -47,9 +57,11 @@ class RecordedRunner(Runner):
         seeding: int = VERSION,
         guard: MemoryGuard | None = None,
         begin: int | None = None,
+        watcher: Watcher | None = None,
     ) -> None:
         super().__init__(node, node.make(), emitter)
         self._guard, self._watched = guard or MemoryGuard(), FOREVER if guard is not None else WATCHED
+        self._watcher = watcher or Watcher()
         self.calls = Calls(node, self.operator, seed, version=seeding)
         self.judge = Judge(node.name, tuple(self.ports.states), inputs)
         self._repetition = Repetition(records, begin=begin, stateless=self.operator.stateless)
@@ -67,7 +79,7 @@ class RecordedRunner(Runner):
         """Of the next call, once it is its turn."""
         self._changed: dict[str, Any] = {}
         self._latest: dict[str, tuple[int, int]] = {}
-        self._open = {s for streams in node.inputs.values() for s in streams}
+        self._open = set(node.taken)
 
     @property
     def result(self) -> Verification:
@@ -76,6 +88,7 @@ class RecordedRunner(Runner):
 
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
+        self._watcher.begins("setup", self.node.name)
         statics = self.calls.setup()
         if (record := self._repetition.setup) is not None:
             self.judge.files(record, self.operator.files)
@@ -119,6 +132,7 @@ class RecordedRunner(Runner):
 
     def close(self) -> None:
         """Closes the operator. An error is printed: no record holds the error of `close()` in the run."""
+        self._watcher.begins("close", self.node.name)
         close_quietly(self.operator)
 
     def push(self, stream: str, entry: Entry) -> None:
@@ -126,17 +140,29 @@ class RecordedRunner(Runner):
         if self._next is not None and not self.ended and self.aligner.takes(stream, entry):
             self.judge.arrived(stream, entry)
             self.aligner.push(stream, entry)
+        if not self.awake:
+            self.wake()
 
     def advance(self, stream: str, frontier: int) -> None:
         """Recorded firings wait for messages, not for promises."""
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self._open.discard(stream)
+        self.wake()
 
     def step(self) -> bool:
         """Makes the next recorded firing once its messages are there; ends when it cannot come any more."""
         if self.ended:
             return False
+        self._watcher.begins("fire", self.node.name)
+        worked = self._make_next()
+        if worked:
+            self.wake()
+            self._watcher.stepped(self)
+        self._watcher.begins("read", "")
+        return worked
+
+    def _make_next(self) -> bool:
         self._repeat_changes()
         record = self._next
         if record is not None and self._inputs is None:
@@ -184,7 +210,7 @@ class RecordedRunner(Runner):
 
     def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
         """A fresh operator, with the parameters as they were last set; its static messages."""
-        self.close()
+        close_quietly(self.operator)
         self.operator = self.calls.operator = self.node.make()
         self._change(self._changed, incarnation)
         return self.calls.setup()

@@ -160,6 +160,11 @@ class Node:
         return self.operator.spec
 
     @property
+    def taken(self) -> frozenset[str]:
+        """The streams that its inputs take."""
+        return frozenset(stream for streams in self.inputs.values() for stream in streams)
+
+    @property
     def process_label(self) -> str:
         """The process it runs in unless the placement is overridden: its `process:` label, or its own name."""
         return self.process or self.name
@@ -288,6 +293,11 @@ class Graph:
             ),
             sources_bundle=Bundle(**{**bundle, "settings": tuple(bundle["settings"])}),
         )
+
+    @property
+    def static(self) -> frozenset[str]:
+        """The static streams."""
+        return frozenset(name for name, stream in self.streams.items() if stream.static)
 
     def producer(self, stream: str) -> tuple[Node, str]:
         """The node and output port that make `stream`; raises KeyError for an unknown stream."""

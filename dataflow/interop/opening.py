@@ -16,6 +16,7 @@ from dataflow.recording.streams.part_folder import parts_in
 ROS1_MAGIC = b"#ROSBAG V"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 SQLITE_MAGIC = b"SQLite format 3\x00"
+RERUN_MAGICS = (b"RRF2", b"RRIO")
 WRITER = b"robot-dataflow/"
 """Our library in the header of an MCAP; what others made of one of our files may name theirs."""
 HEAD_BYTES = 128
@@ -30,7 +31,7 @@ def open_bag(path: Path) -> Bag:
 
 
 def bag_at(path: Path) -> Bag:
-    """Opens a ROS 1 bag, a ROS 2 bag (folder, .db3 or .mcap) or any other MCAP file.
+    """Opens a ROS 1 bag, a ROS 2 bag (folder, .db3 or .mcap), any other MCAP file, or the video of a Rerun file.
 
     Raises `BagError` where there is none; the message names what is there instead. Raises `RecordingError` for a
     damaged MCAP file.
@@ -44,12 +45,16 @@ def bag_at(path: Path) -> Bag:
         return _ros_bag(_with_suffix(path, ".bag"))
     if head.startswith(SQLITE_MAGIC):
         return _of_files(path, ".db3", [path])
+    if head.startswith(RERUN_MAGICS):
+        from dataflow.interop.rerun_file import RerunFile  # the viewer takes long to import
+
+        return RerunFile(path)
     if head.startswith(ZSTD_MAGIC):
         return _of_files(path, Path(path.stem).suffix, [path])
     begins = f"it begins with {head[:8].hex(' ')}" if head else "it is empty"
     raise BagError(
-        f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag) and "
-        "ROS 2 bags (a folder with metadata.yaml, .db3 or .mcap)"
+        f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag), "
+        "ROS 2 bags (a folder with metadata.yaml, .db3 or .mcap) and Rerun files (.rrd)"
     )
 
 

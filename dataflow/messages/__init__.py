@@ -16,7 +16,7 @@ from dataflow.messages.images import (
 )
 from dataflow.messages.inertial import Imu, MagneticField
 from dataflow.messages.mapping import Mesh, OccupancyGrid, Planes
-from dataflow.messages.poses import NavSatFix, Odometry, ParticleSet, Path, Pose, Transforms, Twist
+from dataflow.messages.poses import NavSatFix, Odometry, ParticleSet, Path, Point, Pose, Transforms, Twist
 from dataflow.messages.ranging import LaserScan, RadarScan, RangeReading
 from dataflow.messages.scene import Activity, Classification, FeatureVector, SceneGraph
 from dataflow.messages.segmentation import SegmentationMap
@@ -57,6 +57,7 @@ __all__ = [
     "ParticleSet",
     "Path",
     "Planes",
+    "Point",
     "PointCloud",
     "Pose",
     "RadarScan",

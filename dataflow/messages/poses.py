@@ -56,6 +56,14 @@ class Pose(Message):
         return transform_matrix(self.position, self.orientation)
 
 
+class Point(Message):
+    """One place: an obstacle, a clicked point, a corner that was found."""
+
+    frame: str = scalar("str", "frame in which the position is expressed")
+    position: F64 = array("float64", "3", "the place in `frame`", unit="m")
+    covariance: F64 | None = array("float64", "3 3", "of the position, in `frame`", unit="m²", default=None)
+
+
 class Transforms(Message):
     """A set of transforms between named frames at one time; a single transform is a set of one.
 

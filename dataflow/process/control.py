@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from dataflow.execution.driver import Driver
 from dataflow.execution.feeds.window import Window
 from dataflow.process.channel import ChannelClosed
-from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.planned_faults import do_fault
 from dataflow.process.requests import Requests
-from dataflow.process.runners import Runners
 from dataflow.process.streams.inlet import Inlet
 from dataflow.process.streams.outlet import Outlet
 from dataflow.sync import FOREVER
@@ -23,8 +22,7 @@ class Control:
     def __init__(
         self,
         windows: tuple[Window, Window],
-        runners: Runners,
-        feeding: Feeding,
+        driver: Driver,
         live: LiveSources,
         inlet: Inlet,
         outlet: Outlet,
@@ -33,7 +31,7 @@ class Control:
     ) -> None:
         """`windows`: what sources may be ahead, and what may wait for operators that drop; `release`: begins."""
         self._window, self._backlog = windows
-        self._runners, self._feeding, self._live = runners, feeding, live
+        self._driver, self._live = driver, live
         self._inlet, self._outlet, self._requests, self._release = inlet, outlet, requests, release
         self.probing = False
         """Probes are to be sent: consumers prove that they listen."""
@@ -61,7 +59,7 @@ class Control:
                 self._mark(fields["streams"], absent=fields["absent"])
             case "ended_elsewhere":
                 for stream in fields["streams"]:
-                    for runner in self._runners.taking(stream):
+                    for runner in self._driver.taking(stream):
                         runner.end(stream, None, fields["reason"])
             case "fault":
                 kind, operator = fields["fault"], fields["operator"]
@@ -69,7 +67,7 @@ class Control:
                     kind,
                     operator,
                     fields["fields"],
-                    runners=self._runners,
+                    driver=self._driver,
                     live=self._live,
                     outlet=self._outlet,
                 )
@@ -81,7 +79,7 @@ class Control:
                 self._requests.play(fields["action"], fields["steps"], fields["speed"])
             case "stop":
                 self.stopping = True
-                self._feeding.finish("interrupted")
+                self._driver.feeding.finish("interrupted")
                 self._live.finish("interrupted")
             case "gone":
                 self._outlet.consumer_gone(fields["ring"], fields["life"])
@@ -95,7 +93,7 @@ class Control:
     def _mark(self, streams: list[str], *, absent: bool) -> None:
         """Marks these streams, for their consumers, as having no producer, or as having one again."""
         for stream in streams:
-            for consumer in self._runners.taking(stream):
+            for consumer in self._driver.taking(stream):
                 (consumer.absent.add if absent else consumer.absent.discard)(stream)
         if not absent:
             self._inlet.restarted(streams)

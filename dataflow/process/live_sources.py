@@ -16,6 +16,7 @@ from typing import Any
 from dataflow.chaos.faults import SourceFaults
 from dataflow.chaos.kinds import TO_SOURCES
 from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.feeds.pace import Pace
 from dataflow.execution.feeds.window import Handover, Window
 from dataflow.execution.restarts import Restarts
 from dataflow.execution.source import SourceRunner, step_size, step_stamp
@@ -25,7 +26,6 @@ from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.log_pipe import SOURCE_THREAD
 from dataflow.process.outlived import tell_outlived
 from dataflow.process.streams.inbox import Inbox
-from dataflow.process.streams.pace import Pace
 
 MISSED_AFTER = 0.2
 """Seconds after which a step of a restarted source counts as missed."""

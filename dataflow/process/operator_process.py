@@ -12,32 +12,34 @@ import math
 import queue
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
+from dataflow.execution.driver import Driver
+from dataflow.execution.feeds.feeding import Feeding
+from dataflow.execution.feeds.pace import Pace
 from dataflow.execution.feeds.window import Window
 from dataflow.execution.threads import limit_threads
 from dataflow.graph.model import Graph
 from dataflow.process.awake import AwakeClock
-from dataflow.process.build import Builder
+from dataflow.process.build import build, open_box
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.control import Control
 from dataflow.process.descriptors import BACKLOG
-from dataflow.process.feeding import Feeding
 from dataflow.process.idle_report import IdleReport
 from dataflow.process.live_sources import LiveSources, Step
 from dataflow.process.network import leave_network, network_config
+from dataflow.process.outlived import tell_outlived
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
-from dataflow.process.runners import Runners, give, open_box, statics_of
 from dataflow.process.streams.inbox import Inbox
 from dataflow.process.streams.inlet import Inlet
 from dataflow.process.streams.losses import StreamDamaged, losses_of
 from dataflow.process.streams.outlet import Network, Outlet, incarnations_of, left_by
-from dataflow.process.streams.pace import Pace
 from dataflow.process.watchdog import Watchdog
-from dataflow.sync import StreamOrderError
-from dataflow.transport import Bus, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
+from dataflow.sync import NEVER, Entry, StreamOrderError
+from dataflow.transport import Bus, Envelope, Fanout, Kind, Outgoing, OutsidePublisher, TapServer
 from dataflow.transport.fanout import POOL_BYTES
 
 IDLE_WAIT = 0.1
@@ -64,12 +66,11 @@ class OperatorProcess:
         """`box`: the descriptor of the memory in which the latest firing records outlive this process."""
         self.config, self.channel, self.inbox = config, channel, inbox
         self.graph = Graph.from_json(config.graph)
-        self.static = statics_of(self.graph)
         self.pace = Pace(config.rate)
         self.window = Window(*config.window)
         self.backlog = Window(*(most * times for most, times in zip(config.window, BACKLOG, strict=True)))
-        self.runners = Runners()
-        self.feeding = Feeding(self.window, self.pace, paused=config.paused, speed=config.rate)
+        feeding = Feeding(self.window, self.pace, paused=config.paused, speed=config.rate)
+        self.driver = Driver(feeding, self._arrived)
         self.live = LiveSources(
             inbox,
             channel,
@@ -83,7 +84,7 @@ class OperatorProcess:
         self.inlet = Inlet(
             channel,
             self._deliver,
-            static=self.static,
+            static=self.graph.static,
             losses=self._losses,
             from_start=config.live and config.resume is None,
         )
@@ -92,30 +93,28 @@ class OperatorProcess:
         pool_bytes = POOL_BYTES if self.graph.network.shared_memory else 0
         self.outlet = Outlet(
             channel,
-            self.runners.taking,
+            self.driver.consumers,
             fanout=Fanout(outgoing, pool_bytes=pool_bytes, gives_way=config.live),
             namespace=self.graph.namespace,
-            static=self.static,
+            static=self.graph.static,
             box=None if box is None else open_box(box, config, self.graph),
             firings=config.firings,
             incarnations=incarnations_of(before, outputs),
             left=left_by(before, outputs),
         )
-        self.progress = Progress(channel, self.runners, self.feeding, self.live, paced=config.live)
+        self.progress = Progress(channel, self.driver, self.live, paced=config.live)
         self.requests = Requests(
             config,
-            self.runners,
+            self.driver,
             self.live,
             self.progress,
             self.outlet.recent,
             self.pace.event_time,
-            self.feeding,
             channel,
         )
         self.orders = Control(
             (self.window, self.backlog),
-            self.runners,
-            self.feeding,
+            self.driver,
             self.live,
             self.inlet,
             self.outlet,
@@ -125,8 +124,7 @@ class OperatorProcess:
         self._standing = IdleReport(
             channel,
             self.orders,
-            self.runners,
-            self.feeding,
+            self.driver,
             self.live,
             inbox,
             self.inlet,
@@ -158,10 +156,8 @@ class OperatorProcess:
         self.set_up()
         if config.resume is not None:
             self._await_statics()
-        for log in self.feeding.logs:
-            log.setup()
-        first = [*self.feeding.first_stamps(), *self.live.first_stamps()]
-        lengths = [n for source in self.runners.sources if (n := source.source.length()) is not None]
+        first = [*self.driver.feeding.first_stamps(), *self.live.first_stamps()]
+        lengths = [n for source in self.driver.sources if (n := source.source.length()) is not None]
         self.channel.send("ready", first=min(first, default=None), steps=sum(lengths) if lengths else None)
 
     def _await_statics(self) -> None:
@@ -179,23 +175,29 @@ class OperatorProcess:
 
     def make(self) -> None:
         """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
-        parts = (self.pace, self.runners, self.feeding, self.live, self.outlet)
-        Builder(self.config, self.graph, self.channel, *parts).make()
+        build(
+            self.driver,
+            self.graph,
+            self.config,
+            self.outlet,
+            live=self.live,
+            event_clock=self.pace.event_time,
+            on_failure=partial(tell_outlived, self.channel),
+        )
 
     def set_up(self) -> None:
         """Calls `setup()` of every operator, with as many library threads as the graph allows."""
         limit_threads(self.graph.threads)
-        for maker in self.runners.all:
-            maker.setup()
+        self.driver.set_up()
         gc.freeze()  # modules and operators live as long as the process: collections need not look at them
 
     def release(self, first: int | None, at: float) -> None:
         """All processes are linked: sends what was held back, and begins. Event time `first` (ns) is `at` (seconds)."""
         self.outlet.release()
         self.pace.begin(first, at)
-        self.runners.ready.wake_all()
+        self.driver.ready.wake_all()
         self.live.start()
-        self._watch = Watchdog(self.channel, self.runners.operators, deadlines=self.config.live)
+        self._watch = Watchdog(self.channel, self.driver.operators, deadlines=self.config.live)
 
     def run(self) -> None:
         """Runs the main loop; returns when the supervisor has let the process go."""
@@ -235,7 +237,7 @@ class OperatorProcess:
                 return False
             act(step)
         finally:
-            inbox.give_turn(wake=self.runners.ready.any)
+            inbox.give_turn(wake=bool(self.driver.ready.woken))
         return True
 
     def hand_over(self) -> None:
@@ -249,9 +251,7 @@ class OperatorProcess:
         if self._watch is not None:
             self._watch.stop()
         reading, failures = self.live.await_readers()
-        failures += self.runners.close(but=reading)
-        for log in self.feeding.logs:
-            log.close()
+        failures += self.driver.close(but=reading)
         leave_network(self.config.label, self.taps, self.outside, self.bus)
         self.outlet.close()
         if failures:
@@ -262,11 +262,12 @@ class OperatorProcess:
     def _wait_time(self) -> float:
         if self.orders.probing:
             return PROBE_EVERY
-        due = [self.runners.ready.next_due(), self.progress.next_due()]
+        due = [self.driver.ready.next_due(), self.progress.next_due()]
         if self.live.runners:
             due.append(self.live.next_due())
-        if self.feeding.feeds and self.orders.released:
-            due.append(self.feeding.next_due())
+        feeding = self.driver.feeding
+        if feeding.feeds and self.orders.released:
+            due.append(feeding.next_due())
         wait = IDLE_WAIT
         for seconds in due:
             if seconds is not None and seconds < wait:
@@ -281,7 +282,10 @@ class OperatorProcess:
         except queue.Empty:
             return
         more = inbox.qsize()
-        self._handle(item)
+        if item[0] == "envelope":  # the way of most, without a call more than it takes
+            self.inlet.take(item[1], item[2])
+        else:
+            self._handle(item)
         if not more:
             return
         until = time.monotonic() + self._take_within
@@ -306,9 +310,17 @@ class OperatorProcess:
 
     def _deliver(self, stream: str, envelope: Envelope) -> None:
         """Gives an envelope to the operators that take its stream; what contradicts what they have seen is refused."""
-        for runner in self.runners.consumers.get(stream, ()):
+        stamp, message, entry = envelope.stamp, envelope.message, None
+        if message is not None:
+            entry = Entry(stamp, message, envelope.seq, envelope.incarnation, b"", stream)
+        for runner in self.driver.consumers.get(stream, ()):
             try:
-                give(runner, stream, envelope)
+                if entry is not None:
+                    runner.push(stream, entry)
+                elif envelope.kind is Kind.FRONTIER:
+                    runner.advance(stream, stamp)
+                elif envelope.kind is Kind.END:
+                    runner.end(stream, None if stamp == NEVER else stamp, envelope.reason)
             except StreamOrderError as error:
                 self._losses.contradicted(error)
                 self.inlet.refuse(stream, str(error))
@@ -316,30 +328,22 @@ class OperatorProcess:
     # Work
 
     def _work(self) -> bool:
-        """Runs what is decided; when nothing is and nothing has arrived, admits from the feeds. True when anything was
-        done."""
+        """Does what there is to do, but not for long where something has arrived. True when anything was done.
+
+        Nothing before all processes are linked: a restarted one is sent messages before it is told what time it is.
+        """
+        if not self.orders.released:
+            return False
         worked = False
-        feeds, ready, inbox = self.feeding.feeds, self.runners.ready, self.inbox
-        while not self.orders.left:
-            if not (self._step_all() or (feeds and inbox.empty() and self._admit())):
-                if not feeds or not inbox.empty():
-                    break
-                self.feeding.promise()
-                if not self._step_all():
-                    break
+        driver, inbox = self.driver, self.inbox
+        feeds, woken = driver.feeding.feeds, driver.ready.woken
+        while driver.turn():
             worked = True
-            if not (feeds or ready.any) or not inbox.empty():
+            if not (feeds or woken) or not inbox.empty():
                 break
             self.progress.report(idle=False)
-        if self.orders.released:
-            self._standing.end_if_done()
+        self._standing.end_if_done()
         return worked
 
-    def _step_all(self) -> bool:
-        """One step of every operator that has something to do."""
-        if not self.orders.released:
-            return False  # a restarted process is sent messages before it is told what time it is
-        return self.runners.ready.step()
-
-    def _admit(self) -> bool:
-        return self.orders.released and not self.orders.stopping and self.feeding.admit()
+    def _arrived(self) -> bool:
+        return not self.inbox.empty()

@@ -7,13 +7,12 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from dataflow.execution.calls import summary_of
+from dataflow.execution.driver import Driver
 from dataflow.execution.feeds.log import LogFeed
 from dataflow.execution.protocol import Runner
 from dataflow.execution.source import SourceRunner
 from dataflow.process.channel import Channel
-from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
-from dataflow.process.runners import Runners
 from dataflow.sync import MISSES
 
 REPORT_EVERY = 0.02
@@ -31,8 +30,7 @@ class Progress:
     def __init__(
         self,
         channel: Channel,
-        runners: Runners,
-        feeding: Feeding,
+        driver: Driver,
         live: LiveSources,
         clock: Callable[[], float] | None = None,
         *,
@@ -40,7 +38,7 @@ class Progress:
     ) -> None:
         """`paced`: the run is live."""
         self._every, self._idle = (REPORT_LIVE, REPORT_LIVE) if paced else (REPORT_EVERY, REPORT_IDLE)
-        self._channel, self._runners, self._feeding, self._live = channel, runners, feeding, live
+        self._channel, self._driver, self._live = channel, driver, live
         self._clock = clock or time.monotonic
         self.counted: dict[str, list[int]] = {}
         """The counts that were last reported, of all operators."""
@@ -64,7 +62,7 @@ class Progress:
             self._owed = self._owed or idle
             return
         self._owed = False
-        done = {r.node.name: r.done for r in self._runners.operators if self._done.get(r.node.name) != r.done}
+        done = {r.node.name: r.done for r in self._driver.operators if self._done.get(r.node.name) != r.done}
         firings = self._made()
         counts_due = idle or now >= self._count_due
         if not done and firings == self._firings and not (self._uncounted and counts_due):
@@ -76,89 +74,90 @@ class Progress:
         self._uncounted = not counts_due
         if counts_due:
             self._count_due = now + COUNT_EVERY
-            for runner in self._runners.operators:
+            for runner in self._driver.operators:
                 reached = runner.firings, runner.done
                 if self._counted.get(runner.node.name) != reached:
                     self._counted[runner.node.name] = reached
                     changed.append(runner)
-        counts = self._counts_of(changed)
+        counts = counts_of(self._driver, changed)
         self.counted |= counts
-        drops = {name: found for name, found in self._drops_of(changed).items() if found != self._dropped.get(name)}
+        dropped = _drops_of(self._driver, changed)
+        drops = {name: found for name, found in dropped.items() if found != self._dropped.get(name)}
         self._dropped |= drops
-        waits = {name: found for name, found in self._waits_of(changed).items() if found != self.waited.get(name)}
+        waits = {name: found for name, found in _waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
         self.behind = self._live.behind()
         news = {"done": done, "counts": counts, "drops": drops, "waits": waits, "behind": self.behind}
-        self._channel.send("progress", **news, first=self._first())
-
-    def _first(self) -> int | None:
-        """The first stamp that a source has given."""
-        return min((s.first for s in self._runners.sources if s.first is not None), default=None)
+        self._channel.send("progress", **news, first=_first(self._driver))
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""
         return max(0.0, self._reported + self._idle - self._clock()) if self._owed else None
 
     def _made(self) -> int:
-        operators = sum(runner.firings for runner in self._runners.operators)
-        return operators + sum(f.firings for f in self._feeding.feeds) + sum(s.firings for s in self._live.runners)
-
-    def _counts_of(self, operators: Iterable[Runner]) -> dict[str, list[int]]:
-        """For all sources and some operators: firings, messages emitted, messages dropped, CPU time (ns), last stamp,
-        wall time (ns)."""
-        counts = {}
-        for source in self._runners.sources:
-            refused = source.refused.total()
-            counts[source.node.name] = _row(source, source.ports.emitted, refused, source.last)
-        for runner in operators:
-            drops = sum(n for (_, why), n in runner.drops.items() if why not in MISSES)
-            counts[runner.node.name] = _row(runner, runner.ports.emitted, drops, runner.done)
-        for log in self._feeding.logs:
-            counts["@log"] = _row(log, log.emitted, 0, log.last)
-        return counts
-
-    def _drops_of(self, operators: Iterable[Runner]) -> dict[str, list[list[Any]]]:
-        """For all sources and some operators: input ("" for a source), reason and number of what they dropped."""
-        return {r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in operators} | {
-            s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in self._live.runners
-        }
-
-    def _waits_of(self, operators: Iterable[Runner]) -> dict[str, list[list[Any]]]:
-        """For some operators: input, "timeout" or "late", and number: waits given up, and messages that came late."""
-        return {
-            r.node.name: [
-                *([i, "timeout", n] for i, n in sorted(r.timeouts.items())),
-                *([i, "late", n] for i, n in sorted(r.late.items())),
-            ]
-            for r in operators
-        }
+        return sum(maker.firings for maker in (*self._driver.all, *self._driver.feeding.logs))
 
     def waiting(self) -> dict[str, list[Any]]:
         """Per operator that is not done: the stamp it cannot decide, and the inputs (with frontiers) that hold it."""
-        return {r.node.name: list(r.waiting()) for r in self._runners.operators if not r.ended}
+        return {r.node.name: list(r.waiting()) for r in self._driver.operators if not r.ended}
 
-    def final_report(self, transport: Mapping[str, int]) -> dict[str, Any]:
-        """Returns what came of everything; `transport`: what the process has moved."""
-        streams: dict[str, list[Any]] = {}
-        for maker in self._runners.all:
-            for state in maker.ports.states.values():
-                streams[state.stream] = [state.digest.count, state.digest.hexdigest()]
-        for log in self._feeding.logs:
-            streams |= {name: [count, digest] for name, count, digest in log.counts()}
-        return {
-            "streams": streams,
-            "first": self._first(),
-            "counts": self._counts_of(self._runners.operators),
-            "drops": self._drops_of(self._runners.operators),
-            "waits": self._waits_of(self._runners.operators),
-            "summaries": {r.node.name: s for r in self._runners.operators if (s := _summary(r))},
-            "transport": dict(transport),
-        }
+
+def counts_of(driver: Driver, operators: Iterable[Runner]) -> dict[str, list[int]]:
+    """Returns for all sources and some operators: firings, messages emitted, messages dropped, CPU time (ns), last
+    stamp, wall time (ns); for recordings under "@log"."""
+    counts = {}
+    for source in driver.sources:
+        counts[source.node.name] = _row(source, source.ports.emitted, source.refused.total(), source.last)
+    for runner in operators:
+        drops = sum(n for (_, why), n in runner.drops.items() if why not in MISSES)
+        counts[runner.node.name] = _row(runner, runner.ports.emitted, drops, runner.done)
+    for log in driver.feeding.logs:
+        counts["@log"] = _row(log, log.emitted, 0, log.last)
+    return counts
+
+
+def _drops_of(driver: Driver, operators: Iterable[Runner]) -> dict[str, list[list[Any]]]:
+    """For all sources and some operators: input ("" for a source), reason and number of what they dropped."""
+    return {r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in operators} | {
+        s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in driver.sources
+    }
+
+
+def _waits_of(operators: Iterable[Runner]) -> dict[str, list[list[Any]]]:
+    """For some operators: input, "timeout" or "late", and number: waits given up, and messages that came late."""
+    return {
+        r.node.name: [
+            *([i, "timeout", n] for i, n in sorted(r.timeouts.items())),
+            *([i, "late", n] for i, n in sorted(r.late.items())),
+        ]
+        for r in operators
+    }
+
+
+def final_report(driver: Driver, transport: Mapping[str, int]) -> dict[str, Any]:
+    """Returns the result of everything that was driven; `transport`: what the process has moved."""
+    streams: dict[str, list[Any]] = {}
+    for maker in driver.all:
+        for state in maker.ports.states.values():
+            streams[state.stream] = [state.digest.count, state.digest.hexdigest()]
+    for log in driver.feeding.logs:
+        streams |= {name: [count, digest] for name, count, digest in log.counts()}
+    runners = driver.operators
+    return {
+        "streams": streams,
+        "first": _first(driver),
+        "counts": counts_of(driver, runners),
+        "drops": _drops_of(driver, runners),
+        "waits": _waits_of(runners),
+        "summaries": {r.node.name: found for r in runners if (found := summary_of(r.operator, r.node.name))},
+        "transport": dict(transport),
+    }
+
+
+def _first(driver: Driver) -> int | None:
+    """The first stamp that a source has given."""
+    return min((source.first for source in driver.sources if source.first is not None), default=None)
 
 
 def _row(maker: SourceRunner | Runner | LogFeed, emitted: int, dropped: int, last: int) -> list[int]:
     return [maker.firings, emitted, dropped, maker.work.cpu_ns, last, maker.work.wall_ns]
-
-
-def _summary(runner: Runner) -> Mapping[str, Any]:
-    return summary_of(runner.operator, runner.node.name)

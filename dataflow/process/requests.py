@@ -8,16 +8,15 @@ from typing import Any
 
 import msgpack
 
+from dataflow.execution.driver import Driver, Maker
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.source import SourceRunner
 from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_live
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
-from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.progress import Progress
-from dataflow.process.runners import Maker, Runners
 from dataflow.process.streams.inbox import Inbox
 from dataflow.process.streams.recent import RecentFirings
 from dataflow.remote import Remote
@@ -35,17 +34,16 @@ class Requests:
     def __init__(
         self,
         config: ProcessConfig,
-        runners: Runners,
+        driver: Driver,
         live: LiveSources,
         progress: Progress,
         recent: RecentFirings,
         event_clock: Callable[[], int],
-        feeding: Feeding,
         channel: Channel,
     ) -> None:
-        self._config, self._runners, self._live = config, runners, live
+        self._config, self._driver, self._live = config, driver, live
         self._progress, self._recent, self._event_clock = progress, recent, event_clock
-        self._feeding, self._channel = feeding, channel
+        self._feeding, self._channel = driver.feeding, channel
         self._given: dict[str, int] = {}
         """The last stamp that each source was given from outside."""
 
@@ -53,12 +51,12 @@ class Requests:
         """Declares what is answered."""
         for name in self._config.nodes:
             bus.serve(runtime_key(namespace, "param", name), _to_inbox(inbox, name))
-        for maker in self._runners.sources:
+        for maker in self._driver.sources:
             if isinstance(maker.source, Remote):
                 bus.serve(runtime_key(namespace, "pub", maker.node.name), partial(self.answer_publication, maker))
         bus.serve(runtime_key(namespace, "status", self._config.label), self._answer_status)
         bus.serve(runtime_key(namespace, "trigger", self._config.label), self._answer_trigger)
-        if self._feeding.feeds or self._runners.sources:
+        if self._feeding.feeds or self._driver.sources:
             bus.serve(runtime_key(namespace, "playback"), _to_inbox(inbox, "", "playback"))
 
     def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
@@ -77,7 +75,7 @@ class Requests:
         with query:
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
-                value = self._value_asked(self._runners[name], asked)
+                value = self._value_asked(self._driver[name], asked)
                 answer = {"ok": True, "operator": name, "value": value}
             except (ParameterError, KeyError, TypeError, ValueError, AttributeError) as error:
                 answer = {"ok": False, "operator": name, "error": str(error)}
@@ -165,7 +163,7 @@ class Requests:
                 "waits": self._progress.waited,
                 "behind": self._progress.behind,
                 "restarts": self._restarts(),
-                "ended": [maker.node.name for maker in self._runners.all if maker.ended],
+                "ended": [maker.node.name for maker in self._driver.all if maker.ended],
             }
             if _asks_for_firings(query):
                 status["firings"] = self._recent.batches()
@@ -184,8 +182,8 @@ class Requests:
 
     def _restarts(self) -> dict[str, int]:
         """Returns how often each operator was restarted, by this process and in the processes before it."""
-        here = {maker.node.name: self._live.restarts_of(maker.node.name) for maker in self._runners.sources}
-        here |= {runner.node.name: runner.restarted for runner in self._runners.operators}
+        here = {maker.node.name: self._live.restarts_of(maker.node.name) for maker in self._driver.sources}
+        here |= {runner.node.name: runner.restarted for runner in self._driver.operators}
         return {name: self._config.resumed(name).restarts + times for name, times in here.items()}
 
 

@@ -1,7 +1,8 @@
 """The order of an operator's calls, where its firing records lie in a file otherwise.
 
 They mostly lie in that order. When a process dies, records that it had not sent are stored after those of others, and
-some of them a second time. The file is then a few *runs*, each in order, which are merged.
+some of them a second time; each part of a recording begins with what stands in for those before. The records are then a
+few *runs*, each in order, which are merged: one is read once it is its turn.
 """
 
 from __future__ import annotations
@@ -57,6 +58,8 @@ class Outliner:
         self._last: Place = (-1, -1)
         self._first: Place = (-1, -1)
         self._begin = self._end = 0
+        self._repeats = False
+        """Whether the newest run is, so far, what came before already."""
         self._newest: dict[str, Place] = dict.fromkeys(outputs, (-1, -1))
         self._scattered: set[str] = set()
 
@@ -67,11 +70,12 @@ class Outliner:
 
     def take(self, number: int, record: FiringRecord) -> None:
         """Takes the next record of the file, which is in batch `number`."""
-        place = (record.incarnation, record.index)
-        if place <= self._last:
+        place, last = (record.incarnation, record.index), self._last
+        back = place <= last
+        if back or (self._repeats and place > (last[0], last[1] + 1)):
             self._runs.append(Run(self._begin, number, self._first))
-            self._begin, self._first = number, place
-        elif self._last == (-1, -1):
+            self._begin, self._first, self._repeats = number, place, back
+        elif last == (-1, -1):
             self._begin, self._first = number, place
         self._last, self._end = place, number + 1
         self._rise(record)
@@ -99,7 +103,7 @@ class Outliner:
             before: FiringRecord | None = None
             for record in merged(self._runs, read):
                 if before is not None and (record.incarnation, record.index) == (before.incarnation, before.index):
-                    if (record.outputs, record.detail) != (before.outputs, before.detail):
+                    if record.kind != "cut" and record.outputs != before.outputs:
                         self._scattered.update(self._outputs)
                     continue
                 before = record

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from typing import Any, Protocol
@@ -61,8 +61,6 @@ class FiringLog:
         stored = {} if recording is None else {n for n, count in recording.firing_batches().items() if count}
         self.operators: Collection[str] = dict.fromkeys([*(name for name in kept if kept[name]), *stored])
         """The operators that left records."""
-        self.watch: Callable[[], None] = lambda: None
-        """Is called for every batch that is read."""
 
     @staticmethod
     def read(recording: Recording) -> FiringLog:
@@ -101,7 +99,6 @@ class FiringLog:
     def decoded(self, operator: str, payload: bytes) -> tuple[FiringRecord, ...]:
         """The records of a batch that is filed under an operator. Raises `RecordingError`, with the file and the
         operator."""
-        self.watch()
         return _decoded(payload, operator, self._origin)
 
     def records(self, operator: str, first: int = 0, end: int | None = None) -> Iterator[FiringRecord]:
@@ -109,10 +106,8 @@ class FiringLog:
 
         Raises `RecordingError` for a batch that is none, with the file and the operator.
         """
-        watch, origin = self.watch, self._origin
         for payload in self.batches(operator, first, end):
-            watch()
-            yield from _decoded(payload, operator, origin)
+            yield from self.decoded(operator, payload)
 
     def of(self, operator: str) -> tuple[FiringRecord, ...]:
         """All records of one operator in memory, in the order of the file: some hundred bytes each."""
@@ -152,7 +147,6 @@ class FiringLog:
         """(place, digest) of what was sent on a stream, in the order of the file. Decodes no more than that."""
         port = outputs.index(stream)
         for payload in self.batches(operator):
-            self.watch()
             batch = unpack_batch(payload)
             if any(row[0] == _CUT for row in batch.rows):
                 for record in decode_rows(batch):

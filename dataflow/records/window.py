@@ -70,7 +70,8 @@ def _window(recording: Recording, heads: Mapping[str, bytes], start: int) -> Fir
     firsts: dict[str, bytes] = {}
     for operator, payload in recording.firings(start=start):
         firsts.setdefault(operator, payload)
-    if any(count > 1 and operator not in firsts for operator, count in recording.firing_batches().items()):
+    counts = {name: count for name, count in recording.firing_batches().items() if name not in firsts}
+    if any(count > 1 or (count and name not in heads) for name, count in counts.items()):
         return None
     kept: dict[str, list[bytes]] = {name: [] if name in firsts else [head] for name, head in heads.items()}
     begins: dict[str, int] = {}

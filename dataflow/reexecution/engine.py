@@ -10,13 +10,13 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
+from dataflow.execution.driver import Driver, HandOver
 from dataflow.execution.feeds.log import LogFeed
 from dataflow.execution.memory import MemoryGuard
-from dataflow.execution.recorded import RecordedRunner
+from dataflow.execution.recorded import RecordedRunner, Watcher
 from dataflow.execution.threads import limit_threads
-from dataflow.graph.model import Graph, Node
+from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
@@ -37,26 +37,6 @@ _NOTHING: Mapping[str, tuple[int | None, int | None]] = {}
 
 class Stuck(RuntimeError):
     """No recorded firing can be made, and nothing is left to read: a fault of the records or of the engine."""
-
-
-class Watcher(Protocol):
-    """Is told what re-execution is about to do, and what it has done. Called for every step: it must be cheap."""
-
-    def begins(self, phase: str, operator: str) -> None:
-        """`phase`: setup, fire, read or close; `operator`: whose turn it is, empty for read."""
-
-    def stepped(self, runner: RecordedRunner) -> None:
-        """A runner has made a firing, or has ended."""
-
-
-class Unwatched:
-    """The watcher of an unobserved re-execution."""
-
-    def begins(self, phase: str, operator: str) -> None:
-        """Takes no notice."""
-
-    def stepped(self, runner: RecordedRunner) -> None:
-        """Takes no notice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +65,7 @@ def plan_feeding(
     left = list(operators)
     while left:
         node = graph.nodes[left.pop()]
-        for stream in {s for taken in node.inputs.values() for s in taken}:
+        for stream in node.taken:
             maker = graph.nodes[graph.streams[stream].node]
             if stream in recording.streams and stream not in incomplete:
                 check_type(recording, graph, stream)
@@ -128,67 +108,62 @@ class Recomputation:
         guard: MemoryGuard | None = None,
         watcher: Watcher | None = None,
     ) -> None:
-        self._fed = frozenset(feeding.streams)
-        self._watcher: Watcher = watcher or Unwatched()
-        self._ready: dict[str, RecordedRunner] = {}
-        consumers: dict[str, list[RecordedRunner]] = {}
+        self._driver = Driver(in_order=True)  # who writes into a message comes before those whose digests show it
         ends = {name: slices[name][1] if name in slices else end for name in feeding.operators}
         records = {n: partial(_until, partial(log.ordered, graph.nodes[n]), ends[n]) for n in feeding.operators}
-        outlet = _Outlet(consumers, self._ready, self._fed, made, ended)
-        begins = {} if begin is None else _begins(graph, records, self._fed, begin)
+        outlet = _HandOver(self._driver, frozenset(feeding.streams), made, ended)
+        begins = {} if begin is None else _begins(graph, records, frozenset(feeding.streams), begin)
         begins |= {name: first for name, (first, _) in slices.items() if first is not None}
         nodes = [graph.nodes[name] for name in feeding.operators]
-        taken = {stream for node in nodes for stream in _streams_into(node)}
+        taken = {stream for node in nodes for stream in node.taken}
         inputs = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in taken}], taken)
         self.runners = {
             node.name: RecordedRunner(
                 node,
                 outlet,
-                static=frozenset(name for name, stream in graph.streams.items() if stream.static),
+                static=graph.static,
                 records=records[node.name],
                 inputs=inputs,
                 seed=graph.seed,
                 seeding=seeding_of(recording),
                 guard=guard,
                 begin=begins.get(node.name),
+                watcher=watcher,
             )
             for node in nodes
         }
         for runner in self.runners.values():
-            for stream in _streams_into(runner.node):
-                consumers.setdefault(stream, []).append(runner)
+            self._driver.add(runner)
         reads = sorted({*feeding.streams, *feeding.besides})
         makers = {stream: graph.streams[stream].node for stream in reads}
         starts = None if begin is None else first_needed(log, graph, self.runners.values())
         self._feed = LogFeed(
             recording if starts is None or begin is None else NeededStreams(recording, starts, begin),
             makers,
-            _Outlet(consumers, self._ready, frozenset(feeding.besides), read or _nowhere, None),
+            _HandOver(self._driver, frozenset(feeding.besides), read, None),
             ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
             finals=final_stamps(recording, reads),
             end=end,
         )
+        self._driver.feeding.feeds.append(self._feed)
         self._threads = graph.threads
         self.wall = 0.0
         """Seconds that `run` took from when all operators were set up."""
 
     def run(self, *, until: Callable[[], bool] = lambda: False, close: bool = True) -> Mapping[str, Verification]:
-        """Makes the recorded firings, to the end or until `until()`, asked between them; then closes.
+        """Makes the recorded firings, to the end or until `until()`, asked now and then; then closes.
 
         Raises `OperatorFailure`, `RecordingError`, `Stuck`.
         """
         limit_threads(self._threads)
         try:
-            for name, runner in self.runners.items():
-                self._watcher.begins("setup", name)
-                runner.setup()
-            limit_threads(self._threads)  # of libraries that were imported in setup()
-            self._ready |= self.runners
+            self._driver.set_up()
             self._feed.setup()
             began = time.monotonic()
-            done = self._drive(until)
+            while (left := self._driver.turn()) and not until():
+                pass
             self.wall = time.monotonic() - began
-            if not done:
+            if left:
                 return self.results()
         finally:
             if close:
@@ -199,10 +174,7 @@ class Recomputation:
 
     def close(self, *, besides: str = "") -> None:
         """Closes all operators but the one named."""
-        for name, runner in self.runners.items():
-            if name != besides:
-                self._watcher.begins("close", name)
-                runner.close()
+        self._driver.close(but=(besides,))
 
     @property
     def reading_cpu_ns(self) -> int:
@@ -212,31 +184,6 @@ class Recomputation:
     def results(self) -> Mapping[str, Verification]:
         """The outcome for each operator so far."""
         return {name: runner.result for name, runner in self.runners.items()}
-
-    def _drive(self, until: Callable[[], bool]) -> bool:
-        """Steps the runners that were given something, and reads on when there is none. False: `until()` said so."""
-        while True:
-            while self._ready:
-                name, runner = next(iter(self._ready.items()))
-                self._watcher.begins("fire", name)
-                if not runner.step():
-                    del self._ready[name]
-                    continue
-                self._watcher.stepped(runner)
-                if until():
-                    return False
-            if self._feed.ended:
-                return True
-            self._watcher.begins("read", "")
-            if self._feed.look_ahead() is None:
-                self._feed.finish()
-                self._ready |= self.runners
-            else:
-                self._feed.admit()
-
-
-def _streams_into(node: Node) -> set[str]:
-    return {stream for taken in node.inputs.values() for stream in taken}
 
 
 def _begins(
@@ -277,44 +224,21 @@ def _until(records: Callable[[], Iterable[FiringRecord]], end: int | None) -> It
         yield record
 
 
-def _nowhere(stream: str, entry: Entry) -> None:
-    """Discards a message without consumers."""
+class _HandOver(HandOver):
+    """Gives messages to `take`, too, and to no operator where those that take the stream are fed from `elsewhere`."""
 
-
-class _Outlet:
-    """Hands messages to `take` and to the operators that take them, unless those of that stream are fed otherwise.
-
-    Operators that were given something are noted in `ready`.
-    """
-
-    def __init__(
-        self,
-        consumers: Mapping[str, list[RecordedRunner]],
-        ready: dict[str, RecordedRunner],
-        elsewhere: frozenset[str],
-        take: Take,
-        ended: End | None,
-    ) -> None:
-        self._consumers, self._ready, self._elsewhere = consumers, ready, elsewhere
-        self._take, self._ended = take, ended
+    def __init__(self, driver: Driver, elsewhere: frozenset[str], take: Take | None, ended: End | None) -> None:
+        super().__init__(driver)
+        self._elsewhere, self._take, self._ended = elsewhere, take, ended
 
     def message(self, stream: str, entry: Entry) -> None:
-        self._take(stream, entry)
+        if self._take is not None:
+            self._take(stream, entry)
         if stream not in self._elsewhere:
-            for runner in self._consumers.get(stream, ()):
-                runner.push(stream, entry)
-                self._ready[runner.node.name] = runner
-
-    def frontier(self, stream: str, frontier: int) -> None:
-        """Recorded firings wait for messages, not for promises."""
+            super().message(stream, entry)
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         if self._ended is not None:
             self._ended(stream, final_stamp, reason)
         if stream not in self._elsewhere:
-            for runner in self._consumers.get(stream, ()):
-                runner.end(stream, final_stamp, reason)
-                self._ready[runner.node.name] = runner
-
-    def record(self, record: FiringRecord) -> None:
-        """The records are those of the recorded run; none are made."""
+            super().end(stream, final_stamp, reason)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dataflow.supervision.plan import ProcessPlan, RunPlan
+from dataflow.supervision.plan import LogPlan, ProcessPlan, RunPlan
 from dataflow.supervision.rings import pairs_of
 
 Config = tuple[str, dict[str, Any]]
@@ -66,20 +66,21 @@ def _operators(
         "publish": dict(process.publish),
         "subscribe": list(process.subscribe),
         "listen": [endpoints[process.label], *(plan.graph.network.listen if first else ())],
-        "replay": _log(plan) if process.has_log else None,
+        "replay": replay_of(plan.log) if process.has_log else None,
         "window": list(plan.window),
         "rate": 1.0 if plan.live and plan.rate is None else plan.rate,
         "paused": plan.paused,
         "paranoid": plan.paranoid,
         "firings": plan.keeps_records,
         "snapshots": plan.graph.record.snapshots,
-        "warm": _warm_start(plan),
+        "warm": warm_start_of(plan.log),
     }
 
 
-def _log(plan: RunPlan) -> dict[str, Any]:
-    log = plan.log
-    assert log is not None
+def replay_of(log: LogPlan | None) -> dict[str, Any] | None:
+    """Returns the `replay` of the process that reads a recording."""
+    if log is None:
+        return None
     return {
         "path": str(log.path),
         "streams": list(log.streams),
@@ -91,8 +92,8 @@ def _log(plan: RunPlan) -> dict[str, Any]:
     }
 
 
-def _warm_start(plan: RunPlan) -> dict[str, Any] | None:
-    log = plan.log
+def warm_start_of(log: LogPlan | None) -> dict[str, Any] | None:
+    """Returns the `warm` of the processes of a replay that begins in the middle of a recording."""
     if log is None or log.start is None or log.bag is not None:
         return None
     return {"path": str(log.path), "stamp": log.start}

@@ -273,7 +273,7 @@ class Aligner:
 
     def has_drops(self) -> bool:
         """Tells whether there is a drop that was not taken."""
-        return self._drop_log.pending
+        return bool(self._drop_log.pending)
 
     def take_drops(self) -> list[Drop]:
         """The drops since this was last asked, at most the last `KEPT`."""

@@ -19,7 +19,8 @@ class DropLog:
         self.counts: Counter[tuple[str, str]] = Counter()
         self.late: Counter[str] = Counter()
         """Messages that came after what needed them was decided, by input, dropped or not."""
-        self._events: deque[Drop] = deque()
+        self.pending: deque[Drop] = deque()
+        """The last drops that were not taken."""
         self._unlisted: Counter[tuple[str, str]] = Counter()
 
     def entry(self, lane: Lane, entry: Entry, reason: DropReason, because: str = "") -> None:
@@ -49,20 +50,15 @@ class DropLog:
     def add(self, drop: Drop) -> None:
         """Notes one drop."""
         self.counts[drop.input, drop.reason] += 1
-        self._events.append(drop)
-        if len(self._events) > KEPT:
-            oldest = self._events.popleft()
+        self.pending.append(drop)
+        if len(self.pending) > KEPT:
+            oldest = self.pending.popleft()
             self._unlisted[oldest.input, oldest.reason] += 1
-
-    @property
-    def pending(self) -> bool:
-        """Tells whether there is a drop that was not taken."""
-        return bool(self._events or self._unlisted)
 
     def take(self) -> list[Drop]:
         """The drops since this was last asked, but for those that were too many."""
-        events = list(self._events)
-        self._events.clear()
+        events = list(self.pending)
+        self.pending.clear()
         return events
 
     def take_unlisted(self) -> dict[tuple[str, str], int]:

@@ -43,11 +43,12 @@ class Uses:
 
     def take(self, message: MessageRef) -> bool:
         """Counts one use as done. Returns whether it was the last of that message."""
-        place = (message.stream, message.incarnation, message.seq)
-        if (more := self._more.pop(place, 0)) > 1:
-            self._more[place] = more - 1
-        if more:
-            return False
+        if self._more:
+            place = (message.stream, message.incarnation, message.seq)
+            if (more := self._more.pop(place, 0)) > 1:
+                self._more[place] = more - 1
+            if more:
+                return False
         page = self._pages[message.stream, message.incarnation][message.seq >> _BITS]
         page[message.seq & _PAGE - 1] -= 1
         return not page[message.seq & _PAGE - 1]

@@ -124,9 +124,8 @@ def complete_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     graph = Graph.from_json(request["graph"])
     part = Path(request["part"])
     started = time.monotonic()
-    with Recording(request["path"]) as recording:
+    with Recording(request["path"], watch=board.goes_on) as recording:
         log = FiringLog.read(recording)
-        log.watch = board.goes_on
         feeding = _plan(recording, graph)
         store = _Store(recording, graph, feeding, part)
         work = Recomputation(

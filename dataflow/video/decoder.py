@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -18,12 +19,39 @@ from dataflow.video.picture import Headers, Picture
 
 MAX_GROUP = 64 << 20
 """Bytes of packets since a key frame that are kept for a snapshot."""
+_PERIODS = 9
+"""Times between packets of which the median counts."""
 _HEADERS: dict[str, Callable[[], Headers]] = {"h264": H264Headers, "h265": H265Headers}
 
 
 def is_key(format_: str, data: bytes) -> bool:
     """Tells whether decoding can begin with a packet: a key frame with its parameter sets."""
     return is_h264_key(data) if format_ == "h264" else is_h265_key(data)
+
+
+class Pace:
+    """The stamps of the packets since a key frame, which show losses of as many pictures as there are numbers.
+
+    `stamps`: of the packets (ns); None where they are not known.
+    """
+
+    def __init__(self) -> None:
+        self.stamps: list[int | None] = []
+        self._periods: deque[int] = deque(maxlen=_PERIODS)
+
+    def hides(self, stamp: int | None, numbers: int) -> bool:
+        """Takes a packet's stamp; returns whether a multiple of `numbers` pictures fits before it, within 5 %."""
+        last = self.stamps[-1] if self.stamps else None
+        self.stamps.append(stamp)
+        if stamp is None or last is None:
+            return False
+        period = sorted(self._periods)[len(self._periods) // 2] if self._periods else 0
+        self._periods.append(stamp - last)
+        if period <= 0 or numbers < 2:
+            return False
+        lost = (stamp - last) / period - 1
+        times = round(lost / numbers)
+        return times > 0 and abs(lost - times * numbers) <= 1 + 0.05 * lost
 
 
 class PacketDecoder:
@@ -46,11 +74,13 @@ class PacketDecoder:
         self._group: list[bytes] | None = []
         """Packets since the key frame; None where they are more than are kept."""
         self._group_bytes = 0
+        self._pace = Pace()
 
-    def decode(self, data: bytes) -> NDArray[np.uint8] | None:
+    def decode(self, data: bytes, stamp: int | None = None) -> NDArray[np.uint8] | None:
         """Returns the pixels (H, W, 3) of a packet, RGB; None where it cannot be decoded.
 
-        Raises `VideoError` for a stream that is not decoded at all (B-frames), TimeoutError where OpenCV hangs.
+        `stamp`: its time (ns), by which losses show that the numbers of pictures hide; None: not known. Raises
+        `VideoError` for a stream that is not decoded at all (B-frames), TimeoutError where OpenCV hangs.
         """
         try:
             picture = self._headers.read(data)
@@ -62,9 +92,13 @@ class PacketDecoder:
         if picture.missing:
             return self._lose(picture.missing)
         if picture.key:
+            self._pace = Pace()
+            self._pace.hides(stamp, picture.numbers)
             return self._begin(data if picture.whole else self._sets + data, new_sets)
         if self._capture is None:
             return self._lose(self.lost)
+        if self._pace.hides(stamp, picture.numbers):
+            return self._lose(f"a pause as long as that of {picture.numbers} pictures, whose numbers then begin anew")
         self._keep(data)
         return self._only(self._capture.feed(data))
 
@@ -72,14 +106,21 @@ class PacketDecoder:
         """Returns a value from which `take_up` goes on alike; None where that were too many bytes."""
         if self._group is None:
             return None
-        return {"format": self.format, "sets": self._sets, "group": list(self._group), "lost": self.lost}
+        stamps = list(self._pace.stamps) if self._group else []
+        return {
+            "format": self.format,
+            "sets": self._sets,
+            "group": list(self._group),
+            "stamps": stamps,
+            "lost": self.lost,
+        }
 
     def take_up(self, state: Mapping[str, Any]) -> None:
         """Takes over the `state` of another decoder of this format, by decoding its packets since the key frame."""
         self._headers.learn(state["sets"])
         self._sets = bytes(state["sets"])
-        for packet in state["group"]:
-            self.decode(packet)
+        for packet, stamp in zip(state["group"], state["stamps"], strict=True):
+            self.decode(packet, stamp)
         self.lost = str(state["lost"])
 
     def close(self) -> None:
@@ -111,6 +152,8 @@ class PacketDecoder:
             self._group_bytes += len(packet)
             if self._group_bytes > MAX_GROUP:
                 self._group = None
+        else:
+            del self._pace.stamps[:-1]
 
     def _only(self, frames: list[NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
         import cv2

@@ -90,7 +90,8 @@ class H264Headers:
         missing = "" if key else self._missing(number, sequence)
         if key or not missing:
             self._last = number if key or reference or self._last is None else self._last
-        return Picture(key, key and {SPS, PPS} <= {u[0] & 31 for u in units(sets)}, missing, sets, sequence.pixels)
+        whole = key and {SPS, PPS} <= {u[0] & 31 for u in units(sets)}
+        return Picture(key, whole, missing, sets, sequence.pixels, 1 << sequence.frame_bits)
 
     def _missing(self, number: int, sequence: _Sequence) -> str:
         if self._last is None:

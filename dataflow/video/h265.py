@@ -117,8 +117,10 @@ class H265Headers:
         bits.u(pictures.extra_bits)
         bits.ue()
         bits.u(pictures.output_flag + 2 * sequence.planes)
+        newest = max(self._held or (0,))
         missing = self._begin(kind, bits, sequence) if key else self._follow(unit, bits, sequence)
-        return Picture(key, key and has_sets, missing, sets, sequence.pixels)
+        step = max(1, max(self._held or (0,)) - newest)
+        return Picture(key, key and has_sets, missing, sets, sequence.pixels, (1 << sequence.order_bits) // step)
 
     def _begin(self, kind: int, bits: Bits, sequence: _Sequence) -> str:
         """Takes a key frame; the ones before it are not referred to any more."""

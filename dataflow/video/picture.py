@@ -15,6 +15,7 @@ class Picture:
     - `missing`: the reason why it cannot be decoded after the packets before it; empty where it can.
     - `sets`: the parameter sets in it, in Annex B form.
     - `pixels`: of one frame.
+    - `numbers`: pictures after which their numbers begin anew, so that as many may be lost unseen.
     """
 
     key: bool
@@ -22,6 +23,7 @@ class Picture:
     missing: str
     sets: bytes
     pixels: int
+    numbers: int = 0
 
 
 class Headers(Protocol):

@@ -17,6 +17,7 @@ from operators.cloud.fpfh import histograms
 from operators.cloud.motion_search import matches, motions
 from operators.cloud.normals import estimate_normals
 from operators.geometry import se3
+from operators.geometry.facing import LEANS, free_directions
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -236,8 +237,8 @@ def _settled(points: Array, normals: Array) -> bool:
     # Over the points' distance from each axis: what is long is thin about its length.
     aside = np.square(centred).sum(axis=1, keepdims=True) - np.square(centred @ axes)
     turning = arms @ axes / np.sqrt(np.maximum(aside.mean(axis=0), 1e-12))
-    moving = normals @ np.linalg.eigh(normals.T @ normals)[1]
-    return not any((np.where(np.abs(x) > 0.3, x**2, 0).mean(axis=0) < _TELLING).any() for x in (moving, turning))
+    told = np.where(np.abs(turning) > LEANS, turning**2, 0).mean(axis=0)
+    return not len(free_directions(normals, _TELLING)) and not bool((told < _TELLING).any())
 
 
 def apart(A: Array, B: Array, voxel: float) -> bool:

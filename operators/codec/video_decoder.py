@@ -41,7 +41,7 @@ class VideoDecoder(Operator):
         decoder = self._decoder_of(video.format)
         was_lost = bool(decoder.lost) or not self._counts.total()
         try:
-            pixels = decoder.decode(video.data.tobytes())
+            pixels = decoder.decode(video.data.tobytes(), video.stamp)
         except VideoError as error:
             raise VideoError(f"CompressedVideo at stamp {video.stamp} cannot be decoded: {error}") from error
         if pixels is None:
@@ -54,6 +54,11 @@ class VideoDecoder(Operator):
         if was_lost:
             made["status"] = self._status(video.stamp, "")
         return made
+
+    def on_reset(self, input: str) -> None:
+        """The recording begins anew: its packets do not follow on those before."""
+        self.close()
+        self._decoder = None
 
     def close(self) -> None:
         decoder: PacketDecoder | None = getattr(self, "_decoder", None)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -14,11 +13,9 @@ from dataflow.messages.diagnostics import Level
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.depth.scaling import Scaling, fitted
 from operators.inference import ModelError, open_session
-from operators.network_input import three_channels
+from operators.models.use import use_model
+from operators.network_input import NORMALIZATIONS, image_input, three_channels
 from operators.status import counted_status
-
-if TYPE_CHECKING:
-    import onnxruntime
 
 Nearness = NDArray[np.float32]
 
@@ -30,12 +27,13 @@ class MonoDepth(Operator):
 
     One image has no scale: `relative` is inverse depth up to a factor and a constant. Where `sparse` gives metric
     depth at some pixels (a stereo pair's, a projected LiDAR's), both are fitted to it, robustly, image by image, and
-    `depth` is the whole image in metres; without agreement no `depth`, and a warning in `status`. An image that is
-    black or without contrast gives neither.
+    `depth` is the whole image in metres; without agreement no `depth`, and a warning in `status`. A model whose
+    `answer` is metres gives `depth` by itself. An image that is black or without contrast gives neither.
 
-    The model takes one (1, 3, H, W) float32 input of RGB from 0 to 255 and gives one value per pixel, larger for
-    nearer, as those of Li et al., "Enforcing temporal consistency in video depth estimation", 2021 (TCMonoDepth). The
-    fit is that of Ranftl et al. (MiDaS), 2020.
+    The model is one of `dataflow models` by name, or a file. It takes one (1, 3, H, W) input of RGB in float32, float16
+    or uint8 and gives one value per pixel, larger for nearer, as those of Li et al., "Enforcing temporal consistency in
+    video depth estimation", 2021 (TCMonoDepth) and Yang et al., "Depth Anything V2", 2024. The fit is that of Ranftl et
+    al. (MiDaS), 2020.
     """
 
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
@@ -50,7 +48,14 @@ class MonoDepth(Operator):
         doc="the scale and how many depths agree; a warning where `sparse` gives none, or the image shows nothing"
     )
 
-    model: str = Param(min_length=1, doc="ONNX file")
+    model: str = Param(min_length=1, doc="a name of `dataflow models list`, or an ONNX file")
+    normalization: Literal["none", "unit", "imagenet"] = Param(
+        "none", doc="of pixels: as they are, as shares of 255, or those less ImageNet's mean by its deviation"
+    )
+    answer: Literal["nearness", "metres"] = Param(
+        "nearness", doc="what the model gives: larger for nearer without a scale, or depth in metres"
+    )
+    input_size: tuple[int, int] = Param((518, 518), doc="(width, height) where the model leaves it open", unit="px")
     align: Literal["scale_and_shift", "scale"] = Param(
         "scale_and_shift", doc="what is fitted to the given depths: the model's own constant is unknown, or is 0"
     )
@@ -63,9 +68,14 @@ class MonoDepth(Operator):
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError where there is none, ModelError where it is of another kind."""
-        file = self.use_file(self.model)
-        self._session = open_session(file)
-        self._input, self._size = _input_of(file, self._session)
+        used = use_model(self, self.model)
+        self._session = open_session(used.file)
+        mean, scale = NORMALIZATIONS[used.setting(self, "normalization")]
+        free = tuple(used.setting(self, "input_size"))
+        self._metric = used.setting(self, "answer") == "metres"
+        self._input = image_input(
+            used.file, self._session, (free[0], free[1]), bgr=False, mean=mean, scale=scale, layouts=("nchw",)
+        )
 
     def process(self, image: Image, sparse: DepthImage | None = None) -> dict[str, Any]:
         """Raises ValueError where the given depths are of another view, ModelError for an output of another shape."""
@@ -73,7 +83,13 @@ class MonoDepth(Operator):
         if (flaw := _flaw(image.data)) is not None:
             self.state.counts.update({"images": 1, f"images {flaw}": 1})
             return {"status": counted_status("mono_depth", image.stamp, f"the image is {flaw}", Level.WARN, counts)}
-        nearness = self._nearness(image.data)
+        nearness = self._answer(image.data)
+        if self._metric:
+            self.state.counts.update({"images": 1, "images with a scale": 1})
+            near = np.where(np.isfinite(nearness) & (nearness > 0) & (nearness <= self.max_range), nearness, 0)
+            depth = DepthImage(stamp=image.stamp, frame=image.frame, data=near.astype(np.float32))
+            status = counted_status("mono_depth", image.stamp, "the model gives metres", Level.OK, counts)
+            return {"depth": depth, "status": status}
         messages: dict[str, Any] = {"relative": RelativeDepth(stamp=image.stamp, frame=image.frame, data=nearness)}
         scaling, text, level = None, "no metric depth is given: relative only", Level.OK
         if sparse is not None:
@@ -89,17 +105,18 @@ class MonoDepth(Operator):
         )
         return messages | {"status": counted_status("mono_depth", image.stamp, text, level, counts)}
 
-    def _nearness(self, pixels: NDArray[np.uint8]) -> Nearness:
+    def _answer(self, pixels: NDArray[np.uint8]) -> Nearness:
         """Returns the model's output (H, W) for pixels (H, W) or (H, W, 3), at their size."""
         color = three_channels(pixels)
         height, width = color.shape[:2]
-        shrinking = width >= self._size[0] and height >= self._size[1]
-        fitting = cv2.resize(color, self._size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
-        tensor = np.ascontiguousarray(fitting.transpose(2, 0, 1)[None], np.float32)
-        output = np.asarray(self._session.run(None, {self._input: tensor})[0])
-        if output.size != self._size[0] * self._size[1]:
-            raise ModelError(f"{self.model} gave {output.shape}, but one value per pixel of {self._size} is needed")
-        small = output.reshape(self._size[1], self._size[0]).astype(np.float32)
+        size = self._input.size
+        shrinking = width >= size[0] and height >= size[1]
+        fitting = cv2.resize(color, size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
+        tensor = self._input.tensor(np.asarray(fitting, np.uint8))
+        output = np.asarray(self._session.run(None, {self._input.name: tensor})[0])
+        if output.size != size[0] * size[1]:
+            raise ModelError(f"{self.model} gave {output.shape}, but one value per pixel of {size} is needed")
+        small = output.reshape(size[1], size[0]).astype(np.float32)
         return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
     def _scaling(self, nearness: Nearness, sparse: DepthImage) -> tuple[Scaling | None, dict[str, int]]:
@@ -137,14 +154,3 @@ def _flaw(pixels: NDArray[np.uint8]) -> str | None:
     if spread >= LEAST_CONTRAST:
         return None
     return "black" if float(pixels.mean()) < 16.0 else "without contrast"
-
-
-def _input_of(file: Path, session: onnxruntime.InferenceSession) -> tuple[str, tuple[int, int]]:
-    """Returns the name of the input, and its (width, height)."""
-    inputs = session.get_inputs()
-    shape = inputs[0].shape
-    fixed = len(shape) == 4 and shape[1] == 3 and all(isinstance(extent, int) for extent in shape[2:])
-    if len(inputs) != 1 or not fixed or inputs[0].type != "tensor(float)":
-        described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
-        raise ModelError(f"{file} must have one input tensor(float) [1, 3, H, W] of fixed size, has {described}")
-    return inputs[0].name, (shape[3], shape[2])

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
+    from operators.detection.box_segmenter import BoxSegmenter
     from operators.detection.custom_detector import CustomDetector
     from operators.detection.drawing import draw_detections
     from operators.detection.onnx_detector import OnnxDetector
@@ -14,6 +15,7 @@ else:
     __getattr__, __dir__ = lazily(
         __name__,
         {
+            "box_segmenter": ("BoxSegmenter",),
             "custom_detector": ("CustomDetector",),
             "drawing": ("draw_detections",),
             "onnx_detector": ("OnnxDetector",),
@@ -23,6 +25,7 @@ else:
     )
 
 __all__ = [
+    "BoxSegmenter",
     "CustomDetector",
     "OnnxDetector",
     "ScoreFilter",

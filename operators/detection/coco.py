@@ -1,4 +1,4 @@
-"""The 80 classes of COCO detection, in the order detectors number them."""
+"""The classes of COCO detection: the 80 in the order detectors number them, and by COCO's own numbers."""
 
 from __future__ import annotations
 
@@ -18,3 +18,13 @@ _NAMES = """
 """
 
 COCO_CLASSES: Final = tuple(name.strip() for name in _NAMES.split(","))
+
+_UNUSED = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
+"""Numbers up to 90 that COCO gives no class, as in its category ids."""
+
+_USED = iter(COCO_CLASSES)
+COCO_NUMBERS: Final = tuple("" if k in _UNUSED else next(_USED) for k in range(91))
+"""Class names by COCO's own numbers from 0 to 90, which skip some; these have no name."""
+
+CLASS_LISTS: Final = {"coco": COCO_CLASSES, "coco91": COCO_NUMBERS, "coco90": COCO_NUMBERS[1:]}
+"""Lists of class names by their names in the registry of models."""

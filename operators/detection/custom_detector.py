@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.custom.first_look import FirstLook
-from operators.detection.custom.refiner import Refiner
+from operators.detection.custom.finder import GridFinder
+from operators.detection.messages import detections_of
 from operators.network_input import three_channels
 from operators.weights import shipped, trained_in_simulation
 
@@ -41,25 +39,10 @@ class CustomDetector(Operator):
 
     def setup(self) -> None:
         """Loads the network. Raises FileNotFoundError or NetworkFileError."""
-        file = self.use_file(self.weights if self.weights is not None else shipped("detector.onnx"))
-        self._look = FirstLook(file)
-        self._refiner = Refiner.within(self._look.network)
-        if self._refiner is not None:
-            self._look.reveal(self._refiner.maps)
+        self._finder = GridFinder(self.use_file(self.weights if self.weights is not None else shipped("detector.onnx")))
 
     def process(self, image: Image) -> Detections2D:
         """Raises NetworkFileError where the network's output is not what its metadata say."""
         pixels = three_channels(image.data)
-        looked = self._look.look(pixels, self.score_threshold, self.nms_iou, self.max_detections)
-        refiner = self._refiner
-        found = looked.found if refiner is None else refiner.refined(pixels, looked, self.nms_iou)
-        return Detections2D(
-            stamp=image.stamp,
-            frame=image.frame,
-            width=image.width,
-            height=image.height,
-            class_names=self._look.network.classes,
-            boxes=found.boxes,
-            scores=np.minimum(found.scores, np.float32(1)),
-            class_ids=found.classes,
-        )
+        found = self._finder.find(pixels, self.score_threshold, self.nms_iou, self.max_detections)
+        return detections_of(image, self._finder.names, found)

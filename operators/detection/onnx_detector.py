@@ -1,92 +1,124 @@
-"""Object detection with a network in an ONNX file."""
+"""Object detection with a network in an ONNX file, or one of the registry of models by its name."""
 
 from __future__ import annotations
 
-from typing import Literal
-
-import numpy as np
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
 
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.coco import COCO_CLASSES
-from operators.detection.decode import LAYOUTS, Candidates, DecoderName, Outputs
-from operators.detection.nms import class_wise_nms
-from operators.image.letterbox import Fit, FitMode
-from operators.inference import ModelError, Provider, open_session
-from operators.network_input import image_input, read_labels, three_channels
+from operators.detection.coco import CLASS_LISTS
+from operators.detection.custom.finder import GridFinder
+from operators.detection.decoders import DecoderName
+from operators.detection.exported import ExportedFinder
+from operators.detection.messages import detections_of
+from operators.inference import ModelError, Provider
+from operators.models.registry import Model, Registry
+from operators.models.use import Used, names_a_model, use_model
+from operators.network_input import read_labels, three_channels
+from operators.weights import kind_of, trained_in_simulation
+
+_SCORE, _GRID_IOU = 0.3, 0.5
 
 
 class OnnxDetector(Operator):
     """Finds objects in an image with an ONNX model; on the CPU with one thread, so equal images give equal boxes.
 
-    The model takes one (1, 3, H, W) float32 input; the decoder defines its colours, range and fit, and the meaning of
-    the output.
+    The model is one of `dataflow models` by name, or a file. The decoder defines the colours, range and fit of its
+    input and the meaning of its output; it comes from the registry for a file that has a row there, whatever its name.
+    Inputs are (1, 3, H, W) or (1, H, W, 3) of float32, float16 or uint8. Models of instance segmentation give masks.
     """
 
     stateless = True
 
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
-    detections: Out[Detections2D] = Out(doc="boxes in the image's own pixels, by falling score")
+    detections: Out[Detections2D] = Out(doc="boxes in the image's own pixels, by falling score; masks where it has any")
 
-    model: str = Param(doc="ONNX file")
-    decoder: DecoderName = Param(doc="family of the network: how its input is made and its output read")
-    classes: str | None = Param(None, doc="text file with one class name a line; none means the 80 of COCO")
-    score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes below are dropped")
-    nms_iou: float = Param(0.45, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped")
+    model: str = Param(min_length=1, doc="a name of `dataflow models list`, or an ONNX file")
+    decoder: DecoderName | Literal["grid"] | None = Param(
+        None,
+        doc="family of the network: how its input is made and its output read; `grid` is of `dataflow train detector`; "
+        "none takes the registry's",
+    )
+    classes: str | None = Param(
+        None,
+        doc="text file with one class name a line, or the names with commas between (`mug, fire extinguisher`); none "
+        "takes the registry's, those of the model's metadata, or the 80 of COCO",
+    )
+    score_threshold: float | None = Param(
+        None, ge=0, le=1, live=True, doc="boxes below are dropped; none takes the registry's for the model, or 0.3"
+    )
+    nms_iou: float | None = Param(
+        None, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped; none: the family's"
+    )
     max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
-    fit: Literal["default", "stretch", "letterbox"] = Param(
+    fit: Literal["default", "stretch", "letterbox", "corner"] = Param(
         "default", doc="how the image fills the input; by default as the decoder's family was trained"
     )
     provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
     input_size: int = Param(640, ge=32, doc="side of the input where the model leaves it open", unit="px")
+    masks: bool = Param(True, doc="give instance masks where the model has them")
+
+    @classmethod
+    def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:
+        given = str(params["model"])
+        if not names_a_model(given):
+            return trained_in_simulation(given)
+        registry = Registry.load()
+        return given in registry and trained_in_simulation(registry[given].file)
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError or ModelError."""
-        file = self.use_file(self.model)
-        self._session = open_session(file, self.provider)
-        self._layout = LAYOUTS[self.decoder]
-        self._input = image_input(
-            file,
-            self._session,
-            (self.input_size, self.input_size),
-            bgr=self._layout.bgr,
-            mean=(self._layout.mean,) * 3,
-            scale=(self._layout.scale,) * 3,
-            layouts=("nchw",),
-            types=("tensor(float)",),
-        )
-        self._fit: FitMode = self._layout.fit if self.fit == "default" else self.fit
-        self._names = COCO_CLASSES if self.classes is None else read_labels(self.use_file(self.classes)).names
+        used = use_model(self, self.model)
+        row = {} if used.model is None else used.model.params
+        decoder = self.decoder or row.get("decoder") or ("grid" if kind_of(used.file) == "detector" else None)
+        if decoder is None:
+            raise ModelError(
+                f"{used.file} is no file of a model that `dataflow models list` prints, so OnnxDetector.decoder must "
+                f"name its family"
+            )
+        self._finder: GridFinder | ExportedFinder
+        self._finder = GridFinder(used.file) if decoder == "grid" else self._exported(used, decoder)
+        family = _GRID_IOU if isinstance(self._finder, GridFinder) else self._finder.nms_iou
+        self._score, self._iou = float(row.get("score_threshold", _SCORE)), float(row.get("nms_iou", family))
+        self.log.info("%s", self._described(used, decoder))
 
     def process(self, image: Image) -> Detections2D:
         """Raises ModelError where the model's output is not what the decoder reads, or has other classes than names."""
-        fit = Fit.plan(self._fit, (image.width, image.height), self._input.size)
-        tensor = self._input.tensor(fit.apply(three_channels(image.data)))
-        outputs = self._session.run(None, {self._input.name: tensor})
-        try:
-            found = self._layout.decode(outputs, self._input.size, self.score_threshold)
-        except ValueError as error:
-            raise ModelError(f"OnnxDetector.decoder={self.decoder!r} does not fit {self.model}: {error}") from None
-        self._check_classes(outputs, found)
-        found = found.select(class_wise_nms(found.boxes, found.scores, found.classes, self.nms_iou))
-        boxes = fit.restore(found.boxes[: self.max_detections])
-        return Detections2D(
-            stamp=image.stamp,
-            frame=image.frame,
-            width=image.width,
-            height=image.height,
-            class_names=self._names,
-            boxes=boxes,
-            scores=np.minimum(found.scores[: self.max_detections], np.float32(1)),
-            class_ids=found.classes[: self.max_detections],
+        score = self._score if self.score_threshold is None else self.score_threshold
+        iou = self._iou if self.nms_iou is None else self.nms_iou
+        found = self._finder.find(three_channels(image.data), score, iou, self.max_detections)
+        return detections_of(image, self._finder.names, found)
+
+    def _exported(self, used: Used, decoder: DecoderName) -> ExportedFinder:
+        if used.model is not None and not used.model.operator.endswith(f":{type(self).__name__}"):
+            raise ModelError(f"{used.model.name} is run by {used.model.operator}, not by {type(self).__name__}")
+        return ExportedFinder(
+            used.file,
+            decoder,
+            self._names(used.model),
+            provider=self.provider,
+            fit=None if self.fit == "default" else self.fit,
+            free_side=self.input_size,
+            masks=self.masks,
         )
 
-    def _check_classes(self, outputs: Outputs, found: Candidates) -> None:
-        known = self._layout.classes
-        count = int(found.classes.max(initial=-1)) + 1 if known is None else known(outputs)
-        if count > len(self._names) or (known is not None and count != len(self._names)):
-            raise ModelError(
-                f"{self.model} separates {count} {'classes' if known is not None else 'or more classes'}, but there "
-                f"are {len(self._names)} class names{' (those of COCO)' if self.classes is None else ''}; give the "
-                f"model's own in OnnxDetector.classes, one a line"
-            )
+    def _names(self, model: Model | None) -> tuple[str, ...] | None:
+        if self.classes is not None:
+            names = tuple(name.strip() for name in self.classes.split(","))
+            file = len(names) == 1 or Path(self.classes).is_file()
+            return read_labels(self.use_file(self.classes)).names if file else names
+        if model is None or model.classes is None:
+            return None
+        if isinstance(model.classes, list):
+            return tuple(model.classes)
+        if model.classes not in CLASS_LISTS:
+            raise ModelError(f"{model.name}: there is no list of classes {model.classes!r}; {', '.join(CLASS_LISTS)}")
+        return CLASS_LISTS[model.classes]
+
+    def _described(self, used: Used, decoder: str) -> str:
+        count = len(self._finder.names)
+        if used.model is None:
+            return f"{Path(self.model).name}, decoder {decoder}, {count} classes, on {self.provider}"
+        return f"{used.model.name} ({used.model.about}; {used.model.licence}), {count} classes, on {self.provider}"

@@ -33,19 +33,20 @@ class Consensus:
     count: int
 
 
-def consensus(a: Points, b: Points, names: NDArray[np.int64]) -> Consensus | None:
-    """Returns the motion for which most pairs (N, 3), (N, 3) agree; b in a camera's axes, z forward.
+def consensus(a: Points, b: Points, names: NDArray[np.int64]) -> list[Consensus]:
+    """Returns the motions on which pairs (N, 3), (N, 3) agree, that of the most first; b in a camera's axes, z forward.
 
-    A point of b may come in several pairs, by the same name (N,), and counts once.
+    A point of b may come in several pairs, by the same name (N,), and counts once. No two motions share most of their
+    pairs, so that a second one is of a place that looks alike.
     """
     if len(a) < FEWEST:
-        return None
+        return []
     slack = SLACK / 2 + SLACK_PER_METRE * b[:, 2]
     between_b = distances(b)
     fits = (np.abs(distances(a) - between_b) < slack[:, None] + slack) & (between_b > APART)
     links = fits.astype(np.float32)
     triangles = ((links @ links) * links).sum(axis=1)
-    best: Consensus | None = None
+    grown: list[Consensus] = []
     tried = np.zeros(len(a), np.bool_)
     for _ in range(SEEDS):
         seed = int(np.argmax(np.where(tried, -1.0, triangles)))
@@ -55,11 +56,14 @@ def consensus(a: Points, b: Points, names: NDArray[np.int64]) -> Consensus | Non
         tried[clique] = True
         if len(np.unique(names[clique])) < FEWEST:
             continue
-        found = _grown(a, b, names, clique)
-        tried |= found.agree
-        if best is None or found.count > best.count:
-            best = found
-    return best
+        grown.append(_grown(a, b, names, clique))
+        tried |= grown[-1].agree
+    distinct: list[Consensus] = []
+    for found in sorted(grown, key=lambda one: -one.count):
+        shared = (np.count_nonzero(found.agree & other.agree) for other in distinct)
+        if all(2 * count < np.count_nonzero(found.agree) for count in shared):
+            distinct.append(found)
+    return distinct
 
 
 def _clique(links: NDArray[np.float32], seed: int) -> NDArray[np.intp]:

@@ -37,6 +37,7 @@ class TrackResult:
     inliers: int  # feature tracks that agree with the pose
     depth_inliers: float  # share of compared depth points that agree with it
     keyframe: bool  # whether this frame became a keyframe
+    taken_back: int | None = None  # stamp: the poses since then were at a wrong place, as this frame shows
 
 
 def moved_covariance(covariance: Matrix, T_world_a: Matrix, T_world_b: Matrix) -> Matrix:

@@ -13,10 +13,12 @@ from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param
 from operators.image.letterbox import Fit, FitMode
 from operators.inference import ModelError, Provider, open_session
-from operators.network_input import image_input, read_labels, three_channels
+from operators.model_metadata import told
+from operators.models.use import use_model
+from operators.network_input import Labels, image_input, read_labels, three_channels
 from operators.segmentation.drawing import draw_segmentation
 from operators.segmentation.labelled import labelled, least_of
-from operators.segmentation.onnx_answer import at_image, best_of, classes_of, scores_of, told
+from operators.segmentation.onnx_answer import at_image, best_of, classes_of, scores_of
 from operators.status import Row, status_of_rows
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, by which most were trained
@@ -39,7 +41,7 @@ class OnnxSegmenter(Operator):
     painted: Out[Image] = Out(doc="the image in its classes' colours, with `paint`")
     status: Out[Diagnostics] = Out(doc="the classes in the image: share and mean confidence; a warning if all is void")
 
-    model: str = Param(min_length=1, doc="ONNX file")
+    model: str = Param(min_length=1, doc="a name of `dataflow models list`, or an ONNX file")
     classes: str | None = Param(
         None,
         doc="text file with one class name a line, with or without its colour (`road 128 64 128`); none means the "
@@ -62,10 +64,14 @@ class OnnxSegmenter(Operator):
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError, or ModelError where parameters do not fit it."""
-        file = self.use_file(self.model)
+        used = use_model(self, self.model)
+        file, row = used.file, used.model
         self._session = open_session(file, self.provider)
+        self._shares = used.setting(self, "scores") == "probabilities"
         facts = told(file, self._session.get_modelmeta().custom_metadata_map)
         self._labels = facts.labels if self.classes is None else read_labels(self.use_file(self.classes))
+        if self._labels is None and row is not None and isinstance(row.classes, list):
+            self._labels = Labels(tuple(row.classes), {})
         mean, std = self.mean or facts.mean, self.std or facts.std
         if min(self.input_size) < 1 or (std is not None and min(std) <= 0):
             raise ModelError(f"input_size and std must be above 0, are {self.input_size} and {std}")
@@ -80,7 +86,7 @@ class OnnxSegmenter(Operator):
         if self._input.type is np.uint8 and (self.mean, self.std) != (None, None):
             raise ModelError(f"{file} takes pixels of uint8 as they are: leave mean and std out")
         found = {each.name: each for each in self._session.get_outputs()}
-        self._output = next(iter(found)) if self.output is None else self.output
+        self._output = used.setting(self, "output") or next(iter(found))
         if self._output not in found:
             raise ModelError(f"{file} has no output {self._output!r}; it has {', '.join(found)}")
         self._sure = "int" not in found[self._output].type
@@ -120,7 +126,7 @@ class OnnxSegmenter(Operator):
     def _scored(
         self, output: NDArray[Any], fit: Fit
     ) -> tuple[NDArray[np.intp], NDArray[np.float32] | None, tuple[str, ...]]:
-        shares = self.scores == "probabilities"
+        shares = self._shares
         scores = scores_of(output, None if self._labels is None else len(self._labels.names), shares)
         names = tuple(map(str, range(len(scores)))) if self._labels is None else self._labels.names
         if len(names) != len(scores):

@@ -16,7 +16,7 @@ from operators.geometry.se3 import Matrix
 from operators.odometry.lidar.fit import Fit, Prior, fit
 from operators.odometry.lidar.map import PlaneMap, thinned
 from operators.odometry.lidar.scan import SPARSER, Scan
-from operators.odometry.lidar.search import TURNS, around
+from operators.odometry.lidar.search import TURNS, around, places
 from operators.slam.keyframe_graph import Node
 from operators.slam.scan_context import Context, describe
 
@@ -27,7 +27,6 @@ _SIDE, _LEVELS = 2.0, 3  # planes, as in the odometry
 _ABOUT, _MOST = 2.5, 6  # metres around a view, and views there, that another is measured against
 _SEARCH = 3.0  # metres to each side of a view that looks alike
 _STARTS = 5  # poses found there that are refined
-_WORTH = 0.7  # share of the best pose's agreement from which another is worth a look
 _OFF = (0.15, 0.05)  # metres and radians by which the planes may correct the registration
 _GUESS = np.diag([0.3**-2.0] * 3 + [0.1**-2.0] * 3)  # information of where a scan is expected, which hardly counts
 
@@ -104,12 +103,7 @@ class LidarEyes:
 
     def _searched(self, one: LidarView, other: LidarView, planes: PlaneMap) -> Registered:
         poses, scores = around(other.points.astype(np.float64), planes, np.eye(4), _SEARCH, TURNS, 2 * self.noise)
-        starts: list[Array] = []
-        for T in poses[scores > _WORTH * scores[0]]:
-            if all(_far_apart(T, start) for start in starts):
-                starts.append(T)
-            if len(starts) == _STARTS:
-                break
+        starts = places(poses, scores, _STARTS)
         if not starts:
             return failure("nothing of the scan lies on surfaces that were seen there")
         return best_of([refine(other.prepared, one.prepared, T, self.judge) for T in starts], self.judge.voxel)
@@ -144,8 +138,3 @@ def _planes(nodes: Mapping[int, Node[LidarView]], known: int, seen: int) -> Plan
         T = invert(here.T) @ nodes[k].T
         planes.add(view.points @ T[:3, :3].T + T[:3, 3], 0)
     return planes
-
-
-def _far_apart(A: Matrix, B: Matrix) -> bool:
-    off = se3.log(invert(A) @ B)
-    return bool(np.linalg.norm(off[:3]) > 0.9 or np.linalg.norm(off[3:]) > 0.4)

@@ -76,7 +76,7 @@ class MapPoints:
 
         A node that keeps no view adds no points. `camera` has the K_color of the working image.
         """
-        self._forget(nodes, number)
+        self.forget(nodes, number)
         rows = np.flatnonzero(np.isin(self.anchors, np.array(around, np.int64)))
         matched = np.zeros(len(view.pixels), np.bool_)
         if len(rows):
@@ -146,12 +146,12 @@ class MapPoints:
             Sightings(here, rows, view.pixels[features].astype(np.float64), depths)
         )  # fmt: skip
 
-    def _forget(self, nodes: Nodes, newest: int) -> None:
-        """Drops the sightings of nodes that are gone, and points that one view alone showed and long ago."""
-        seen = self.sightings
-        there = np.isin(seen.nodes, np.fromiter(nodes, np.int64))
+    def forget(self, nodes: Nodes, newest: int) -> None:
+        """Drops the sightings and points of nodes that are gone, and points that one view alone showed and long ago."""
+        seen, here = self.sightings, np.fromiter(nodes, np.int64)
+        there = np.isin(seen.nodes, here)
         counts = np.bincount(seen.points[there], minlength=len(self.anchors))
-        wanted = (counts > 1) | (self.anchors > newest - LONE)
+        wanted = ((counts > 1) | (self.anchors > newest - LONE)) & np.isin(self.anchors, here)
         there &= wanted[seen.points]
         kept = seen[there]
         self.sightings = replace(kept, points=(np.cumsum(wanted) - 1)[kept.points])

@@ -53,6 +53,8 @@ class RgbdSlam:
         """
         result = self._odometry.track(image, depth, stamp)
         self._jumped |= result.status is Status.RELOCALISED
+        if result.taken_back is not None:
+            self.graph.withdraw(result.taken_back)
         added = Added()
         if result.keyframe:
             factor = max(1, image.shape[1] // self._config.image_width)

@@ -98,6 +98,11 @@ class VisualGraph(PlaceGraph[View]):
             lambda: View.of(keyframe, fitter.camera),
         )  # fmt: skip
 
+    def withdraw(self, since: int) -> None:
+        """Forgets what views from a stamp on, at a place that was taken back, added to the map."""
+        super().withdraw(since)
+        self.points.forget(self.nodes, self.graph.newest)
+
     def _adjust(self, number: int, view: View, eyes: Eyes[View]) -> None:
         """Adjusts the newest nodes and the points that they share with each other and with views around."""
         assert isinstance(eyes, CameraEyes)

@@ -78,12 +78,8 @@ class View:
     def steady(self) -> NDArray[np.bool_]:
         """Returns which features (N,) lie on a smooth surface, not on an edge, where either depth may do."""
         known = np.isfinite(self.points[:, 2])
-        h, w = self.surface.inverse_depth.shape
         points = np.where(known[:, None], self.points, np.float32(1.0)).astype(np.float64)
-        u, v = np.rint(project(points, self.surface.K)).astype(np.int64).T
-        planes = self.surface.bordered_planes.reshape(h + 2, w + 2, 4)
-        smooth = planes[np.clip(v + 1, 0, h + 1), np.clip(u + 1, 0, w + 1), 3] != 0
-        return np.asarray(known & smooth, np.bool_)
+        return np.asarray(known & (self.surface.planes_at(points)[:, 3] != 0), np.bool_)
 
     @cached_property
     def description(self) -> Description:

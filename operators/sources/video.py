@@ -64,7 +64,8 @@ class VideoFile(_Video):
     """Reads a video file (whatever the installed OpenCV decodes: AVI, MP4, MKV, ...), frame by frame, all of them.
 
     A frame is stamped `first_stamp` plus its time in the file, at least 1 ns after the one before, or with `rate`, plus
-    its number divided by the rate. Which pixels a lossy codec gives may depend on the version of OpenCV.
+    its number divided by the rate; B-frames come in the order of their times. Which pixels a lossy codec gives may
+    depend on the version of OpenCV.
     """
 
     input: str = Param(min_length=1, doc="the file")
@@ -81,7 +82,12 @@ class VideoFile(_Video):
             raise SourceError(f"{path} is no video that OpenCV {cv2.__version__} can decode")
         read, first = self._video.read()
         if not read:
-            raise SourceError(f"{path} holds no frame that can be decoded")
+            code = int(self._video.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
+            codec = code.to_bytes(4, "little").decode("ascii", "replace").strip("\0 ")
+            raise SourceError(
+                f"{path} holds no frame that can be decoded; its codec is {codec or 'unknown'}. OpenCV's wheels decode "
+                "H.264 and H.265, and no AV1: encode it anew"
+            )
         self._size = (first.shape[1], first.shape[0])
         self._rate = self.rate or self._video.get(cv2.CAP_PROP_FPS) or 25.0
         self._video.set(cv2.CAP_PROP_POS_FRAMES, 0)

@@ -48,12 +48,22 @@ def trained_in_simulation(file: str | Path) -> bool:
     file = Path(file).expanduser()
     if file.resolve().parent == _FOLDER.resolve():
         return True
+    return _peeked(file).get(TRAINED_ON) == SIMULATOR
+
+
+def kind_of(file: Path) -> str | None:
+    """Returns the kind of a network that our training wrote (`detector`); None for any other file. Opens no network."""
+    kind = _peeked(file).get("kind")
+    return kind if isinstance(kind, str) else None
+
+
+def _peeked(file: Path) -> dict[str, Any]:
     try:
         entries = (dict(_entry(f.content)) for f in fields(file.read_bytes()) if f.number == _METADATA)
         facts = next((json.loads(e[_VALUE]) for e in entries if e.get(_NAME) == KEY.encode()), None)
     except (OSError, ValueError):
-        return False
-    return isinstance(facts, dict) and facts.get(TRAINED_ON) == SIMULATOR
+        return {}
+    return facts if isinstance(facts, dict) else {}
 
 
 def _entry(content: bytes) -> Iterator[tuple[int, bytes]]:

@@ -76,7 +76,9 @@ SHOWN_BY = {
         a_clock_that_jumps_ahead_goes_on_there
         a_source_whose_stamps_jumped_far_ahead_is_named
     """,
-    "a message has a stamp in the past": "a_message_with_a_stamp_in_the_past_is_dropped_and_counted",
+    "a message has a stamp in the past": """
+        a_stamp_in_the_past_is_dropped_and_a_malformed_message_from_outside_reaches_nobody
+    """,
     "the disk is full while recording": """
         a_full_disk_stops_the_recording_until_it_has_room_and_never_the_run
         a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable
@@ -90,7 +92,7 @@ SHOWN_BY = {
     """,
     "a Zenoh subscriber outside the run is slow or stopped": "a_slow_subscriber_from_outside_costs_nobody_anything",
     "another program publishes on a key of the run, malformed or forged": """
-        a_malformed_message_from_outside_reaches_nobody
+        a_stamp_in_the_past_is_dropped_and_a_malformed_message_from_outside_reaches_nobody
         forged_ends_frontiers_and_messages_change_nothing
     """,
     "an envelope contradicts its stream": """

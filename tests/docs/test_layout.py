@@ -21,7 +21,7 @@ LONG = {
     "dataflow.cli.commands.replay:replay": 181,
     "dataflow.cli.commands.run:run": 106,
     "dataflow.cli.commands.verification:verify": 160,
-    "dataflow.process.operator_process:OperatorProcess.__init__": 84,
+    "dataflow.process.operator_process:OperatorProcess.__init__": 80,
     "dataflow.supervision.plan:process_plans": 69,
     "dataflow.verification.verify:verify": 80,
     "operators.scene.commands:show": 69,

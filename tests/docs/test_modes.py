@@ -6,10 +6,10 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-PACKAGES = ("feeds", "firing", "process", "reexecution", "supervision", "verification")
+PACKAGES = ("execution", "process", "reexecution", "supervision", "verification")
 KINDS = {"LiveRunner", "OperatorRunner", "RecordedRunner", "LogFeed", "NoLoss", "LossTold", "LiveSinkProcess"}
 """Classes of which one run has this and another that."""
-MAKES = {"__init__", "open", "release", "make_source", "make_runner", "_make_source"} | {
+MAKES = {"__init__", "open", "release", "_make_runner", "_make_source"} | {
     "core_of",
     "configurations",
     "_common",

@@ -56,8 +56,8 @@ def test_operators_of_nested_graphs_are_counted_to_the_graph_that_holds_them() -
 def test_an_operator_that_a_parameter_names_is_the_one_that_is_run() -> None:
     graphs = graphs_of()
     assert graphs["operators.recognition:LearnedDetector"] == ["learned.yaml"]
-    assert "perception.yaml" in graphs["operators.detection:CustomDetector"]
-    assert "perception_kitti.yaml" not in graphs["operators.detection:CustomDetector"]
+    assert "perception.yaml" in graphs["operators.detection:OnnxDetector"]
+    assert "learned.yaml" not in graphs["operators.detection:OnnxDetector"]
     assert not [use for use in graphs if "$" in use]
 
 

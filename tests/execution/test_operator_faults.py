@@ -19,7 +19,7 @@ def test_a_planned_error_fails_one_firing_in_place_of_the_operator() -> None:
     faults = OperatorFaults()
     made = node(Echo, {"x": ["t/s/x"]}, Live("newest", 16, {"x": 0}, restart=Restart(max=1, backoff=0)))
     collector = Collector()
-    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 0, fault=faults.before)
+    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 0, faults=faults)
     runner.setup()
     faults.begin("raise", {}, 0.0)
     for seq in range(2):

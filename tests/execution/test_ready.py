@@ -122,5 +122,5 @@ def test_the_same_are_asked_in_the_same_order_as_by_a_look_at_everybody(actions:
         else:
             assert ready.step() == listed.step(clock.now)
         assert log == listed.log
-        assert ready.any == bool(listed.awake)
+        assert bool(ready.woken) == bool(listed.awake)
         assert ready.next_due() == listed.next_due(clock.now)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -111,9 +112,8 @@ def test_an_operator_that_was_restarted_with_changed_parameters_is_identical() -
     made = dice(shared=True, restart=Restart(max=1, backoff=0))
     collector = Collector()
     errors = iter([None, Fails("once"), None])
-    runner = LiveRunner(
-        made, collector, static=frozenset(), event_clock=lambda: 10**6, fault=lambda firing: next(errors, None)
-    )
+    faults: Any = SimpleNamespace(before=lambda firing: next(errors, None))
+    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 10**6, faults=faults)
     runner.setup()
     messages = [entry(STREAM, 100 * seq, seq) for seq in range(1, 4)]
     for message in messages:

@@ -38,14 +38,14 @@ def brute_force(pattern: str, key: str) -> bool:
     return parts(pattern.split("/"), key.split("/"))
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(PATTERNS, st.lists(KEYS, unique=True, max_size=6))
 def test_matching_is_by_definition_of_the_wildcards(pattern: str, keys: list[str]) -> None:
     assert key_fault(pattern) is None
     assert matching(canonical(pattern), keys) == sorted(key for key in keys if brute_force(pattern, key))
 
 
-@settings(max_examples=800, deadline=None)
+@settings(max_examples=250, deadline=None)
 @given(ANY_PATTERNS, ANY_PATTERNS)
 def test_two_expressions_meet_and_are_spelled_as_zenoh_says(one: str, other: str) -> None:
     theirs = [zenoh.KeyExpr.autocanonize(key) for key in (one, other)]
@@ -66,7 +66,7 @@ def test_a_graph_loads_without_the_network_library() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.text(alphabet="ab*$/@#? ", min_size=0, max_size=8))
 def test_an_expression_without_fault_is_one_to_zenoh(text: str) -> None:
     if key_fault(text) is None:
@@ -79,7 +79,7 @@ def test_an_expression_without_fault_is_one_to_zenoh(text: str) -> None:
         raise AssertionError(f"Zenoh takes {text!r}, we say: {key_fault(text)}")
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.text(alphabet="ab*$/", min_size=1, max_size=8))
 def test_a_pattern_of_people_becomes_an_expression_and_an_expression_stays(text: str) -> None:
     if key_fault(text) is None:
@@ -90,7 +90,7 @@ def test_a_pattern_of_people_becomes_an_expression_and_an_expression_stays(text:
         assert intersect(canonical(made), text.replace("*", "any"))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.text(min_size=0, max_size=6))
 def test_a_name_without_fault_is_a_plain_key(text: str) -> None:
     if name_fault(text) is None:

@@ -90,6 +90,16 @@ P = "\n    def process(self, image):\n        return None\n"
         ),
         ("Operator", "    image: In[Image]\n    def process(self):\n        pass\n", "does not take the input 'image'"),
         ("Operator", "    image: In[Image]\n    def process(self, **all):\n        pass\n", "instead of *all"),
+        (
+            "Operator",
+            "    image: In[Image]\n    out: Out[Pose]\n    def process(self, image) -> Image | None:\n        pass\n",
+            "X.process: returns Image, but out emits Pose",
+        ),
+        (
+            "Operator",
+            "    image: In[Image]\n    def process(self, image) -> Image:\n        pass\n",
+            "X.process: returns one message, has 0 outputs (none): return a mapping",
+        ),
         ("Source", "    image: In[Image]\n    out: Out[Image]\n", "X.image: a source has no inputs"),
         ("Source", "    gain: int = Param(1, doc='g')\n", "X.(outputs): a source needs at least one Out[...]"),
     ],

@@ -14,7 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 from dataflow.interop.conversions import convert
 from dataflow.interop.ros import CONVERSIONS
 from dataflow.interop.ros.clouds import left_out
-from dataflow.messages import Boxes3D, DepthImage, Image, Message, MessageError, Odometry, Path, Pose
+from dataflow.interop.ros.outward import OUTWARD
+from dataflow.messages import Boxes3D, DepthImage, Image, Message, MessageError, Odometry, Path, Point, Pose
 from dataflow.recording import RecordingError
 
 STAMP = 5 * SECOND
@@ -246,6 +247,17 @@ def test_orientation_that_is_not_set_is_the_identity_and_others_are_normalised()
 
     assert unset.orientation.tolist() == [0, 0, 0, 1]
     assert long.orientation.tolist() == [0, 0, 1, 0]
+
+
+def test_a_point_comes_in_and_goes_out() -> None:
+    place = ros("geometry_msgs/Point", x=1.0, y=2.0, z=3.0)
+    point = converted(ros("geometry_msgs/PointStamped", header=header(7, "map"), point=place))
+
+    name, back = OUTWARD[Point](point)
+
+    assert point == Point(stamp=point.stamp, frame="map", position=np.array([1.0, 2.0, 3.0]))
+    assert (name, back.header.frame_id, back.point.y) == ("geometry_msgs/msg/PointStamped", "map", 2.0)
+    assert converted(place).position.tolist() == [1, 2, 3]
 
 
 def test_path_is_timed_where_its_stamps_increase() -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rerun as rr
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo as Proto
 from google.protobuf.timestamp_pb2 import Timestamp
 from made_bags import ROS2, SECOND, header, made, ros, write_ros2
@@ -117,3 +119,37 @@ def test_other_formats_are_refused_with_a_reason(make: Any, encoding: str, tmp_p
     assert not reading.playable
     assert f"'{encoding}' is not read: those known are h264 and h265" in reading.reason
     assert "AV1" in reading.reason
+
+
+def rerun_file(path: Path, codec: rr.VideoCodec, packets: Sequence[bytes], **timeline: str) -> Path:
+    with rr.RecordingStream("test", recording_id="test") as recording:
+        recording.save(path)
+        recording.log("cam/video", rr.VideoStream(codec=codec), static=True)
+        for k, packet in enumerate(packets):
+            stamp = START + k * PERIOD
+            if timeline["of"] == "timestamp":
+                recording.set_time("frame time", timestamp=np.datetime64(stamp, "ns"))
+            else:
+                recording.set_time("frame time", duration=np.timedelta64(stamp, "ns"))
+            recording.log("cam/video", rr.VideoStream.from_fields(sample=packet))
+        recording.log("cam/points", rr.Points3D([[0, 0, 1]]))
+    return path
+
+
+@pytest.mark.parametrize(("codec", "format_"), [(rr.VideoCodec.H264, "h264"), (rr.VideoCodec.H265, "h265")])
+@pytest.mark.parametrize("of", ["timestamp", "duration"])
+def test_video_streams_of_rerun_files_decode(codec: rr.VideoCodec, format_: str, of: str, tmp_path: Path) -> None:
+    packets = clip(format_)
+    path = rerun_file(tmp_path / "video.rrd", codec, packets, of=of)
+    with BagStreams(path, {"video": Played("/cam/video", "CompressedVideo")}) as bag:
+        found = [recorded.message for recorded in bag.messages()]
+        assert "/cam/video is stamped by its timeline 'frame time'" in bag.notes
+    assert [m.stamp for m in found] == [START + k * PERIOD for k in range(24)]
+    images = play(VideoDecoder(), {"video": found})["image"]
+    assert all(np.array_equal(m.data, frame) for m, frame in zip(images, decoded(format_, packets), strict=True))
+
+
+def test_av1_of_a_rerun_file_is_refused_with_a_reason(tmp_path: Path) -> None:
+    path = rerun_file(tmp_path / "video.rrd", rr.VideoCodec.AV1, [b"\x12\0\x0a\x0b"] * 3, of="timestamp")
+    bag = open_bag(path)
+    assert "video of format 'av1' is not read" in Reading(bag, bag.topics["/cam/video"]).reason

@@ -23,7 +23,7 @@ INSTEAD_OF_NONE = {"bool": False, "int": 0, "float": 0.0, "str": "", "strs": ()}
 def test_the_families_cover_what_a_robot_needs() -> None:
     wanted = """
         Image Image16 CompressedImage CompressedVideo DepthImage CompressedDepth RelativeDepth CameraInfo
-        PointCloud Imu MagneticField LaserScan RadarScan RangeReading NavSatFix Pose Transforms Odometry Twist
+        PointCloud Imu MagneticField LaserScan RadarScan RangeReading NavSatFix Point Pose Transforms Odometry Twist
         WheelTicks JointState Detections2D Boxes3D
         SegmentationMap Tracks FeatureVector SceneGraph Activity Diagnostics LandmarkSightings Path OccupancyGrid Mesh
         Planes Clusters Classification ParticleSet Number Measurement Text Switch Alarm"""

@@ -12,12 +12,12 @@ import pytest
 from process_doubles import RecordedChannel
 
 from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.feeds.pace import Pace
 from dataflow.execution.feeds.window import Window
 from dataflow.execution.source import SourceRunner
 from dataflow.graph import load_text
 from dataflow.process import live_sources
 from dataflow.process.live_sources import LiveSources
-from dataflow.process.streams.pace import Pace
 from dataflow.records.firing import FiringRecord
 from dataflow.sync import Entry
 

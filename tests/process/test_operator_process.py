@@ -55,7 +55,7 @@ class OneProcess:
         config = ProcessConfig(runs, graph.to_json(), [runs], {}, takes, [], live=live, firings=True)
         self.process = OperatorProcess(config, self.channel, self.inbox, box=box)  # type: ignore[arg-type]
         self.process.make()
-        for runner in self.process.runners.all:
+        for runner in self.process.driver.all:
             runner.setup()
         self.process.orders.released = True
 
@@ -102,7 +102,7 @@ def test_what_is_decided_does_not_wait_for_all_that_has_arrived(monkeypatch: pyt
     one.process._take(0.0)
     one.process._work()
 
-    assert one.process.runners.operators[0].firings == 1
+    assert one.process.driver.operators[0].firings == 1
     assert one.inbox.qsize() == 99
 
 
@@ -129,7 +129,7 @@ def test_envelopes_that_contradict_their_stream_end_no_process(live: bool, capsy
         one.process._take(0.0)
         one.process._work()
 
-    assert one.process.runners.operators[0].firings == 3
+    assert one.process.driver.operators[0].firings == 3
     assert (one.process.inlet.received, one.process.inlet.misplaced) == (3, 3)
     assert capsys.readouterr().err.count(STREAM) == 1
 
@@ -152,7 +152,7 @@ def test_libraries_that_setup_imports_are_limited_to_the_threads_of_the_graph(mo
     limits: list[int] = []
     one = OneProcess()
     monkeypatch.setitem(sys.modules, "cv2", None)
-    runner = one.process.runners.operators[0]
+    runner = one.process.driver.operators[0]
 
     def setup() -> None:
         monkeypatch.setitem(sys.modules, "cv2", SimpleNamespace(setNumThreads=limits.append))  # type: ignore[arg-type]

@@ -31,7 +31,7 @@ class Linked:
         link = Outgoing(*self.descriptors, most)
         self.outlet = Outlet(
             RecordedChannel(),  # type: ignore[arg-type]
-            lambda stream: (),
+            {},
             fanout=Fanout([([INFO, FAST], link)]),
             namespace="test",
             static=frozenset([INFO]),
@@ -121,7 +121,7 @@ def test_what_was_dropped_last_of_an_incarnation_that_is_over_is_missed(linked: 
 def test_a_process_that_was_restarted_says_on_a_static_stream_no_more_than_its_message_and_end(linked: Linked) -> None:
     linked.outlet = Outlet(
         RecordedChannel(),  # type: ignore[arg-type]
-        lambda stream: (),
+        {},
         fanout=Fanout([([INFO, FAST], Outgoing(*linked.descriptors, None))]),
         namespace="test",
         static=frozenset([INFO]),

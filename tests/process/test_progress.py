@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from process_doubles import RecordedChannel
 
+from dataflow.execution.driver import Driver
 from dataflow.execution.work import Work
 from dataflow.process.progress import REPORT_EVERY, REPORT_IDLE, Progress
 
@@ -22,11 +23,11 @@ class Reporting:
             node=node, done=0, firings=0, drops={}, timeouts={}, late={}, ports=ports, work=Work()
         )
         self.channel, self.now = RecordedChannel(), 0.0
-        runners: Any = SimpleNamespace(operators=[self.operator], sources=[])
-        feeding: Any = SimpleNamespace(feeds=[], logs=[])
+        driver = Driver()
+        driver.operators.append(self.operator)  # type: ignore[arg-type]
         live: Any = SimpleNamespace(runners=[], behind=dict)
         channel: Any = self.channel
-        self.progress = Progress(channel, runners, feeding, live, lambda: self.now)
+        self.progress = Progress(channel, driver, live, lambda: self.now)
 
     def fires(self, *, idle: bool) -> None:
         self.operator.done += 10

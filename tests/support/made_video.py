@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from functools import cache
+from pathlib import Path
 
 import av
 import numpy as np
@@ -41,6 +42,18 @@ def clip(
         frame.pts = number
         made += map(bytes, encoder.encode(frame))
     return (*made, *map(bytes, encoder.encode(None)))
+
+
+def mp4(path: Path, codec: str, count: int = 20) -> Path:
+    """Writes a file as LeRobot does, with B-frames where the codec has them."""
+    options = {"libx264": {"bf": "2"}, "libx265": {"x265-params": "bframes=2:pools=1:log-level=none"}}
+    with av.open(path, "w") as container:
+        stream = container.add_stream(codec, rate=25, options=options.get(codec, {"preset": "10"}))
+        stream.width, stream.height, stream.pix_fmt, stream.thread_count = 96, 64, "yuv420p", 1
+        for number in range(count):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pattern(number), format="rgb24")))
+        container.mux(stream.encode(None))
+    return path
 
 
 @cache

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import msgpack
 import pytest
 
 from dataflow.graph import Graph
@@ -14,6 +17,9 @@ from dataflow.recording import Recording
 from dataflow.reexecution.recorded_run import recorded_graph
 from dataflow.supervision.core.report import RunFailed, Status
 from dataflow.verification.verify import verify
+from dataflow.verification.workers import job
+from dataflow.verification.workers.board import Board
+from dataflow.verification.workers.processes import Call
 
 
 def with_busy(kept: Path, use: str) -> Graph:
@@ -52,3 +58,33 @@ def test_progress_is_shown_for_every_operator_and_both_times_are_told(kept: Path
     assert set(seen[-1].operators) == {"look", "smooth", "busy", "tally"}
     assert set(seen[-1].process_of.values()) == {"worker 1", "worker 2"}
     assert report.total > report.wall > 0
+
+
+def test_opening_a_recording_and_reading_its_records_are_steps_of_a_worker(kept: Path) -> None:
+    """A bound on the time between two steps then bounds no honest recording, however long it takes to be read."""
+    steps: list[int] = []
+
+    class Noting(Board):
+        def begins(self, phase: str, operator: str) -> None:
+            if phase == "setup" and not steps:
+                steps.append(self.steps)
+            super().begins(phase, operator)
+
+    def here(calls: Sequence[Call], **options: Any) -> list[Any]:
+        answers = []
+        for call in calls:
+            descriptor = os.memfd_create("board")
+            answers.append(
+                job.verify_part(msgpack.unpackb(msgpack.packb(call.request)), Noting(descriptor, call.operators))
+            )
+            os.close(descriptor)
+        return answers
+
+    report = verify(kept, jobs=1, workers=here)
+
+    reads: list[None] = []
+    with Recording(kept, watch=lambda: reads.append(None)):
+        opening = len(reads)
+    assert report.identical
+    assert opening > 5
+    assert steps[0] > opening  # and records, of chunks that are read but once

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_video import clip, decoded
+from made_video import PERIOD, clip, decoded
 
 from dataflow.video.bits import VideoError
 from dataflow.video.decoder import PacketDecoder, is_key
@@ -73,6 +73,22 @@ def test_no_frame_is_given_after_a_lost_packet_until_a_key_frame(format_: str, o
         assert (frame is None) == behind == bool(decoder.lost)
         if frame is not None:
             assert np.array_equal(frame, expected[k])
+    decoder.close()
+
+
+@pytest.mark.parametrize("count", [15, 16, 17, 32])
+def test_a_loss_of_all_numbers_shows_in_the_stamps(count: int) -> None:
+    packets = clip("h264", count=48, group=48)
+    expected = decoded("h264", packets)
+    decoder = PacketDecoder("h264")
+    for k in range(10):
+        decoder.decode(packets[k], k * PERIOD + k % 2 * 1_000_000)
+    assert decoder.decode(packets[10 + count], (10 + count) * PERIOD) is None
+    assert decoder.lost.startswith("frame" if count == 17 else "a pause as long as that of 16 pictures")
+    decoder.decode(packets[0], 0)
+    for k in range(1, 10):  # a pause in which nothing is lost
+        frame = decoder.decode(packets[k], k * PERIOD + (k > 5) * 9 * PERIOD)
+        assert np.array_equal(frame, expected[k])
     decoder.close()
 
 

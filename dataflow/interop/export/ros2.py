@@ -26,6 +26,7 @@ from dataflow.messages import (
     NavSatFix,
     Number,
     ParticleSet,
+    Point,
     Pose,
     RangeReading,
     Transforms,
@@ -247,6 +248,7 @@ def _made(recorded_as: str, message: Message) -> Made:
 _NO_PLACE: dict[type[Message], tuple[str, ...]] = {
     Imu: ("temperature",),
     NavSatFix: ("satellites",),
+    Point: ("covariance",),
     RangeReading: ("variance",),
     ParticleSet: ("weights",),
     Detections2D: ("visible", "pixel_counts", "masks"),

@@ -13,6 +13,7 @@ from dataflow.interop.ros.made import (
     make,
     moving,
     placed_at,
+    point,
     quaternion,
     time,
     vector,
@@ -28,6 +29,7 @@ from dataflow.messages import (
     Odometry,
     ParticleSet,
     Path,
+    Point,
     Pose,
     Switch,
     Text,
@@ -45,6 +47,12 @@ def odometry(m: Odometry) -> Made:
         child_frame_id=m.child_frame,
         pose=with_covariance(m.position, m.orientation, m.pose_covariance),
         twist=moving(m.linear, m.angular, m.twist_covariance),
+    )
+
+
+def point_stamped(m: Point) -> Made:
+    return "geometry_msgs/msg/PointStamped", make(
+        "geometry_msgs/PointStamped", header=header_of(m.stamp, m.frame), point=point(m.position)
     )
 
 

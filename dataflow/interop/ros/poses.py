@@ -9,7 +9,7 @@ import numpy as np
 
 from dataflow.interop.ros.values import covariance, orientation, time_ns, vector
 from dataflow.interop.seen import lose
-from dataflow.messages import Odometry, ParticleSet, Path, Pose, Transforms, Twist
+from dataflow.messages import Odometry, ParticleSet, Path, Point, Pose, Transforms, Twist
 
 
 def odometry(message: Any, stamp: int) -> Odometry:
@@ -26,6 +26,11 @@ def odometry(message: Any, stamp: int) -> Odometry:
         angular=vector(twist.twist.angular),
         twist_covariance=covariance(twist.covariance, 6),
     )
+
+
+def point(message: Any, stamp: int) -> Point:
+    """geometry_msgs/Point and PointStamped."""
+    return Point(stamp=stamp, frame=_frame(message), position=vector(getattr(message, "point", message)))
 
 
 def pose(message: Any, stamp: int) -> Pose:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -77,7 +77,7 @@ class Outlet:
     def __init__(
         self,
         channel: Channel,
-        consumers: Callable[[str], Iterable[Consumer]],
+        consumers: Mapping[str, Sequence[Consumer]],
         *,
         fanout: Fanout,
         namespace: str,
@@ -208,7 +208,7 @@ class Outlet:
 
     def message(self, stream: str, entry: Entry) -> None:
         """Most messages go to other processes of the run and nowhere else: that way is the short one."""
-        for consumer in self._consumers(stream):
+        for consumer in self._consumers.get(stream, ()):
             consumer.push(stream, entry)
         before = self._next.get(stream)
         if before is not None and before[0] != entry.incarnation:
@@ -239,13 +239,13 @@ class Outlet:
         return self._held is not None or stream in self._fanout.takers or self._listened(stream) is not None
 
     def frontier(self, stream: str, frontier: int) -> None:
-        for consumer in self._consumers(stream):
+        for consumer in self._consumers.get(stream, ()):
             consumer.advance(stream, frontier)
         if self._is_taken(stream):
             self._send(stream, self._envelope(Kind.FRONTIER, stream, frontier))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        for consumer in self._consumers(stream):
+        for consumer in self._consumers.get(stream, ()):
             consumer.end(stream, final_stamp, reason)
         if stream in self._static:
             over = self._envelope(Kind.END, stream, NEVER, reason)

@@ -23,7 +23,7 @@ from dataflow.recording.mcap.attachments import Attachment, Place, read_attachme
 from dataflow.recording.mcap.contents import UNCHUNKED, Contents, signed
 from dataflow.recording.mcap.ending import MAGIC
 from dataflow.recording.mcap.message_index import LoadedIndex, MessageIndex
-from dataflow.recording.mcap.rawfile import RECORD, RawFile
+from dataflow.recording.mcap.rawfile import RECORD, RawFile, Watch
 from dataflow.recording.mcap.scan import scan
 from dataflow.recording.mcap.seals import Seal, seal_of
 from dataflow.recording.mcap.summary import TAIL_BYTES, Footer, Summary, read_footer, read_summary
@@ -54,7 +54,7 @@ class McapFile:
     and was got round, or left out. Raises `RecordingError` for a file that is no MCAP or is damaged otherwise.
     """
 
-    def __init__(self, path: Path, *, lenient: bool = False) -> None:
+    def __init__(self, path: Path, *, lenient: bool = False, watch: Watch | None = None) -> None:
         """`lenient`: what cannot be read of a file without a sound index is left out, with a note."""
         self._lenient = lenient
         self.header = Header("", "")
@@ -63,7 +63,7 @@ class McapFile:
         self.damage: list[str] = []
         self._sealed = False
         self.path = path
-        self._file = RawFile(path)
+        self._file = RawFile(path, watch)
         try:
             contents, self.index = self._load()
         except struct.error as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,20 @@ from dataflow.recording.limits import MAX_RECORD_BYTES
 RECORD = struct.Struct("<BQ")
 """The head of every record: opcode, length of the rest."""
 WINDOW_BYTES = 2**16
+Watch = Callable[[], None]
+"""Is called before every read of a file: a sign of progress, however long it is."""
+
+
+def _unwatched() -> None:
+    """Takes no notice."""
 
 
 class RawFile:
     """A file opened for reading. Raises `RecordingError` where it cannot be read, `DamagedError` beyond its end."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, watch: Watch | None = None) -> None:
         self.path = path
+        self._watch = watch or _unwatched
         try:
             self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -50,6 +58,7 @@ class RawFile:
         """`size` bytes at `offset`, fewer where the file ends before."""
         if self._fd < 0:
             raise RecordingError(f"the recording {self.path} is closed")
+        self._watch()
         try:
             data = os.pread(self._fd, size, offset)
             while len(data) < size and (more := os.pread(self._fd, size - len(data), offset + len(data))):

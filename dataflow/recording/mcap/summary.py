@@ -27,7 +27,7 @@ BLOCK_BYTES = 2**24
 """Of the summary, in memory at a time."""
 LONG = 2**14
 """Chunks of a file beyond which its message indexes are read as they are needed: all would take seconds."""
-LONG_BYTES = 2**25
+LONG_BYTES = 2**24
 """Bytes of its message indexes, 16 a message, beyond which they are so too: in memory all would take half as much
 again."""
 

@@ -22,6 +22,7 @@ from dataflow.recording.mcap.chunks import Column
 from dataflow.recording.mcap.contents import Entries
 from dataflow.recording.mcap.index import McapFile, RawMessage
 from dataflow.recording.mcap.message_index import MessageIndex
+from dataflow.recording.mcap.rawfile import Watch
 from dataflow.recording.streams.cutting import cut_of
 
 _PART = re.compile(r"(.+)_(\d{3,})\.mcap")
@@ -48,12 +49,12 @@ def parts_in(folder: Path) -> list[Path]:
 class PartedFile:
     """The parts of a recording as one file (see `McapFile`). Chunks and channels are numbered through all of them."""
 
-    def __init__(self, path: Path, parts: Sequence[Path]) -> None:
+    def __init__(self, path: Path, parts: Sequence[Path], *, watch: Watch | None = None) -> None:
         self.path = path
         self._files: list[McapFile] = []
         try:
             for part in parts:
-                self._files.append(McapFile(part))
+                self._files.append(McapFile(part, watch=watch))
                 if not any(name == RECORDING for name, _ in self._files[-1].metadata):
                     raise RecordingError(f"{part} is no recording of this program, so {path} is not one in parts")
         except BaseException:

@@ -14,6 +14,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import FORMAT, RECORDING, Kind
 from dataflow.recording.mcap.attachments import Attachment
 from dataflow.recording.mcap.index import McapFile, RawMessage
+from dataflow.recording.mcap.rawfile import Watch
 from dataflow.recording.streams.access import StreamIndex
 from dataflow.recording.streams.codecs import codec_for
 from dataflow.recording.streams.entries import Event, RawRecord, Recorded
@@ -41,10 +42,13 @@ class Recording:
     MCAP or is damaged.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, watch: Watch | None = None) -> None:
+        """`watch` is called before every read of the file: a sign of progress while a long one is opened or read."""
         self.path = Path(path)
         parts = parts_in(self.path) if self.path.is_dir() else []
-        self._file: McapFile | PartedFile = PartedFile(self.path, parts) if parts else McapFile(self.path)
+        self._file: McapFile | PartedFile = (
+            PartedFile(self.path, parts, watch=watch) if parts else McapFile(self.path, watch=watch)
+        )
         try:
             self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
             _check_format(self.path, self.metadata)
@@ -306,6 +310,10 @@ class Recording:
         self, channels: list[int], start: int | None = None, end: int | None = None, *, skip: int = 0
     ) -> Iterator[RawMessage]:
         for part in self._file.index.in_file_order(channels, start, end):
+            count = sum(map(len, part.values()))
+            if start is None and end is None and skip >= count:
+                skip -= count
+                continue
             for place in in_file_order(list(part.items())):
                 if (start is None or place[3] >= start) and (end is None or place[3] <= end):
                     if skip:

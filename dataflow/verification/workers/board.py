@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from dataflow.execution.recorded import RecordedRunner
+from dataflow.execution.recorded import RecordedRunner, Watcher
 
 PHASES = ("start", "setup", "fire", "read", "close")
 _HEAD = 3
@@ -37,7 +37,7 @@ class Place(NamedTuple):
     operator: str
 
 
-class Board:
+class Board(Watcher):
     """The shared memory of one worker and its parent: who opens it by its descriptor sees what the other wrote.
 
     Integers of 64 bits: phase, operator, steps, then `Counts` of each operator. A parent that reads while the worker
@@ -62,7 +62,7 @@ class Board:
         cells[2] += 1
 
     def goes_on(self) -> None:
-        """Counts a step of what is long and made of small parts, such as reading firing records."""
+        """Counts a step of what may take long before the first one, such as opening a recording."""
         self._cells[2] += 1
 
     def stepped(self, runner: RecordedRunner) -> None:

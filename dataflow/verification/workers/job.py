@@ -30,11 +30,10 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     those that are not repeated as a whole.
     """
     graph = Graph.from_json(request["graph"])
-    with Recording(request["path"]) as recording:
+    with Recording(request["path"], watch=board.goes_on) as recording:
         feeding = plan_feeding(recording, graph, request["operators"], incomplete=request["incomplete"])
         feeding = feeding.reading(request["checks"])
         log = FiringLog.from_wire(request["records"], recording)
-        log.watch = board.goes_on
 
         def repeated(operator: str) -> FiringRecord | None:
             return work.runners[operator].record

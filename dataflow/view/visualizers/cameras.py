@@ -85,7 +85,7 @@ def compressed_video(canvas: Canvas, message: CompressedVideo) -> None:
     decoder = canvas.scene.videos.get(canvas.stream)
     if decoder is None or decoder.format != message.format:
         decoder = canvas.scene.videos[canvas.stream] = PacketDecoder(message.format)
-    pixels = decoder.decode(message.data.tobytes())
+    pixels = decoder.decode(message.data.tobytes(), message.stamp)
     if pixels is None:
         canvas.notice(f"pictures are not shown until the next key frame: {decoder.lost}")
         canvas.clear("")

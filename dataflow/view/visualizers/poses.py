@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from dataflow.messages import NavSatFix, Odometry, ParticleSet, Path, Pose, Transforms, Twist
+from dataflow.messages import NavSatFix, Odometry, ParticleSet, Path, Point, Pose, Transforms, Twist
 from dataflow.messages.geometry import matrix_to_quaternion, quaternion_from_yaw, quaternion_to_matrix
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
@@ -27,6 +27,23 @@ def transforms(canvas: Canvas, message: Transforms) -> None:
         if child and canvas.scene.changed(canvas.entity, f"axes {child}", True):
             where = f"space/{rr.escape_entity_path_part(child)}"
             canvas.log(where, rr.CoordinateFrame(child), _axes(np.eye(4), 0.6 * _AXIS), static=True)
+
+
+@visualizer(Point, "space")
+def point(canvas: Canvas, message: Point) -> None:
+    """A dot with the stream's name, and the covariance of its position."""
+    if not np.isfinite(message.position).all():
+        canvas.clear("space/point")
+        canvas.clear("space/covariance")
+        return
+    name = "/".join(canvas.stream.split("/")[-2:])
+    canvas.draw(
+        "space/point",
+        message.frame,
+        rr.Points3D([message.position], radii=rr.Radius.ui_points(5.0), labels=[name], show_labels=True),
+    )
+    if message.covariance is not None:
+        _ellipsoid(canvas, message.frame, message.position, message.covariance)
 
 
 @visualizer(Pose, "space")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.geometry import invert
+from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.lidar.fit import agreements
 from operators.odometry.lidar.map import PlaneMap
@@ -15,6 +17,8 @@ STEP = 0.5  # metres between poses
 TURNS = 24  # headings, where none is known
 _SEARCHED = 120  # points that are looked at
 _WIDTH = 6.0  # standard deviations of the kernel
+_WORTH = 0.7  # share of the best pose's score from which another is worth a look
+_APART = (0.9, 0.4)  # metres and radians between two places
 
 
 def around(
@@ -37,3 +41,20 @@ def around(
     scores = agreements(chosen, planes, poses, noise, _WIDTH) - 1e-3 * (np.abs(x) + np.abs(y))
     best = np.argsort(-scores, kind="stable")
     return poses[best], scores[best]
+
+
+def places(poses: Array, scores: Array, most: int) -> list[Matrix]:
+    """Returns the best of poses (K, 4, 4) that have scores (K,), best first, no two of them of one place."""
+    found: list[Matrix] = []
+    for T in poses[scores > _WORTH * scores[0]]:
+        if all(apart(T, other) for other in found):
+            found.append(T)
+        if len(found) == most:
+            break
+    return found
+
+
+def apart(A: Matrix, B: Matrix) -> bool:
+    """Returns whether two poses are of two places."""
+    off = se3.log(invert(A) @ B)
+    return bool(np.linalg.norm(off[:3]) > _APART[0] or np.linalg.norm(off[3:]) > _APART[1])

@@ -18,12 +18,13 @@ from operators.odometry.lidar.fit import Fit, Prior, fit
 from operators.odometry.lidar.map import PlaneMap
 from operators.odometry.lidar.motion import LidarMotion, as_left, as_right, corrected
 from operators.odometry.lidar.scan import Scan, prepare
-from operators.odometry.lidar.search import TURNS, around
+from operators.odometry.lidar.search import TURNS, apart, around, places
 
 FEWEST = 50  # points of a scan, and half as many in planes, that a pose may rest on
 _EPOCH = (1.0, 0.35)  # metres, radians: what the sensor moves until the map's new voxels count as younger
 _REACH = 3.0  # metres to each side that a search for the pose covers
-_STARTS, _LOST_STARTS = 3, 4  # of which a pose is fitted
+_STARTS, _LOST_STARTS = 3, 5  # of which a pose is fitted
+_RIVAL = 0.03  # a second place whose agreement is that near to the best one's makes the pose ambiguous
 
 
 class State(StrEnum):
@@ -112,13 +113,13 @@ class LidarTracker:
         lost = self._motion.seconds(stamp) > self._patience
         starts = self._starts(scan, stamp, lost)
         if self._first is not None and self._first.offsets is not None:
-            found = self._second(scan, stamp, starts)
+            fits = self._second(scan, stamp, starts)
         else:
-            found = self._fitted(scan, stamp, starts)
-        reason = self._doubt(found, stamp, lost)
+            fits = self._fitted(scan, stamp, starts)
+        reason = self._doubt(fits[0], stamp, lost) or (_elsewhere(fits) if lost else "")
         if reason:
             return self._unmeasured(scan, stamp, reason)
-        return self._measured(scan, stamp, found, State.RELOCALISED if lost else State.TRACKING)
+        return self._measured(scan, stamp, fits[0], State.RELOCALISED if lost else State.TRACKING)
 
     @property
     def _patience(self) -> float:
@@ -154,11 +155,11 @@ class LidarTracker:
         if not lost:
             reach = min(reach, self._config.start_speed * self._motion.seconds(stamp))
         turns = TURNS if lost else 1
-        best, _ = around(scan.points[scan.sample], self._map, T, reach, turns, self._config.noise)
-        return [T, *best[: _LOST_STARTS if lost else _STARTS]]
+        best, scores = around(scan.points[scan.sample], self._map, T, reach, turns, self._config.noise)
+        return [T, *(places(best, scores, _LOST_STARTS) if lost else best[:_STARTS])]
 
-    def _fitted(self, scan: Scan, stamp: int, starts: list[Matrix]) -> Fit:
-        """Returns the pose from the start that ends in the most agreement."""
+    def _fitted(self, scan: Scan, stamp: int, starts: list[Matrix]) -> list[Fit]:
+        """Returns the pose that each start leads to, that of the most agreement first."""
         motion = self._motion
         assert motion is not None
         config = self._config
@@ -169,17 +170,17 @@ class LidarTracker:
             return motion.sweep_velocity(T, stamp)
 
         fits = [fit(scan, self._map, Prior(T, certain), velocity, config.noise) for T in starts]
-        return max(fits, key=lambda found: found.inliers * found.paired)
+        return sorted(fits, key=lambda found: -found.inliers * found.paired)
 
-    def _second(self, scan: Scan, stamp: int, starts: list[Matrix]) -> Fit:
-        """Returns the fit of the second scan, which shows by what velocity both are to be deskewed.
+    def _second(self, scan: Scan, stamp: int, starts: list[Matrix]) -> list[Fit]:
+        """Returns the fits of the second scan, which shows by what velocity both are to be deskewed.
 
         As they were taken, both are skewed alike, so the motion between them comes out nearly right.
         """
         motion, first = self._motion, self._first
         assert motion is not None
         assert first is not None
-        found = self._fitted(replace(scan, offsets=None), stamp, starts)
+        found = self._fitted(replace(scan, offsets=None), stamp, starts)[0]
         points = deskewed(first.points, first.offsets, motion.velocity_to(found.T, stamp))
         self._map = PlaneMap(self._config.voxel, self._config.levels)
         self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], 0)
@@ -303,6 +304,18 @@ class LidarTracker:
 
 _MOTION = ("stamp", "T", "velocity", "covariance", "fresh", "before_stamp", "before_T")
 _SCAN = ("points", "offsets", "sample", "unusable")
+
+
+def _elsewhere(fits: list[Fit]) -> str:
+    """Returns why a lost sensor may as well be elsewhere than where the first of some fits has it, or nothing."""
+    best, *others = fits
+    for twist in best.blind:
+        if twist[:3].any():
+            return _told_nothing(twist)
+    least = (1 - _RIVAL) * best.inliers * best.paired
+    if any(other.inliers * other.paired > least and apart(best.T, other.T) for other in others):
+        return "ambiguous: the scan lies on the map in another place as well"
+    return ""
 
 
 def _told_nothing(twist: Vector) -> str:

@@ -50,9 +50,14 @@ class Evidence:
         )
 
 
+def slack_of(noise: DepthNoise) -> float:
+    """Returns by how much depths may differ besides `NEAR`, per square of the depth, 1/m."""
+    return max(NEAR_PER_SQUARE, noise.quadratic)
+
+
 def seeing(points: Points, T_world_camera: Matrix, keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
     """Returns the keyframes that saw most of a view's points (N, 3), the most last."""
-    seen = [int(np.count_nonzero(_compared(points, T_world_camera, k)[2])) for k in keyframes]
+    seen = [int(np.count_nonzero(compared(points, T_world_camera, k)[2])) for k in keyframes]
     order = np.argsort(seen, kind="stable")[-count:]
     return [keyframes[i] for i in order.tolist() if seen[i]]
 
@@ -65,15 +70,14 @@ def gathered(
     noise: DepthNoise = USUAL_NOISE,
 ) -> Evidence:
     """Compares a frame at a pose with keyframes, by the colour camera of whose images K_color is."""
-    slack = max(NEAR_PER_SQUARE, noise.quadratic)
     points = frame.surface.points(STRIDE)
-    here = _sampled(_levelled(frame.gray), points, camera)
+    here = sampled(levelled(frame.gray), points, camera)
     met, same, pairs = 0, 0, [np.zeros((0, 2))]
     for keyframe in keyframes:
-        moved, on, known = _compared(points, T_world_camera, keyframe, slack)
+        moved, on, known = compared(points, T_world_camera, keyframe, slack_of(noise))
         met += int(np.count_nonzero(known))
         same += int(np.count_nonzero(on))
-        there = _sampled(_levelled(keyframe.gray), moved[on], camera)
+        there = sampled(levelled(keyframe.gray), moved[on], camera)
         pairs.append(np.column_stack([here[on], there]))
     both = np.concatenate(pairs)
     both = both[np.isfinite(both).all(axis=1)]
@@ -88,7 +92,7 @@ def _correlation(pairs: NDArray[np.float64]) -> float:
     return float(np.asarray(np.corrcoef(pairs.T))[0, 1])
 
 
-def _compared(
+def compared(
     points: Points, T_world_camera: Matrix, keyframe: Keyframe, slack: float = NEAR_PER_SQUARE
 ) -> tuple[Points, NDArray[np.bool_], NDArray[np.bool_]]:
     """Returns points (N, 3) in a keyframe's camera, which lie on its surface, and which are where it has one."""
@@ -104,7 +108,7 @@ def _compared(
     return moved, known & (off < NEAR + slack * z * z), known
 
 
-def _levelled(gray: Gray) -> NDArray[np.float32]:
+def levelled(gray: Gray) -> NDArray[np.float32]:
     """Returns an image without its noise and without its slow changes, whose contrast is 1 wherever there is some."""
     image = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.5)
     side = max(gray.shape[1] // 10, 3) | 1
@@ -113,7 +117,7 @@ def _levelled(gray: Gray) -> NDArray[np.float32]:
     return np.asarray((image - mean) / (spread + np.float32(5.0)), np.float32)
 
 
-def _sampled(image: NDArray[np.float32], points: Points, camera: RgbdCamera) -> NDArray[np.float64]:
+def sampled(image: NDArray[np.float32], points: Points, camera: RgbdCamera) -> NDArray[np.float64]:
     """Returns what an image has where points (N, 3) of the depth camera are; NaN beside it."""
     if not len(points):
         return np.zeros(0)

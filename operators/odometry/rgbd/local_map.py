@@ -10,6 +10,7 @@ from operators.geometry.se3 import Matrix, orthonormalised
 from operators.odometry.keyframes import redundant, view_distance
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.surface import Surface
+from operators.odometry.rgbd.trial import Trial
 
 RECENT = 5  # newest keyframes, never forgotten
 EARLIER = 6  # keyframes back, at most, to one that reveals motion since
@@ -69,6 +70,17 @@ class LocalMap:
             if k.segment == segment
             else k
             for k in self.keyframes
+        ]
+
+    def part(self, trial: Trial) -> None:
+        """Makes a segment of the newest keyframes, those that rest on a place, and takes that back."""
+        segment = self.newest.segment
+        self.keyframes = [
+            replace(k, T_world_camera=orthonormalised(T), covariance=covariance, sunk=np.zeros(6), segment=segment + 1)
+            if k.segment == segment and k.stamp >= trial.since
+            else k
+            for k in self.keyframes
+            for T, covariance in [trial.taken_back(k.T_world_camera)]
         ]
 
     def nearby(self, T_world_camera: Matrix, count: int, segment: int, reach: float = REACH) -> list[Keyframe]:

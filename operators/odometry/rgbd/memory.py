@@ -15,6 +15,7 @@ from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.surface import Surface
 from operators.odometry.rgbd.tracker import State
+from operators.odometry.rgbd.trial import Trial
 
 
 def to_plain(state: State) -> dict[str, Any]:
@@ -28,6 +29,7 @@ def to_plain(state: State) -> dict[str, Any]:
         "watch": fields_of(state.watch),
         "recalls": state.recalls,
         "apart_since": state.apart_since,
+        "trial": None if state.trial is None else fields_of(state.trial),
     }
 
 
@@ -43,6 +45,7 @@ def from_plain(values: Mapping[str, Any]) -> State:
         watch=Watch(**values.get("watch", {})),
         recalls=values.get("recalls", 0),
         apart_since=values.get("apart_since"),
+        trial=None if values.get("trial") is None else Trial(**values["trial"]),
     )
 
 

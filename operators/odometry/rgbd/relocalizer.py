@@ -1,7 +1,8 @@
 """Finds a lost camera's view among remembered keyframes.
 
-Where depth is seen, points of several keyframes are paired with those of the view, and the motion on which most agree
-is refined and judged by all that both see. Without depth, the pixels of one keyframe's points give the pose.
+Where depth is seen, points of several keyframes are paired with those of the view, and the motions on which most agree
+are refined and judged by all that both see; where two places fit, neither is believed. Without depth, the pixels of one
+keyframe's points give the pose.
 """
 
 from __future__ import annotations
@@ -26,9 +27,13 @@ from operators.odometry.rgbd.frame import Frame
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.surface import DepthNoise, Surface
+from operators.odometry.rgbd.uniqueness import unique
 
 PAIRS = 60  # features of one keyframe that are paired
 FEWEST = 8  # different features of a view that must agree on its pose for a look at what else supports it
+APART = 0.5  # metres between two places
+SHARED = 0.15  # of a view that the map must have seen to contradict it
+CONTRADICTED = 0.4  # of what a view and the map both see: less of it agrees only at a wrong place, or after a change
 VIEWS = 2  # keyframes that a recognised view is compared with
 SPARSE = 4  # patches of the view's surface between points by which these are chosen
 FEWEST_PIXELS = 7  # features that a pose may be solved from without depth
@@ -70,19 +75,37 @@ def recognised(
     seen = Landmarks.of(describe(frame.gray), frame.surface, fitter.camera)
     for segment in sorted({k.segment for k in chosen}):
         keyframes = [k for k in chosen if k.segment == segment]
-        sighting = common(seen, keyframes, fitter.camera)
-        if sighting is None:
-            continue
         there = [k for k in known.keyframes if k.segment == segment]
-        views = seeing(frame.surface.points(SPARSE), sighting.T_world_camera, there, VIEWS)
-        if not views:
-            continue
-        compared = LocalMap(VIEWS)
-        compared.keyframes = views
-        fit = fitter.refine(frame, sighting, motion, T_predicted, compared, segment)
-        view = believed(frame, fit.T_world_camera, there, fitter.camera, fitter.config.depth_noise)
-        if view is not None:
-            yield fit, view
+        first: tuple[Fit, Keyframe] | None = None
+        for sighting in common(seen, keyframes, fitter.camera):
+            found = _refined(frame, sighting, fitter, motion, T_predicted, there)
+            if found is None and first is None:
+                break  # what fewer features say is no better founded
+            if found is not None and first is not None and _apart(found[0], first[0]):
+                first = None
+                break
+            first = first or found
+        if first is not None:
+            yield first
+
+
+def _refined(
+    frame: Frame, sighting: Sighting, fitter: Fitter, motion: Motion, T_predicted: Matrix, there: Sequence[Keyframe]
+) -> tuple[Fit, Keyframe] | None:
+    """Returns a sighting's pose among a segment's keyframes, refined, and the one that shows most, if it is certain."""
+    views = seeing(frame.surface.points(SPARSE), sighting.T_world_camera, there, VIEWS)
+    if not views:
+        return None
+    compared = LocalMap(VIEWS)
+    compared.keyframes = views
+    fit = fitter.refine(frame, sighting, motion, T_predicted, compared, views[0].segment)
+    view = believed(frame, fit.T_world_camera, there, fitter.camera, fitter.config.depth_noise)
+    return None if view is None else (fit, view)
+
+
+def _apart(a: Fit, b: Fit) -> bool:
+    """Returns whether two poses are of two places, and not of one that a map with drift holds twice."""
+    return float(np.linalg.norm((a.T_world_camera - b.T_world_camera)[:3, 3])) > APART
 
 
 def believed(
@@ -90,11 +113,22 @@ def believed(
 ) -> Keyframe | None:
     """Returns the keyframe that sees most of a view, if shape and brightness make sure of its pose; else nothing."""
     views = seeing(frame.surface.points(SPARSE), T_world_camera, keyframes, VIEWS)
-    return views[-1] if views and gathered(frame, T_world_camera, views, camera, noise).certain else None
+    if not views or not gathered(frame, T_world_camera, views, camera, noise).certain:
+        return None
+    return views[-1] if unique(frame, T_world_camera, views, camera, noise) else None
 
 
-def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> Sighting | None:
-    """Returns the pose in which most of a view's features lie where keyframes of one segment have them."""
+def contradicted(
+    frame: Frame, T_world_camera: Matrix, keyframes: Sequence[Keyframe], camera: RgbdCamera, noise: DepthNoise
+) -> bool | None:
+    """Returns whether most of a view at a pose lies elsewhere than on keyframes; nothing where these saw too little."""
+    views = seeing(frame.surface.points(SPARSE), T_world_camera, keyframes, VIEWS)
+    found = gathered(frame, T_world_camera, views, camera, noise)
+    return found.agreement < CONTRADICTED if found.overlap >= SHARED else None
+
+
+def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> list[Sighting]:
+    """Returns the poses in which a view's features lie where keyframes of one segment have them, most of them first."""
     known, names = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for keyframe in keyframes:
         landmarks = Landmarks.of(keyframe.description, keyframe.surface, camera)
@@ -102,11 +136,12 @@ def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -
         known.append(transform_points(keyframe.T_world_camera, landmarks.points[pairs[:, 0]]))
         names.append(pairs[:, 1])
     points, which = np.concatenate(known), np.concatenate(names)
-    found = consensus(points, seen.points[which], which)
-    if found is None or found.count < FEWEST:
-        return None
-    pixels, ages = seen.pixels[which[found.agree]], np.zeros(np.count_nonzero(found.agree), np.int64)
-    return Sighting(found.T_a_b, points[found.agree], pixels, ages, len(points), recognised=True)
+    sightings = []
+    for found in consensus(points, seen.points[which], which):
+        if found.count >= FEWEST:
+            pixels, ages = seen.pixels[which[found.agree]], np.zeros(np.count_nonzero(found.agree), np.int64)
+            sightings.append(Sighting(found.T_a_b, points[found.agree], pixels, ages, len(points), recognised=True))
+    return sightings
 
 
 def _by_pixels(

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix
 
 Array32 = NDArray[np.float32]
@@ -111,6 +112,13 @@ class Surface:
         for i, part in enumerate((a, b, c, 1.0)):
             np.multiply(part, -scale, out=planes[1:-1, 1:-1, i])
         return planes.reshape(-1, 4)
+
+    def planes_at(self, points: NDArray[np.float64]) -> Array32:
+        """Returns the planes (N, 4) of the patches that points (N, 3) fall on, as `bordered_planes` has them."""
+        h, w = self.inverse_depth.shape
+        u, v = np.rint(project(points, self.K)).astype(np.int64).T
+        cells = np.clip(v + 1, 0, h + 1) * (w + 2) + np.clip(u + 1, 0, w + 1)
+        return np.asarray(self.bordered_planes.take(cells, axis=0), np.float32)
 
     @cached_property
     def bordered(self) -> Array32:

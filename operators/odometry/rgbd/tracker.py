@@ -26,8 +26,9 @@ from operators.odometry.rgbd.keyframe import Keyframe, carried
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.noise import Noise
-from operators.odometry.rgbd.relocalizer import believed, recognised
+from operators.odometry.rgbd.relocalizer import believed, contradicted, recognised
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.trial import Trial
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
@@ -45,6 +46,7 @@ class State:
     watch: Watch = field(default_factory=Watch)
     recalls: int = 0  # frames that the map was searched for since the last loss
     apart_since: int | None = None  # stamp at which the newest segment began, while its place is unknown
+    trial: Trial | None = None  # of the place that was found last
 
 
 class RgbdOdometry:
@@ -62,6 +64,7 @@ class RgbdOdometry:
         self._watch = Watch()
         self._recalls = 0
         self._apart_since: int | None = None
+        self._trial: Trial | None = None
 
     def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> TrackResult:
         """Returns the pose of the next frame: (H, W) or (H, W, 3) RGB uint8, (H', W') float32 metres, nanoseconds.
@@ -86,7 +89,9 @@ class RgbdOdometry:
         recalled = self._recall(frame, T_predicted, measured=measured)
         # 6. Decide what the pose rests on, and remember it.
         if recalled is not None:
-            return self._relocalised(frame, fit if measured else None, *recalled)
+            return self._relocalised(frame, fit if measured else None, T_predicted, *recalled)
+        if measured and self._contradicted(frame, fit):
+            return self._taken_back(frame, fit)
         return self._followed(frame, fit) if measured else self._guessed(frame, fit)
 
     # -- the steps ---------------------------------------------------------------------------------------
@@ -156,6 +161,8 @@ class RgbdOdometry:
         """Takes up a pose that was measured against the newest keyframes."""
         assert self._motion is not None
         T, newest = fit.T_world_camera, self._map.newest
+        if self._motion.blind_s > self.config.patience_s:
+            self._try(frame.stamp, frame.stamp, self._motion.predict(frame.stamp, self.config.decay_s), T)
         status = Status.RELOCALISED if self._motion.blind_s > self.config.patience_s else Status.TRACKING
         self._motion = self._motion.measured(frame.stamp, T)
         self._noise = fit.noise
@@ -164,11 +171,16 @@ class RgbdOdometry:
         keyframe = self._new_keyframe(frame, fit, sunk)
         return self._placed(status, _support(frame, fit), fit, keyframe)
 
-    def _relocalised(self, frame: Frame, tracked: Fit | None, found: Fit, known: Keyframe) -> TrackResult:
+    def _relocalised(
+        self, frame: Frame, tracked: Fit | None, T_predicted: Matrix, found: Fit, known: Keyframe
+    ) -> TrackResult:
         """Takes up a pose that was found among older keyframes, and a new map that is `tracked` meanwhile with it."""
         assert self._motion is not None
-        T = found.T_world_camera
-        if known.segment != self._map.newest.segment:
+        T, apart = found.T_world_camera, known.segment != self._map.newest.segment
+        since = self._apart_since if apart and tracked is not None else None
+        before = T_predicted if tracked is None else tracked.T_world_camera
+        self._try(frame.stamp if since is None else since, frame.stamp, before, T)
+        if apart:
             if tracked is not None:
                 self._map.join(known, T @ invert(tracked.T_world_camera))
             else:
@@ -180,6 +192,41 @@ class RgbdOdometry:
         self._covariance = covariance + found.covariance
         keyframe = self._new_keyframe(frame, found, sunk)
         return self._placed(Status.RELOCALISED, f"the map found again by {found.inliers} features", found, keyframe)
+
+    def _try(self, since: int, stamp: int, T_before: Matrix, T_found: Matrix) -> None:
+        """Puts a place that is found on trial: what was placed since a stamp rests on it."""
+        assert self._motion is not None
+        spread = self._motion.spread(stamp, self.config.acceleration, self.config.angular_acceleration)
+        covariance = moved_covariance(self._covariance, self._motion.T_world_camera, T_before) + spread
+        self._trial = Trial.of(since, stamp, T_before, covariance, T_found)
+
+    def _contradicted(self, frame: Frame, fit: Fit) -> bool:
+        """Returns whether this view, as those just before it, contradicts the place that was found last."""
+        trial = self._trial
+        if trial is None or frame.flaws:
+            return False
+        if trial.over(frame.stamp):
+            self._trial = None
+            return False
+        segment = self._map.newest.segment
+        there = [k for k in self._map.keyframes if k.segment == segment and k.stamp < trial.since]
+        says = contradicted(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise)
+        if says is not None:
+            self._trial = trial.heard(says)
+        return self._trial is not None and self._trial.failed
+
+    def _taken_back(self, frame: Frame, fit: Fit) -> TrackResult:
+        """Takes back a place and all that rests on it: a new map, at the pose as it would be without it."""
+        trial = self._trial
+        assert trial is not None
+        segment = self._map.newest.segment
+        self._map.part(trial)
+        T, self._covariance = trial.taken_back(fit.T_world_camera)
+        self._motion = Motion(frame.stamp, T, np.zeros(6))
+        self._map.add(replace(self._keyframe(frame, None), segment=segment + 1))
+        self._apart_since, self._recalls, self._trial = frame.stamp, 0, None
+        reason = f"{trial.against} views contradict the place that was found: taken back"
+        return replace(self._result(Status.LOST, reason, fit, keyframe=True), taken_back=trial.since)
 
     def _guessed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Goes on by the motion so far, and begins a new map where the old one stays out of sight."""
@@ -274,14 +321,14 @@ class RgbdOdometry:
         """Returns all that the next result depends on, as immutable values of plain arrays; it pickles."""
         return State(
             self._motion, self._covariance, tuple(self._map.keyframes), self._shapes,
-            self._noise, self._watch, self._recalls, self._apart_since,
+            self._noise, self._watch, self._recalls, self._apart_since, self._trial,
         )  # fmt: skip
 
     def restore(self, state: State) -> None:
         """Goes on from a snapshot of an odometry with the same camera and configuration."""
         self._motion, self._covariance, self._shapes = state.motion, state.covariance, state.shapes
         self._noise, self._watch = state.noise, state.watch
-        self._recalls, self._apart_since = state.recalls, state.apart_since
+        self._recalls, self._apart_since, self._trial = state.recalls, state.apart_since, state.trial
         self._map.keyframes = list(state.keyframes)
 
     def _placed(self, status: Status, reason: str, fit: Fit, keyframe: bool) -> TrackResult:

@@ -10,6 +10,7 @@ from clip_source import messages
 from made_video import PERIOD, clip, decoded
 
 from dataflow.editing.part import Part, write_part
+from dataflow.editing.split import split
 from dataflow.graph import load_graph
 from dataflow.messages import CompressedVideo, Image, Level
 from dataflow.recording import Recording
@@ -17,6 +18,7 @@ from dataflow.recording.streams.copying import Origin
 from dataflow.supervision.run import replay, run
 from dataflow.testing import play
 from dataflow.verification.verify import verify
+from dataflow.video.decoder import is_key
 from operators.codec import VideoDecoder
 
 FORMATS = pytest.mark.parametrize("format_", ["h264", "h265"])
@@ -40,9 +42,9 @@ def recorded(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / "run.mcap"
 
 
-def images(path: Path) -> dict[int, bytes]:
+def images(path: Path, decoder: str = "decoder") -> dict[int, bytes]:
     with Recording(path) as recording:
-        return {m.message.stamp: m.message.digest() for m in recording.messages(["test/decoder/image"])}
+        return {m.message.stamp: m.message.digest() for m in recording.messages([f"test/{decoder}/image"])}
 
 
 @FORMATS
@@ -73,6 +75,18 @@ def test_lost_pictures_are_marked_until_the_next_key_frame() -> None:
     }
 
 
+def test_after_a_jump_of_the_clock_decoding_begins_with_a_key_frame() -> None:
+    decoder = VideoDecoder()
+    decoder.setup()
+    sent = messages("h264")
+    for message in sent[:12]:
+        assert "image" in decoder.process(message)
+    decoder.on_reset("video")  # the next number fits, and the picture does not
+    assert decoder.process(sent[4])["status"].messages == ("its parameter sets (SPS, PPS) have not come",)
+    assert "image" in decoder.process(sent[8])
+    decoder.close()
+
+
 def test_a_stream_with_b_frames_is_refused_by_its_stamp() -> None:
     decoder = VideoDecoder()
     decoder.setup()
@@ -94,8 +108,29 @@ def test_a_replay_from_the_middle_goes_on_with_the_same_images(recorded: Path, t
     assert images(tmp_path / "later.mcap") == {stamp: digest for stamp, digest in whole.items() if stamp >= WITHIN}
 
 
-def test_a_part_that_begins_within_a_group_verifies(recorded: Path, tmp_path: Path) -> None:
+def test_a_part_begins_with_a_key_frame_and_gives_the_same_images(recorded: Path, tmp_path: Path) -> None:
+    part, fresh = tmp_path / "part.mcap", tmp_path / "fresh.yaml"
     with Origin(recorded) as origin:
-        write_part(origin, Part(start=WITHIN), tmp_path / "part.mcap")
-    report = verify(tmp_path / "part.mcap")
+        done = write_part(origin, Part(start=WITHIN), part)
+    assert done.notes == ["it begins 0.160 s earlier, with a key frame of its video"]
+    report = verify(part)
     assert {v.verdict for v in report.operators} == {"identical"}
+    fresh.write_text(GRAPH.format(format="h264", lost=[]).replace("decoder:", "another:"))
+    replay(part, graph=load_graph(fresh), placement="one_process", record=tmp_path / "again.mcap")
+    expected = {stamp: digest for stamp, digest in images(recorded).items() if stamp >= WITHIN - 4 * PERIOD}
+    assert images(tmp_path / "again.mcap", "another") == expected
+
+
+def test_split_parts_begin_with_key_frames_and_are_the_whole(recorded: Path, tmp_path: Path) -> None:
+    with Origin(recorded) as origin:
+        parts = list(split(origin, tmp_path, every=10 * PERIOD))
+    found = []
+    for part in parts:
+        assert part.span is not None
+        with Recording(Path(part.path)) as recording:  # before its span stand packets that a repeated firing took
+            packets = [m.message for m in recording.messages(["test/camera/video"], part.span[0])]
+        assert is_key(packets[0].format, packets[0].data.tobytes())
+        found += [packet.stamp for packet in packets]
+    assert len(parts) == 3
+    with Recording(recorded) as recording:
+        assert found == [m.message.stamp for m in recording.messages(["test/camera/video"])]

@@ -176,10 +176,34 @@ def test_missing_and_unfit_models_are_named(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("no model")
     with pytest.raises(ValueError, match="cannot be loaded as an ONNX model"):
         MonoDepth(model=str(tmp_path / "text.onnx")).setup()
-    with pytest.raises(ValueError, match="of fixed size, has input"):
-        MonoDepth(model=str(network(tmp_path / "open.onnx", (1, 3, "h", "w")))).setup()
     with pytest.raises(ValueError, match=r"must have one input tensor\(float\)"):
         MonoDepth(model=str(network(tmp_path / "four.onnx", (1, 4, 8, 8)))).setup()
+
+
+def test_a_model_that_answers_in_metres_gives_depth_by_itself(model: Path) -> None:
+    image = photograph(scene(), grey=True)
+    played = estimated(model, image, None, answer="metres", max_range=60.0)
+    (depth,) = played["depth"]
+    expected = np.asarray(image.data, np.float32)
+    np.testing.assert_allclose(depth.data, np.where(expected <= 60, expected, 0), atol=1e-3)
+    assert (depth.data > 0).any()
+    assert (depth.data == 0).any()
+    assert not played["relative"]
+    assert status_of(played) == ("the model gives metres", 0)
+
+
+def test_an_open_input_takes_the_given_size_and_pixels_are_normalised(tmp_path: Path) -> None:
+    """The model passes the mean of its channels on, here of ImageNet's normalisation."""
+    file = network(tmp_path / "open.onnx", (1, 3, "h", "w"))
+    image = photograph(scene(), grey=True)
+    options = {"normalization": "imagenet", "input_size": (WIDTH, HEIGHT)}
+    (plain,) = estimated(file, image, None, input_size=(WIDTH, HEIGHT))["relative"]
+    (relative,) = estimated(file, image, None, **options)["relative"]
+    mean, scale = (np.array(v) for v in ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375)))
+    given = np.repeat(np.asarray(image.data, np.float64)[..., None], 3, axis=2)
+    gain = np.polyfit(given.mean(axis=2).ravel(), plain.data.ravel().astype(np.float64), 1)
+    expected = np.polyval(gain, ((given - mean) / scale).mean(axis=2))
+    np.testing.assert_allclose(relative.data, expected, atol=2e-3)
 
 
 @given(st.floats(0.01, 5), st.floats(-0.2, 0.5), st.integers(0, 1000), st.floats(0, 0.4))

@@ -5,14 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from operators.detection.decode import (
-    decode_end2end,
-    decode_fastestdet,
-    decode_ssd,
-    decode_torchvision,
-    decode_yolov5,
-    decode_yolov8,
-)
+from operators.detection.suppressed import decode_end2end, decode_ssd, decode_torchvision
+from operators.detection.yolo import decode_fastestdet, decode_yolov5, decode_yolov8
 
 
 def test_fastestdet_reads_offset_size_and_score_of_a_cell() -> None:
@@ -63,7 +57,7 @@ def test_an_end_to_end_output_is_read_as_it_is() -> None:
     ("outputs", "reason"),
     [
         ([np.zeros((1, 300, 6), np.float32)], "decoder end2end"),
-        ([np.zeros((1, 116, 8400), np.float32), np.zeros((1, 32, 160, 160), np.float32)], "a segmentation model"),
+        ([np.zeros((1, 30, 8400), np.float32), np.zeros((1, 32, 160, 160), np.float32)], "32 coefficients of masks"),
     ],
 )
 def test_outputs_of_other_exports_than_yolov8_decodes_are_refused_with_the_reason(

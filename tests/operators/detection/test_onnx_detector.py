@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dataflow.messages import Image
-from operators.detection import OnnxDetector
+from operators.detection import CustomDetector, OnnxDetector
 from operators.inference import ModelError
 
 onnx = pytest.importorskip("onnx")
@@ -104,6 +104,12 @@ def test_class_names_come_from_a_file(tmp_path: Path) -> None:
     assert set(made.files) == {model, str(tmp_path / "names.txt")}  # both content hashes are on record
 
 
+def test_class_names_may_be_given_as_text(tmp_path: Path) -> None:
+    model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
+    found = detector(model=model, decoder="yolov8", fit="stretch", classes="mug, fire extinguisher").process(red())
+    assert found.labels() == ("fire extinguisher",)
+
+
 @pytest.mark.parametrize("given", [("crate",), ("crate", "pallet", "forklift")])
 def test_as_many_class_names_are_needed_as_the_model_has_classes(tmp_path: Path, given: tuple[str, ...]) -> None:
     model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
@@ -152,6 +158,47 @@ def test_a_decoder_that_does_not_fit_the_model_is_named(tmp_path: Path) -> None:
     made = detector(model=save_model(tmp_path / "m.onnx", yolov8_rows((1, 1, 1, 1, 0.9))), decoder="fastestdet")
     with pytest.raises(ModelError, match=r"decoder='fastestdet' does not fit .*m\.onnx: .* got \(1, 5, 1\)"):
         made.process(red())
+
+
+def test_the_name_of_a_model_stands_for_its_file_and_is_what_the_record_holds() -> None:
+    named, made = detector(model="simulated"), CustomDetector()
+    made.setup()
+    rng = np.random.default_rng(0)
+    image = Image(stamp=1, frame="camera", data=rng.integers(0, 256, (120, 160, 3)).astype(np.uint8))
+    assert named.files.keys() == {"simulated"}
+    assert list(named.files.values()) == list(made.files.values())
+    assert named.process(image).digest() == made.process(image).digest()
+    assert OnnxDetector.trained_in_simulation({"model": "simulated"})
+    assert not OnnxDetector.trained_in_simulation({"model": "yolox_nano"})
+
+
+def test_a_named_model_that_is_not_here_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DATAFLOW_MODEL_CACHE", str(tmp_path))
+    where = rf"looked for {tmp_path}/yolox_nano\.onnx\)"
+    with pytest.raises(FileNotFoundError, match=rf"{where}.*dataflow models get yolox_nano"):
+        detector(model="yolox_nano")
+    (tmp_path / "yolox_nano.onnx").write_bytes(b"another")
+    with pytest.raises(ModelError, match="is not the file of yolox_nano: its sha256 is"):
+        detector(model="yolox_nano")
+
+
+def test_a_model_of_another_operator_and_a_file_of_no_row_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ModelError, match=r"OnnxDetector\.decoder must name its family"):
+        detector(model=save_model(tmp_path / "m.onnx", yolov8_rows((1, 1, 1, 1, 0.9))))
+    monkeypatch.setenv("DATAFLOW_MODEL_CACHE", str(tmp_path))
+    save_model(tmp_path / "depth_anything_v2_small.onnx", yolov8_rows((1, 1, 1, 1, 0.9)))
+    with pytest.raises(ModelError, match=r"is not the file of depth_anything_v2_small"):
+        detector(model="depth_anything_v2_small", decoder="yolov8")
+
+
+def test_class_names_are_those_of_the_models_metadata(tmp_path: Path) -> None:
+    file = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
+    model = onnx.load(file)
+    model.metadata_props.add(key="names", value="{0: 'crate', 1: 'pallet'}")
+    onnx.save(model, file)
+    assert detector(model=file, decoder="yolov8").process(red()).class_names == ("crate", "pallet")
 
 
 @pytest.mark.data

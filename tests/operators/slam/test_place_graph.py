@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 
 import numpy as np
@@ -33,7 +34,7 @@ class NoLooks:
     def add(self, key: int, view: str) -> None: ...
 
     def likeness(self, view: str) -> dict[int, float]:
-        return {}
+        return defaultdict(float)
 
 
 def at(x: float) -> Matrix:
@@ -48,3 +49,18 @@ def test_a_neighbour_seen_far_from_where_odometry_has_it_is_no_measurement(perio
     for k in range(6):
         graph.grow(k, at(0.25 * k), 1e-6 * np.eye(6), 0, False, Eyes(period), lambda: "view")
     assert any(edge.loop for edge in graph.graph.edges) == joined
+
+
+def test_nodes_at_a_place_that_was_taken_back_leave_the_map_as_it_was() -> None:
+    graph = PlaceGraph[str](GraphSettings(), NoLooks, lambda node, T, covariance: 1e-6 * np.eye(6))
+    for k in range(6):
+        graph.grow(k, at(0.25 * k), 1e-6 * np.eye(6), 0, False, Eyes(0.0), lambda: "view")
+    before = {k: node.T.copy() for k, node in graph.nodes.items()}
+    for k in range(6, 9):
+        graph.grow(k, at(5.0 + 0.25 * k), 1e-6 * np.eye(6), 0, k == 6, Eyes(0.0), lambda: "view")
+    graph.withdraw(6)
+    assert sorted(graph.nodes) == sorted(before)
+    assert all(edge.first in before and edge.last in before for edge in graph.graph.edges)
+    assert all(np.allclose(graph.nodes[k].T, T, atol=1e-6) for k, T in before.items())
+    graph.grow(9, at(1.6), 1e-6 * np.eye(6), 1, False, Eyes(0.0), lambda: "view")
+    assert not graph.located

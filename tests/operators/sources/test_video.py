@@ -7,9 +7,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
+from made_video import ENCODERS, PERIOD, mp4
 
 from dataflow.messages import CameraInfo, Image
 from dataflow.operator import SourceError
@@ -50,6 +52,23 @@ def test_every_frame_of_a_file_is_an_image_at_its_time(clip: Path) -> None:
         red, _, blue = image.data.mean((0, 1))
         assert abs(blue - 40 * k) < 4
         assert abs(red - (255 - 40 * k)) < 4
+
+
+@pytest.mark.parametrize("format_", ["h264", "h265"])
+def test_files_with_b_frames_give_the_frames_in_their_order(format_: str, tmp_path: Path) -> None:
+    file = mp4(tmp_path / "episode_000000.mp4", ENCODERS[format_])
+    with av.open(file) as container:
+        expected = [frame.to_ndarray(format="bgr24")[..., ::-1] for frame in container.decode(video=0)]
+
+    found = images(VideoFile(input=str(file)))
+
+    assert [m.stamp for m in found] == [k * PERIOD for k in range(20)]
+    assert all(np.array_equal(m.data, frame) for m, frame in zip(found, expected, strict=True))
+
+
+def test_a_file_of_av1_is_refused_by_its_codec(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"its codec is AV01\. .* no AV1: encode it anew"):
+        VideoFile(input=str(mp4(tmp_path / "episode_000000.mp4", "libsvtav1"))).setup()
 
 
 def test_part_of_a_file_at_another_rate(clip: Path) -> None:

@@ -175,7 +175,7 @@ class Simulation:
             (f"{process}.operator_process", "TapServer"): network.Nobody,
             (f"{process}.operator_process", "OutsidePublisher"): network.Nobody,
             (f"{process}.operator_process", "leave_network"): _nothing,
-            (f"{process}.runners", "BlackBox"): memory.black_box(world),
+            (f"{process}.build", "BlackBox"): memory.black_box(world),
             ("dataflow.transport.links", "RingWriter"): memory.ring_writer(world),
             ("dataflow.transport.ring", "os"): system,
             ("dataflow.transport.fanout", "os"): SimpleNamespace(sched_yield=_nothing),  # greenlets need no core

@@ -220,6 +220,37 @@ def test_a_lidar_that_was_covered_is_found_again_near_by() -> None:
     assert np.linalg.norm(errors(played, moved)[-4:, :3], axis=1).max() < 0.03
 
 
+def carried_blind(world: list[Any]) -> list[str]:
+    """The states of a LiDAR after it was covered for 0.8 s, and went on by 1.5 m meanwhile."""
+
+    def moved(t: float) -> Array:
+        return along(t if t < 0.65 else t + 0.7)
+
+    clouds = [scan(world, moved, k) for k in range(18)]
+    for k in range(7, 15):
+        clouds[k] = clouds[k].replace(points=np.zeros((0, 3), np.float32))
+    return texts(play(LidarOdometry(give_up=2.0), {"cloud": clouds}))[15:]
+
+
+def test_a_lidar_is_not_found_again_in_a_bare_corridor() -> None:
+    assert all(text.startswith("lost: nothing constrains motion along (1.00, 0.00") for text in carried_blind(CORRIDOR))
+
+
+def test_a_lidar_is_not_found_again_in_a_room_that_looks_alike_in_four_headings() -> None:
+    square = [
+        (2, -0.6, (-4, 4), (-4, 4)), (2, 2.0, (-4, 4), (-4, 4)), (0, -4, (-4, 4), (-1, 2)), (0, 4, (-4, 4), (-1, 2)),
+        (1, -4, (-4, 4), (-1, 2)), (1, 4, (-4, 4), (-1, 2)),
+    ]  # fmt: skip
+    states = carried_blind(square)
+    assert all(text.startswith("lost: ambiguous") for text in states), states
+
+
+def test_a_lidar_is_found_again_in_a_corridor_with_one_thing_in_it() -> None:
+    cupboard = [(0, 3.0, (-1, -0.4), (-1, 1.2)), (0, 3.6, (-1, -0.4), (-1, 1.2)), (1, -0.4, (3.0, 3.6), (-1, 1.2))]
+    states = carried_blind(CORRIDOR + cupboard)
+    assert states[0].startswith("relocalised"), states
+
+
 def test_another_place_is_not_taken_for_the_mapped_one_and_a_new_map_begins() -> None:
     elsewhere = [(axis, 3 * place, *spans) if axis == 2 else (axis, place, *spans) for axis, place, *spans in CORRIDOR]
     clouds = [scan(ROOM, circling, k) for k in range(6)] + [scan(elsewhere, along, k) for k in range(6, 18)]

@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +29,8 @@ from operators.odometry.rgbd.fitting import Fit, Fitter
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import Surface
-from operators.odometry.rgbd.tracker import RgbdOdometry
+from operators.odometry.rgbd.tracker import RgbdOdometry, State
+from operators.odometry.rgbd.trial import Trial
 from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
 
 SIZE = (320, 240)
@@ -351,6 +353,47 @@ def test_old_map_is_found_again_after_a_gap() -> None:
     assert statuses[-1] is Status.LOST
     assert results[50].status is Status.RELOCALISED
     assert errors(results[50:], poses[45:])[0] < 0.03
+
+
+def at_a_wrong_place(state: State, since: int, T_wrong: NDArray[np.float64]) -> State:
+    """The state of an odometry that was found again at stamp `since`, and placed wrong by a motion in the world."""
+    assert state.motion is not None
+    T = state.motion.T_world_camera
+    keyframes = [
+        replace(k, T_world_camera=T_wrong @ k.T_world_camera) if k.stamp >= since else k for k in state.keyframes
+    ]
+    wrong = replace(state.motion, T_world_camera=T_wrong @ T)
+    trial = Trial.of(since, state.motion.stamp, T, 1e-2 * np.eye(6), T_wrong @ T)
+    return replace(state, motion=wrong, keyframes=tuple(keyframes), trial=trial)
+
+
+def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
+    frames, poses = sequence(60, 1.5)
+    stamps = [int(i * 1e9 / 30) for i in range(len(frames))]
+    odometry = RgbdOdometry(camera())
+    for i in range(25):
+        odometry.track(*frames[i], stamps[i])
+    since = odometry.snapshot().keyframes[-1].stamp
+    odometry.restore(at_a_wrong_place(odometry.snapshot(), since, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0]))))
+    results = [odometry.track(*frames[i], stamps[i]) for i in range(25, 60)]
+    assert np.linalg.norm((results[0].T_world_camera - poses[25])[:3, 3]) > 0.7
+    (taken_back,) = (r for r in results if r.taken_back is not None)
+    assert results.index(taken_back) < 10
+    assert (taken_back.status, taken_back.taken_back) == (Status.LOST, since)
+    assert Status.RELOCALISED in [r.status for r in results]
+    assert errors(results[-5:], poses[-5:])[0] < 0.03
+
+
+def test_a_right_place_is_not_taken_back() -> None:
+    frames, poses = sequence(60, 1.5)
+    stamps = [int(i * 1e9 / 30) for i in range(len(frames))]
+    odometry = RgbdOdometry(camera())
+    for i in range(25):
+        odometry.track(*frames[i], stamps[i])
+    odometry.restore(at_a_wrong_place(odometry.snapshot(), odometry.snapshot().keyframes[-1].stamp, np.eye(4)))
+    results = [odometry.track(*frames[i], stamps[i]) for i in range(25, 60)]
+    assert {(r.status, r.taken_back) for r in results} == {(Status.TRACKING, None)}
+    assert errors(results, poses[25:])[0] < 0.03
 
 
 def test_new_map_apart_is_joined_when_the_old_one_is_seen_again() -> None:

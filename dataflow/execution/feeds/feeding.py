@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 from dataflow.execution.feeds.log import LogFeed
+from dataflow.execution.feeds.pace import Pace
 from dataflow.execution.feeds.playback import Action, Playback
 from dataflow.execution.feeds.window import Feed, Window
-from dataflow.process.streams.pace import Pace
-from dataflow.sync import NEVER
+from dataflow.sync import FOREVER, NEVER
 
 PROMISE_EVERY = 8
 """Steps after which a frontier is sent on streams that had no message."""
 
 
 class Feeding:
-    """Of several feeds, the oldest step first, as far as the window and the pace allow."""
+    """Of several feeds, the oldest step first, as far as the window and the pace allow; without these, at once."""
 
-    def __init__(self, window: Window, pace: Pace, *, paused: bool = False, speed: float | None = None) -> None:
+    def __init__(
+        self,
+        window: Window | None = None,
+        pace: Pace | None = None,
+        *,
+        paused: bool = False,
+        speed: float | None = None,
+    ) -> None:
+        if window is None:
+            window = Window(1, 1)
+            window.cover(FOREVER)
         self.feeds: list[Feed] = []
         self.logs: list[LogFeed] = []
         """The recordings among the feeds."""
         self.playback = Playback(paused=paused, speed=speed)
-        self._window, self._pace = window, pace
+        self._window, self._pace = window, pace or Pace(None)
         self._since_promise = 0
 
     @property

