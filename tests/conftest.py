@@ -35,6 +35,8 @@ ROOMS = {
     ),
 }  # fmt: skip
 """Folders of tests by marker; a test anywhere else is a `unit` test."""
+SLOW = pytest.StashKey[set[str]]()
+"""Libraries that take seconds to import and were imported when tests were collected."""
 sys.path += [str(REPOSITORY / "tests" / "support"), str(REPOSITORY / "tools")]
 
 
@@ -63,7 +65,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Iterator[None]:
+def pytest_collection(session: pytest.Session) -> Iterator[None]:
     """Spares the garbage collector what collection makes: it all stays until the end."""
     gc.disable()
     try:
@@ -71,6 +73,7 @@ def pytest_collection() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
+        session.config.stash[SLOW] = {"open3d", "pandas", "rerun", "torch"} & sys.modules.keys()
 
 
 def marker_of(path: Path) -> str:
@@ -133,6 +136,12 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[P
 
 
 @pytest.fixture(scope="session")
+def imported_by_collection(pytestconfig: pytest.Config) -> set[str]:
+    """Libraries that take seconds to import and that some module of tests imports when it is collected."""
+    return pytestconfig.stash[SLOW]
+
+
+@pytest.fixture(scope="session")
 def repository() -> Path:
     """The root of the checkout."""
     return REPOSITORY
@@ -145,3 +154,12 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real data not found: no folder {folder} (set PERCEPTION_DATA to where it is)")
     return folder
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets verification call its workers' functions in this process: for tests of its verdicts."""
+    from dataflow.api.here import call_here
+    from dataflow.verification import verify
+
+    monkeypatch.setattr(verify, "call_workers", call_here)

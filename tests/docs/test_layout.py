@@ -191,3 +191,7 @@ def test_functions_are_short(repository: Path) -> None:
     assert not longer, f"longer than {MOST_LINES} lines, or than the list of long functions allows: {longer}"
     shorter = {function: long.get(function) for function in LONG if long.get(function) != LONG[function]}
     assert not shorter, f"take these off the list of long functions, or write down that they are shorter: {shorter}"
+
+
+def test_collecting_tests_imports_no_library_that_takes_seconds(imported_by_collection: set[str]) -> None:
+    assert not imported_by_collection, "import it under `if TYPE_CHECKING:` (tests/conftest.py) or in the test"

@@ -22,6 +22,8 @@ from dataflow.verification.ledger import read_ledger
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 HERE = Path(__file__).resolve().parent
 
 

@@ -22,6 +22,8 @@ from dataflow.supervision.run import replay, run
 from dataflow.sync import Entry
 from dataflow.verification.verify import verify
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 HERE = Path(__file__).resolve().parent
 
 

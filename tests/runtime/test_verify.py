@@ -19,6 +19,13 @@ from dataflow.verification.verify import verify
 HERE = Path(__file__).resolve().parent
 
 
+@pytest.fixture(autouse=True)
+def _verified_here(request: pytest.FixtureRequest) -> None:
+    """Leaves worker processes to the test of their number."""
+    if "jobs" not in request.fixturenames:
+        request.getfixturevalue("in_process")
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("verify") / "run.mcap"

@@ -15,6 +15,8 @@ from dataflow.verification import facts as verification_facts
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 HERE = Path(__file__).resolve().parent
 SETTINGS = ["count=30"]
 

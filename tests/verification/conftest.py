@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from orphans import end_orphans
@@ -27,31 +25,3 @@ def _no_orphans() -> Iterator[None]:
 def kept() -> Path:
     """A small recording of a run, whole and identical: see `recordings_of`."""
     return KEPT / "run.mcap"
-
-
-@pytest.fixture
-def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets verification call its workers' functions in this process: for tests of what they find."""
-    from dataflow.verification import verify
-    from dataflow.verification.workers import mail as letters
-    from dataflow.verification.workers import processes
-    from dataflow.verification.workers.board import Board
-
-    def call(calls: Sequence[processes.Call], **options: Any) -> list[Any]:
-        return [_called(one, letters) for one in calls]
-
-    def _called(one: processes.Call, letters: Any) -> Any:
-        module, _, name = one.function.partition(":")
-        letter, shared = os.memfd_create("call"), os.memfd_create("board")
-        board = Board(shared, one.operators)
-        try:
-            letters.write_letter(letter, one.request)
-            answer = getattr(sys.modules[module], name)(letters.read_letter(letter), board)
-            letters.write_letter(letter, {"value": answer})
-            return letters.read_letter(letter)["value"]
-        finally:
-            board.close()
-            os.close(letter)
-            os.close(shared)
-
-    monkeypatch.setattr(verify, "call_workers", call)

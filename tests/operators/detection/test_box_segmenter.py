@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -11,20 +12,24 @@ from dataflow.messages import Detections2D, Image
 from operators.detection import BoxSegmenter
 from operators.inference import ModelError
 
-torch = pytest.importorskip("torch")
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch")
 
 WIDTH, HEIGHT = 80, 60
 
 
-class Prompted(torch.nn.Module):
-    """Answers with three masks a prompt: where the image is bright, nowhere, everywhere. The first fits best where the
-    corners' labels are those of a box."""
+def prompted() -> torch.nn.Module:
+    class Prompted(torch.nn.Module):
+        """Answers with three masks a prompt: where the image is bright, nowhere, everywhere. The first fits best where
+        the corners' labels are those of a box."""
 
-    def forward(self, image, points, labels):
-        bright = (image.mean(1) - 0.5)[:, None, None] + 0 * points.sum() + torch.zeros(1, points.shape[1], 1, 1, 1)
-        masks = torch.cat([bright, bright * 0 - 1, bright * 0 + 1], dim=2)
-        box = (labels[..., :1] - 1) * (labels[..., 1:] - 2)  # 1 for the labels 2 and 3
-        return masks, torch.cat([box, box * 0, box * 0 + 0.5], dim=2)
+        def forward(self, image, points, labels):
+            bright = (image.mean(1) - 0.5)[:, None, None] + 0 * points.sum() + torch.zeros(1, points.shape[1], 1, 1, 1)
+            masks = torch.cat([bright, bright * 0 - 1, bright * 0 + 1], dim=2)
+            box = (labels[..., :1] - 1) * (labels[..., 1:] - 2)  # 1 for the labels 2 and 3
+            return masks, torch.cat([box, box * 0, box * 0 + 0.5], dim=2)
+
+    return Prompted()
 
 
 def exported(file: Path, *, many: bool) -> str:
@@ -32,7 +37,7 @@ def exported(file: Path, *, many: bool) -> str:
     given = (torch.rand(1, 3, 48, 64), torch.rand(1, queries, 2, 2), torch.rand(1, queries, 2))
     names = ["batched_images", "batched_point_coords", "batched_point_labels"]
     torch.onnx.export(
-        Prompted(),
+        prompted(),
         given,
         str(file),
         input_names=names,

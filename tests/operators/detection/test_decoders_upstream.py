@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -13,9 +13,11 @@ import pytest
 from dataflow.messages import Detections2D, Image
 from operators.detection import OnnxDetector
 
+if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
+    torch = pytest.importorskip("torch")
+    torchvision = pytest.importorskip("torchvision")
+
 onnx = pytest.importorskip("onnx")
-torch = pytest.importorskip("torch")
-torchvision = pytest.importorskip("torchvision")
 
 SIDE = 64
 WIDTH, HEIGHT = 150, 90  # of the image
