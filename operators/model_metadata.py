@@ -1,4 +1,4 @@
-"""What ONNX files say of themselves in their metadata: class names, colours, normalisation."""
+"""Class names, colours and normalisation from the metadata of ONNX files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What decoders of detector networks share: candidates in the pixels of the network's input, and boxes from rows."""
+"""Candidates in the pixels of a network's input, boxes from rows: shared by the decoders of detector networks."""
 
 from __future__ import annotations
 

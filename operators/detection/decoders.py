@@ -95,4 +95,4 @@ LAYOUTS: dict[DecoderName, Layout] = {
     ),
     "tensorflow": Layout(decode_tensorflow, bgr=False, fit="stretch", classes=None, scale=_ONE, nms_iou=1.0),
 }
-"""How each family is read: its input, its outputs, and whether its boxes are suppressed."""
+"""Input, outputs and suppression of each family."""

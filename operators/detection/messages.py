@@ -1,4 +1,4 @@
-"""What a detector found in an image, as a message."""
+"""Detections2D of found boxes, scores, classes and masks."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class _Row(BaseModel):
 
 
 class Source(_Row):
-    """Where a model's file comes from: one of these, the others None.
+    """The source of a model's file: one of these, the others None.
 
     - `url`: of http, https or file. `package` and `member`: a package of `index` that carries the file, as
       `name==version` of pypi or `name@version` of npm, and the file's path in it.
@@ -120,7 +120,7 @@ class Model(_Row):
 
     @property
     def file(self) -> Path:
-        """Where its file is looked for."""
+        """Place of its file: in the project, or in the cache."""
         return _WEIGHTS / self.source.shipped if self.source.shipped is not None else cache_folder() / self.file_name
 
     def accepts(self, sha256: str) -> bool:
