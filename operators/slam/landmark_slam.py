@@ -10,11 +10,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import LandmarkSightings, Odometry, Transforms
+from dataflow.messages import Diagnostics, LandmarkSightings, Odometry, Transforms
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix, transform_points, yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
-from operators.slam.landmark_filter import Association, LandmarkFilter
+from operators.slam.landmark_association import Association
+from operators.slam.landmark_filter import LandmarkFilter
+from operators.status import counted_status
 
 Array = NDArray[np.float64]
 
@@ -24,12 +26,18 @@ class LandmarkSlam(Operator, merge=True):
 
     The map frame is the first pose. Sightings, polar or Cartesian, are taken at their own stamp, between the odometry
     messages around it. Motion noise is that of each message's twist covariance, taken as independent from message to
-    message; where there is none that can be used, that of a differential drive by the parameters. Landmarks without
-    identity are associated by Mahalanobis distance, each with one sighting of a message; one that is too far from a
-    known landmark to be it and too near to be another is ignored and counted, and so is what is not finite. Where
-    odometry jumps (its origin began anew), the robot may be anywhere that it can have reached.
+    message; where there is none that can be used, that of a differential drive by the parameters. Where innovations
+    show more noise, it is taken for as large as they show. Where odometry jumps (its origin began anew), the robot may
+    be anywhere that it can have reached.
 
-    Method: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015.
+    Landmarks without identity are matched at once where no other can be meant and all fit together (joint
+    compatibility). The others begin landmarks, which are united with earlier ones when a constellation of them leaves
+    no doubt (delayed association). A sighting too far from a known landmark to be it and too near to be another is
+    ignored and counted, and so is what is not finite. While landmarks are not seen at their places, the robot is lost:
+    its covariance is that of a robot astray until landmarks from before are found again.
+
+    Methods: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015; Neira and Tardos, "Data
+    association in stochastic mapping using the joint compatibility test", 2001.
     """
 
     odometry: In[Odometry] = In(doc="planar motion: increments between messages count, the pose itself does not")
@@ -40,6 +48,9 @@ class LandmarkSlam(Operator, merge=True):
     pose: Out[Odometry] = Out(doc="the robot in the map frame, with covariance, at every odometry message")
     correction: Out[Transforms] = Out(doc="the odometry frame in the map frame (REP 105), whenever sightings moved it")
     landmarks: Out[LandmarkSightings] = Out(doc="the map: every landmark in the map frame, with covariance")
+    status: Out[Diagnostics] = Out(
+        doc="mapped, inconsistent or lost, with innovations and counts; every second and when it changes"
+    )
 
     map_frame: str = Param("map", min_length=1, doc="name of the frame that the first pose defines")
     association: Literal["known", "unknown"] = Param(
@@ -65,6 +76,7 @@ class LandmarkSlam(Operator, merge=True):
         self._last: Odometry | None = None
         self._pending: list[tuple[int, NDArray[np.int64], Array, Array]] = []
         self._ignored: Counter[str] = Counter()
+        self._reported, self._word = -1, ""
 
     def process(
         self, odometry: Odometry | None, sightings: LandmarkSightings | None, extrinsics: Transforms | None = None
@@ -98,6 +110,11 @@ class LandmarkSlam(Operator, merge=True):
                 positions=self._filter.landmarks,
                 covariances=self._filter.landmark_covariances(),
             )
+        word, level, text = self._filter.state
+        if self._reported < 0 or odometry.stamp - self._reported >= 10**9 or word != self._word:
+            self._reported, self._word = odometry.stamp, word
+            figures = {name: f"{n:.3g}" if isinstance(n, float) else n for name, n in self.summary().items()}
+            result["status"] = counted_status("landmarks", odometry.stamp, text, level, figures)
         return result
 
     def on_reset(self, input: str) -> None:
@@ -113,6 +130,7 @@ class LandmarkSlam(Operator, merge=True):
             else [last.stamp, last.position, last.orientation, last.frame, last.child_frame],
             "pending": [list(item) for item in self._pending],
             "ignored": dict(self._ignored),
+            "reported": [self._reported, self._word],
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -125,6 +143,7 @@ class LandmarkSlam(Operator, merge=True):
             )
         self._pending = [(int(stamp), ids, p, C) for stamp, ids, p, C in state["pending"]]
         self._ignored = Counter(state["ignored"])
+        self._reported, self._word = int(state["reported"][0]), str(state["reported"][1])
 
     def summary(self) -> Mapping[str, float | int]:
         counts = self._filter.counts
@@ -134,6 +153,10 @@ class LandmarkSlam(Operator, merge=True):
             "sightings matched": counts.matched,
             "sightings of new landmarks": counts.added,
             "ignored, ambiguous": counts.ambiguous,
+            "landmarks found to be one": counts.merged,
+            "landmarks dropped": counts.dropped,
+            "odometry's noise over what was told": math.sqrt(self._filter.consistency.odometry_variance),
+            "innovations squared over their expectation": self._filter.consistency.ratio,
         } | ignored
 
     def _moves(self, odometry: Odometry) -> bool:
