@@ -21,7 +21,7 @@ from dataflow.video.bits import VideoError
 _TURN, _TURNS = 0.5, 120
 """Seconds, and how often they pass, in which the decoder takes a packet: a machine that pauses loses one turn."""
 _OPENING = 40
-"""Repetitions of a key frame at most, after which OpenCV knows the stream; it takes 8 for H.264, 1 for H.265."""
+"""Repetitions of a key frame at most, before OpenCV gives its frames; it takes 8 for H.264, 1 for H.265."""
 _CODECS = {"h264": b"V_MPEG4/ISO/AVC", "h265": b"V_MPEGH/ISO/HEVC"}
 _UNKNOWN_SIZE = b"\x01" + 7 * b"\xff"
 _FRAME = 33_333_333

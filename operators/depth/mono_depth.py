@@ -87,9 +87,9 @@ class MonoDepth(Operator):
         if self._metric:
             self.state.counts.update({"images": 1, "images with a scale": 1})
             near = np.where(np.isfinite(nearness) & (nearness > 0) & (nearness <= self.max_range), nearness, 0)
-            depth = DepthImage(stamp=image.stamp, frame=image.frame, data=near.astype(np.float32))
             status = counted_status("mono_depth", image.stamp, "the model gives metres", Level.OK, counts)
-            return {"depth": depth, "status": status}
+            metres = DepthImage(stamp=image.stamp, frame=image.frame, data=near.astype(np.float32))
+            return {"depth": metres, "status": status}
         messages: dict[str, Any] = {"relative": RelativeDepth(stamp=image.stamp, frame=image.frame, data=nearness)}
         scaling, text, level = None, "no metric depth is given: relative only", Level.OK
         if sparse is not None:

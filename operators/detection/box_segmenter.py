@@ -89,7 +89,8 @@ class BoxSegmenter(Operator):
                 f"{self.model} gave {masks.shape} and {fits.shape} for {len(prompts)} boxes; masks (1, Q, M, h, w) and "
                 f"fits (1, Q, M) are needed"
             )
-        return masks[0][np.arange(len(prompts)), fits[0].argmax(axis=1)]
+        best: NDArray[np.float32] = masks[0][np.arange(len(prompts)), fits[0].argmax(axis=1)]
+        return best
 
 
 def _inside(box: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -58,6 +58,13 @@ def test_a_file_of_ones_own_adds_rows_and_hides_those_of_the_same_name(named: Pa
     assert "yolox_tiny" in registry
 
 
+def test_the_row_in_the_documentation_is_one(repository: Path, tmp_path: Path) -> None:
+    page = (repository / "docs" / "models.md").read_text(encoding="utf-8")
+    file = tmp_path / "documented.yaml"
+    file.write_text(page.partition("```yaml\nmodels:")[2].partition("```")[0].join(("models:", "")))
+    assert Registry([file])["crates"].classes == ["crate", "pallet"]
+
+
 def test_a_name_that_is_not_there_is_answered_with_the_nearest() -> None:
     with pytest.raises(ModelError, match=r"there is no model 'yolox_nan'; did you mean 'yolox_nano'\?"):
         Registry.load()["yolox_nan"]
