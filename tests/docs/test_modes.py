@@ -1,4 +1,4 @@
-"""What kind of run this is decides what is made; whatever is made then does not ask."""
+"""The kind of a run decides which parts are made; parts do not ask for it."""
 
 from __future__ import annotations
 
