@@ -73,7 +73,7 @@ class RecordedRunner(Runner):
         self.aligner = RecordedAligner(self._align_spec, self._repetition.uses)
         self._ahead = iter(self._repetition)
         self.record = self._repetition.setup
-        """What is repeated now, or was last."""
+        """The record that is repeated now, or was last."""
         self._next = next(self._ahead, None)
         self._inputs: FiringInputs | None = None
         """Of the next call, once it is its turn."""

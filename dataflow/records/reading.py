@@ -30,7 +30,7 @@ class Lookup(Protocol):
     """The recorded digests of the messages of a stream."""
 
     def get(self, place: Place) -> bytes | None:
-        """The digest of a message by its place; None where no record tells of it."""
+        """The digest of a message by its place; None where no record accounts for it."""
 
 
 Digests = Mapping[str, Lookup]
@@ -175,7 +175,7 @@ class RecordedDigests:
         """All of them, once one was asked for that lies behind."""
 
     def get(self, place: Place) -> bytes | None:
-        """The digest of a message by its place; None where no record tells of it."""
+        """The digest of a message by its place; None where no record accounts for it."""
         if self._all is None and self._asked is not None and place < self._asked:
             self._all = dict(self._read())
         if self._all is not None:

@@ -81,7 +81,7 @@ class RecordedAligner:
         return self._uses.left(stream, entry.incarnation, entry.seq)
 
     def take(self, record: FiringInputs) -> Firing | None:
-        """Returns the firing that `record` tells of, the next one; None while a message of it is missing."""
+        """Returns the recorded firing `record`, the next one; None while a message of it is missing."""
         if self._missing is not None and self._missing not in self._held:
             return None
         self._missing = None
