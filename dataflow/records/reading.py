@@ -167,7 +167,7 @@ class RecordedDigests:
     """The digests of the messages of one stream, read along with the messages: asked for in their order."""
 
     def __init__(self, log: FiringLog, maker: Maker, stream: str) -> None:
-        self._read = lambda: log.emissions(maker, stream)
+        self._read = partial(log.emissions, maker, stream)
         self._ahead: Iterator[tuple[Place, bytes]] | None = None
         self._next: tuple[Place, bytes] | None = None
         self._asked: Place | None = None

@@ -10,8 +10,8 @@ from dataflow.messages.digest import StreamDigest
 from dataflow.recording import RecordingError
 from dataflow.records.cuts import held_by
 from dataflow.records.firing import CALLS, WITHHELD, Emission, FiringRecord
-from dataflow.records.order import Outliner
-from dataflow.records.reading import FiringLog, Place, Repeatable
+from dataflow.records.order import Outliner, Place
+from dataflow.records.reading import FiringLog, Repeatable
 from dataflow.sync import InputRef, MessageRef, messages_of
 
 _BITS = 10
