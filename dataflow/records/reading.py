@@ -30,7 +30,7 @@ class Lookup(Protocol):
     """The recorded digests of the messages of a stream."""
 
     def get(self, place: Place) -> bytes | None:
-        """The digest of a message by its place; None where no record tells of it."""
+        """The digest of a message by its place; None where no record accounts for it."""
 
 
 Digests = Mapping[str, Lookup]
@@ -167,7 +167,7 @@ class RecordedDigests:
     """The digests of the messages of one stream, read along with the messages: asked for in their order."""
 
     def __init__(self, log: FiringLog, maker: Maker, stream: str) -> None:
-        self._read = lambda: log.emissions(maker, stream)
+        self._read = partial(log.emissions, maker, stream)
         self._ahead: Iterator[tuple[Place, bytes]] | None = None
         self._next: tuple[Place, bytes] | None = None
         self._asked: Place | None = None
@@ -175,7 +175,7 @@ class RecordedDigests:
         """All of them, once one was asked for that lies behind."""
 
     def get(self, place: Place) -> bytes | None:
-        """The digest of a message by its place; None where no record tells of it."""
+        """The digest of a message by its place; None where no record accounts for it."""
         if self._all is None and self._asked is not None and place < self._asked:
             self._all = dict(self._read())
         if self._all is not None:

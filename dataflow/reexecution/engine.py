@@ -85,7 +85,7 @@ def plan_feeding(
 class Recomputation:
     """Recorded operators, driven by their records on one thread.
 
-    Re-execution begins at the stamp `begin` (see `records.reading.beginning`) and ends before the firings from `end`
+    Re-execution begins at the stamp `begin` (see `dataflow.records.repetition`) and ends before the firings from `end`
     on; `slices` are operators of which only the calls between two stamps are repeated (see `verification.slices`).
     `guard` watches over the memory of what they are given.
     `made` is given every message that the operators make, `read` every message that is read for them; `ended` the

@@ -1,4 +1,4 @@
-"""What the firing records of a recording add up to, found in one pass over them before anything is repeated."""
+"""Adds up the firing records of a recording, in one pass over them before anything is repeated."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dataflow.messages.digest import StreamDigest
 from dataflow.recording import RecordingError
 from dataflow.records.cuts import held_by
 from dataflow.records.firing import CALLS, WITHHELD, Emission, FiringRecord
-from dataflow.records.order import Outliner
-from dataflow.records.reading import FiringLog, Place, Repeatable
+from dataflow.records.order import Outliner, Place
+from dataflow.records.reading import FiringLog, Repeatable
 from dataflow.sync import InputRef, MessageRef, messages_of
 
 _BITS = 10
@@ -75,7 +75,7 @@ class Book:
     - `records`, `calls`, `duration` (ns): how many there are, how many are calls, and how long these took, whether or
       not they were handed over twice. `lost`: calls that follow missing records.
     - `only_calls`: nothing happened to the node but `setup()` and calls, and none is missing.
-    - `ports`: outputs it was recorded with; None where no record tells. `replayed`: a replay made the records.
+    - `ports`: outputs it was recorded with; None where no record has any. `replayed`: a replay made the records.
     - `sent`, `digests`: messages sent and their digest, by stream; `made`: their places; `since`: the first one behind
       records that were not read. `outputs`: messages made, whether or not they were sent.
     - `finished`: the last call is that of `finish()`.

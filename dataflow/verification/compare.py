@@ -152,7 +152,7 @@ class Comparer:
         return {name: found for name, found in self.found.items() if results[name].first is not None}
 
     def _expected(self, operator: str, stream: str) -> tuple[FiringRecord, Emission]:
-        """The record that is being repeated, and what it tells of a stream."""
+        """The record that is being repeated, and its output on a stream."""
         record = self._repeated(operator)
         port = list(self._graph.nodes[operator].outputs.values()).index(stream)
         emission = None if record is None else record.outputs[port]

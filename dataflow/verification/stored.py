@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from itertools import chain
 from typing import Any
 
-from dataflow.records.reading import Place
+from dataflow.records.order import Place
 
 
 @dataclass(slots=True)

@@ -188,9 +188,7 @@ def _prepare(
         require_records(recording, books.operators, operators)
         require_ports(recording, played, books, operators)
         plan_feeding(recording, played, operators, incomplete=incomplete)
-        feeding = {
-            played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
-        } - chosen
+        feeding = {played.streams[s].node for name in chosen for s in played.nodes[name].taken} - chosen
         sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
         stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, books, n)]
         checks, unchecked = stored_checks(recording, played, books, [*operators, *stand_ins])

@@ -23,7 +23,7 @@ LONG = {
     "dataflow.cli.commands.verification:verify": 160,
     "dataflow.process.operator_process:OperatorProcess.__init__": 80,
     "dataflow.supervision.plan:process_plans": 69,
-    "dataflow.verification.verify:verify": 80,
+    "dataflow.verification.verify:verify": 78,
     "operators.scene.commands:show": 69,
     "operators.scene.cuboid:fit_cuboid": 81,
     "operators.training.learning:learn_object": 71,

@@ -1,4 +1,4 @@
-"""What is repeated of an operator, read record by record, is what a list of all its records would say."""
+"""Reading record by record repeats what a list of all records of an operator would."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def recorded(draw: st.DrawFn) -> list[FiringRecord]:
 def listed(
     records: Sequence[FiringRecord], begin: int | None, *, stateless: bool
 ) -> tuple[list[FiringRecord], list[FiringRecord], int]:
-    """What lies before the place from which records are repeated, those that are, and the calls at an unknown state."""
+    """The records before the place from which they are repeated, those that are, and the calls at an unknown state."""
     kept, _ = whole(records)
     kept = kept[1:] if kept and kept[0].kind == "setup" else kept
     place = 0

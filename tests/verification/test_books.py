@@ -1,4 +1,4 @@
-"""The books of a recording say of its firing records what a set of all of them says, in a fraction of the memory."""
+"""The books of a recording agree with a list of all its firing records, in a fraction of the memory."""
 
 from __future__ import annotations
 

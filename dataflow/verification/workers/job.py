@@ -9,7 +9,6 @@ from typing import Any
 from dataflow.execution.memory import MemoryGuard
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.sync import Entry
@@ -23,8 +22,8 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
 
     The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
     `incomplete` (recorded streams to be made again), `records` (see `FiringLog.to_wire`), `begin` (stamp, or None),
-    `tolerance`, `slices` (by operator the stamps between which its calls are made), `until`
-    (operators: once each of them has differed, the rest is left), `guard` (watch over messages in every call).
+    `tolerance`, `slices` (by operator the stamps between which its calls are made), `until` (operators: once each of
+    them has differed, the rest is left), `guard` (watch over messages in every call).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
     stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: `operator` and `work` of
     those that are not repeated as a whole.
@@ -34,11 +33,8 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         feeding = plan_feeding(recording, graph, request["operators"], incomplete=request["incomplete"])
         feeding = feeding.reading(request["checks"])
         log = FiringLog.from_wire(request["records"], recording)
-
-        def repeated(operator: str) -> FiringRecord | None:
-            return work.runners[operator].record
-
-        comparer = Comparer(recording, graph, feeding.operators, request["tolerance"], repeated)
+        tolerance: float | None = request["tolerance"]
+        comparer = Comparer(recording, graph, feeding.operators, tolerance, lambda name: work.runners[name].record)
         checks = _checks(recording, graph, log, request)
 
         def read(stream: str, entry: Entry) -> None:
