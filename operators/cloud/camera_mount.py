@@ -1,4 +1,4 @@
-"""How a camera is held or mounted, from what it sees, as an operator."""
+"""Pose of a camera on its base, from what it sees, as an operator."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ class CameraMount(Operator):
     The vertical comes from the level and upright surfaces of a view, and from the accelerometer where there is one; the
     ground is the lowest level surface. The first view that shows them without doubt decides, for the map's frame begins
     with it; after `patience` the best one so far does, with a warning. The base is level where the camera's odometry
-    began. Extrinsics that hold the base are passed on as they are: `GravityCheck` compares them with what is seen.
+    began. Extrinsics that hold the base are passed on as they are.
+
+    Method: directions of surfaces as in Coughlan and Yuille, "Manhattan world", 1999, with a vertical alone.
     """
 
     cloud: In[PointCloud] = In(doc="points of a depth camera in its optical frame: x right, y down, z ahead")

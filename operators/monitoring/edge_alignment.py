@@ -40,7 +40,7 @@ class Shift:
 
 @dataclass(frozen=True)
 class Correction:
-    """What puts the edges of the depth onto those of the image: a displacement, m, or a turn, rad, of the points.
+    """Puts the edges of the depth onto those of the image: a displacement, m, or a turn, rad, of the points.
 
     Both are of points in the image camera's frame: x to the right and y down of `displacement`, and by `turn` the same
     ways as seen from the camera. One of them is zero: the one that explains near and far edges less well.

@@ -250,7 +250,7 @@ def _object(
 ) -> tuple[Indices, float] | None:
     """Returns the points of the object in a box and the overlap of their image with it.
 
-    `rows` are those that may be of it, `contained` the share of each piece that is in the box; None where a mask says
+    `rows` are those that may be of it, `contained` the share of each piece that is in the box; None where a mask shows
     so.
     """
     rows = rows[pieces[rows] >= 0]
