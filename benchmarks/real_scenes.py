@@ -42,7 +42,7 @@ def run(data: Path, scene: str, detector: str, settings: Sequence[str], recordin
     folder, stride = SCENES[scene]
     model = data / "models" / DETECTORS[detector]
     given = [f"camera.path={data / folder}", f"stride={stride}", f"detector={model}"]
-    command = [sys.executable, "-m", "dataflow", "run", str(REPOSITORY / "graphs" / "perception_rgbd.yaml")]
+    command = [sys.executable, "-m", "dataflow.cli.main", "run", str(REPOSITORY / "graphs" / "perception_rgbd.yaml")]
     command += [part for value in (*given, *settings) for part in ("--set", value)]
     command += ["--record", str(recording), "--overwrite", "--one-process", "--json"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=1800)

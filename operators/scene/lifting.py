@@ -251,7 +251,7 @@ def _object(
     """Returns the points of the object in a box and the overlap of their image with it.
 
     `rows` are those that may be of it, `contained` the share of each piece that is in the box; None where a mask shows
-    so.
+    it.
     """
     rows = rows[pieces[rows] >= 0]
     if not len(rows):
