@@ -162,7 +162,7 @@ def _drawn(points: Array, K: Array, shape: tuple[int, ...]) -> Surface:
 def _sampled(surface: Array, x: Array, y: Array, reach: int) -> Array:
     """Returns the values of a surface (S, S) at shifts (N,) up to `reach`, between its own by interpolation."""
     at = (x + reach).astype(np.float32)[None], (y + reach).astype(np.float32)[None]
-    return cv2.remap(surface.astype(np.float32), *at, cv2.INTER_LINEAR)[0].astype(np.float64)
+    return np.asarray(cv2.remap(surface.astype(np.float32), *at, cv2.INTER_LINEAR)[0], np.float64)
 
 
 def _best(part: str, surface: Array, edges: float, reach: int) -> Shift:

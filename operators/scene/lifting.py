@@ -237,7 +237,7 @@ def _reach(points: Array, s: LiftSettings) -> Array:
 
 def _counts(pieces: NDArray[np.int32], number: int) -> NDArray[np.intp]:
     """Returns how many points each piece has, -1 being none."""
-    return np.bincount(pieces[pieces >= 0], minlength=number)
+    return np.asarray(np.bincount(pieces[pieces >= 0], minlength=number), np.intp)
 
 
 def _object(
