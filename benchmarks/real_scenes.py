@@ -32,7 +32,7 @@ from operators.tracking.assignment import overlap
 REPOSITORY = Path(__file__).resolve().parent.parent
 SCENES = {"seven_0_249": ("rgbd_7scenes", 2), "fr1_rpy": ("scenes/fr1_rpy", 2), "cup_table": ("scenes/cup_table", 1)}
 """Folder of the frames, and which of them are taken."""
-DETECTORS = {"yolox_nano": ("yolox_nano.onnx", "yolox"), "fastestdet": ("FastestDet.onnx", "fastestdet")}
+DETECTORS = {"yolox_nano": "yolox_nano.onnx", "fastestdet": "FastestDet.onnx"}
 OFTEN, IOU = 3, 0.5
 COUNTED = ("nodes_counted", "right", "found", "labelled", "doubles", "misplaced", "named_wrongly", "phantom")
 
@@ -40,10 +40,9 @@ COUNTED = ("nodes_counted", "right", "found", "labelled", "doubles", "misplaced"
 def run(data: Path, scene: str, detector: str, settings: Sequence[str], recording: Path) -> float:
     """Records the graph on a scene; returns the milliseconds of CPU time an image that its operators took."""
     folder, stride = SCENES[scene]
-    file, decoder = DETECTORS[detector]
-    params = {"model": str(data / "models" / file), "decoder": decoder, "score_threshold": 0.3}
-    given = [f"camera.path={data / folder}", f"stride={stride}", f"perception.detector_params={json.dumps(params)}"]
-    command = [sys.executable, "-m", "dataflow", "run", str(REPOSITORY / "graphs" / "perception_rgbd.yaml")]
+    model = data / "models" / DETECTORS[detector]
+    given = [f"camera.path={data / folder}", f"stride={stride}", f"detector={model}"]
+    command = [sys.executable, "-m", "dataflow.cli.main", "run", str(REPOSITORY / "graphs" / "perception_rgbd.yaml")]
     command += [part for value in (*given, *settings) for part in ("--set", value)]
     command += ["--record", str(recording), "--overwrite", "--one-process", "--json"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=1800)

@@ -1,4 +1,4 @@
-"""How a camera is held or mounted, from what it sees, as an operator."""
+"""Pose of a camera on its base, from what it sees, as an operator."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ class CameraMount(Operator):
     The vertical comes from the level and upright surfaces of a view, and from the accelerometer where there is one; the
     ground is the lowest level surface. The first view that shows them without doubt decides, for the map's frame begins
     with it; after `patience` the best one so far does, with a warning. The base is level where the camera's odometry
-    began. Extrinsics that hold the base are passed on as they are: `GravityCheck` compares them with what is seen.
+    began. Extrinsics that hold the base are passed on as they are.
+
+    Method: directions of surfaces as in Coughlan and Yuille, "Manhattan world", 1999, with a vertical alone.
     """
 
     cloud: In[PointCloud] = In(doc="points of a depth camera in its optical frame: x right, y down, z ahead")
@@ -38,7 +40,7 @@ class CameraMount(Operator):
     motion: Sampled[Odometry] = Sampled(
         required=False, doc="the camera since its odometry began: a view that decides later counts from there"
     )
-    completed: Out[Transforms] = Out(doc="the extrinsics with the camera on its base, from when that is known")
+    base_extrinsics: Out[Transforms] = Out(doc="the extrinsics with the camera on its base, from when that is known")
     status: Out[Diagnostics] = Out(
         doc="how the camera looked at first, with standard deviations; a warning where that is a guess"
     )
@@ -71,7 +73,7 @@ class CameraMount(Operator):
         if extrinsics is not None and self.base_frame in (*extrinsics.frames, *extrinsics.child_frames):
             self._done, self._known = True, _digest(extrinsics)
             text = f"{self.base_frame} is given"
-            return {"completed": extrinsics, "status": counted_status("camera_mount", cloud.stamp, text, Level.OK, {})}
+            return {"base_extrinsics": extrinsics, "status": counted_status("camera_mount", cloud.stamp, text, Level.OK, {})}
         self._counts["views"] += 1
         self._first = cloud.stamp if self._first is None else self._first
         expected, information = held()
@@ -100,7 +102,7 @@ class CameraMount(Operator):
         completed = extrinsics
         if T is not None:
             completed = with_transform(extrinsics, cloud.stamp, self.base_frame, cloud.frame, T)
-        return {"completed": completed.replace(stamp=cloud.stamp)}
+        return {"base_extrinsics": completed.replace(stamp=cloud.stamp)}
 
     def _decided(self, cloud: PointCloud, extrinsics: Transforms | None, found: Vertical) -> dict[str, Any]:
         T = _on_base(found)
@@ -116,7 +118,7 @@ class CameraMount(Operator):
         self._T, self._known = T, _digest(extrinsics)
         level = Level.WARN if guess else Level.OK
         figures = {key: f"{value:g}" for key, value in self._figures.items()}
-        return {"completed": made, "status": counted_status("camera_mount", cloud.stamp, text, level, figures)}
+        return {"base_extrinsics": made, "status": counted_status("camera_mount", cloud.stamp, text, level, figures)}
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew: the camera may have been carried elsewhere."""

@@ -1,4 +1,4 @@
-"""What is expected of the direction up in a camera's optical frame before anything is seen."""
+"""Direction up that is expected in a camera's optical frame before anything is seen."""
 
 from __future__ import annotations
 

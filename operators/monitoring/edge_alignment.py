@@ -40,7 +40,7 @@ class Shift:
 
 @dataclass(frozen=True)
 class Correction:
-    """What puts the edges of the depth onto those of the image: a displacement, m, or a turn, rad, of the points.
+    """Puts the edges of the depth onto those of the image: a displacement, m, or a turn, rad, of the points.
 
     Both are of points in the image camera's frame: x to the right and y down of `displacement`, and by `turn` the same
     ways as seen from the camera. One of them is zero: the one that explains near and far edges less well.
@@ -162,7 +162,7 @@ def _drawn(points: Array, K: Array, shape: tuple[int, ...]) -> Surface:
 def _sampled(surface: Array, x: Array, y: Array, reach: int) -> Array:
     """Returns the values of a surface (S, S) at shifts (N,) up to `reach`, between its own by interpolation."""
     at = (x + reach).astype(np.float32)[None], (y + reach).astype(np.float32)[None]
-    return cv2.remap(surface.astype(np.float32), *at, cv2.INTER_LINEAR)[0].astype(np.float64)
+    return np.asarray(cv2.remap(surface.astype(np.float32), *at, cv2.INTER_LINEAR)[0], np.float64)
 
 
 def _best(part: str, surface: Array, edges: float, reach: int) -> Shift:

@@ -1,4 +1,4 @@
-"""How likely entries of a map are real, by how a detector answers to what is there and to what is not, as it shows."""
+"""Existence of the entries of a map, by the answers that a detector gives to what is there and to what is not."""
 
 from __future__ import annotations
 

@@ -237,7 +237,7 @@ def _reach(points: Array, s: LiftSettings) -> Array:
 
 def _counts(pieces: NDArray[np.int32], number: int) -> NDArray[np.intp]:
     """Returns how many points each piece has, -1 being none."""
-    return np.bincount(pieces[pieces >= 0], minlength=number)
+    return np.asarray(np.bincount(pieces[pieces >= 0], minlength=number), np.intp)
 
 
 def _object(
@@ -250,8 +250,8 @@ def _object(
 ) -> tuple[Indices, float] | None:
     """Returns the points of the object in a box and the overlap of their image with it.
 
-    `rows` are those that may be of it, `contained` the share of each piece that is in the box; None where a mask says
-    so.
+    `rows` are those that may be of it, `contained` the share of each piece that is in the box; None where a mask shows
+    it.
     """
     rows = rows[pieces[rows] >= 0]
     if not len(rows):

@@ -184,8 +184,8 @@ class MapObject:
         beside = sorted(self.beside.items())
         rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
         points = [np.concatenate([v.points for v in rows]), np.array([len(v.points) for v in rows])] if rows else []
-        rest |= {"held": self.held, "fresh": self.fresh, "points": points, "answers": self.answers.snapshot()}
-        return plain | rest
+        more: dict[str, Any] = {"held": self.held, "fresh": self.fresh, "points": points, "answers": self.answers.snapshot()}
+        return plain | rest | more
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:

@@ -38,7 +38,7 @@ _MOST_GRAIN = 4.0  # pixels
 class ObjectLifter(Operator):
     """Finds the points of a cloud that belong to the boxes of an image and puts upright 3-D boxes around them.
 
-    The cloud may be a depth camera's or a lidar's. What the camera sees is divided into smooth pieces once: at jumps of
+    The cloud may be a depth camera's or a lidar's. The view is divided into smooth pieces once: at jumps of
     range, and where surfaces meet inwards, as a cup and its table. That piece of a box is the object whose image
     overlaps the box best and that does not go on beyond it; the overlap is part of its score. With the masks of the
     detections only an object's own points count, with those of the same image only points of the box's class. Boxes

@@ -24,7 +24,7 @@ _VALUE_WIDTH = 30
 
 
 FINDING = "finding"
-"""Key of a summary under which an operator says what is wrong with its inputs, as a text."""
+"""Key of a summary that holds what is wrong with an operator's inputs, as a text."""
 SCORES = ("rmse", "precision", "recall", "f1", "iou", "accuracy", "error")
 """Parts of the names of figures that say how good something is."""
 MOST_SCORES, MOST_LOSSES, MOST_KEPT = 3, 4, 5

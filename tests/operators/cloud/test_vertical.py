@@ -72,7 +72,7 @@ def test_too_few_points_have_no_vertical() -> None:
 def test_base_is_level_on_the_ground_below_the_camera() -> None:
     known = Transforms.from_matrix(np.eye(4), stamp=0, frame="depth", child_frame="color")
     played = play(CameraMount(), {"cloud": [cloud(room(28, 5)), cloud(room(28, 5), 1)], "extrinsics": [known]})
-    (made,) = played["completed"]
+    (made,) = played["base_extrinsics"]
     assert isinstance(made, Transforms)
     assert made.frames == ("depth", "base_link")
     T = made.matrix("depth")
@@ -92,7 +92,7 @@ def test_a_view_that_decides_later_counts_from_where_the_odometry_began() -> Non
     moved = Odometry.from_matrix(T, stamp=1, frame="odom", child_frame="depth")
     nothing = cloud(np.zeros((0, 3)))
     streams = {"cloud": [nothing, cloud(room(10, 0), 1)], "motion": [moved]}
-    (made,) = play(CameraMount(), streams)["completed"]
+    (made,) = play(CameraMount(), streams)["base_extrinsics"]
     assert isinstance(made, Transforms)
     assert made.stamp == 1
     T_base_camera = made.matrix("depth")
@@ -103,13 +103,13 @@ def test_a_view_that_decides_later_counts_from_where_the_odometry_began() -> Non
 def test_after_a_while_without_surfaces_a_guess_is_taken_with_a_warning() -> None:
     nothing = [cloud(np.zeros((0, 3)), stamp) for stamp in (0, 1_000_000_000, 2_000_000_000)]
     played = play(CameraMount(patience="2s"), {"cloud": nothing})
-    assert [m.stamp for m in played["completed"]] == [2_000_000_000]
+    assert [m.stamp for m in played["base_extrinsics"]] == [2_000_000_000]
     assert played["status"][0].levels.tolist() == [Level.WARN]  # type: ignore[attr-defined]
 
 
 def test_a_base_that_is_given_is_kept() -> None:
     given = Transforms.from_matrix(np.eye(4), stamp=0, frame="base_link", child_frame="depth")
-    (made,) = play(CameraMount(), {"cloud": [cloud(room(28, 5))], "extrinsics": [given]})["completed"]
+    (made,) = play(CameraMount(), {"cloud": [cloud(room(28, 5))], "extrinsics": [given]})["base_extrinsics"]
     assert made.digest() == given.digest()
 
 
