@@ -342,6 +342,8 @@ class EkfFusion(Operator):
             return None
         unused |= {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
         unused |= unmeasured(self._filter.estimate(stamp)[0].covariance)
+        if self._filter.refuted_heading:
+            unused["heading"] = "the first heading that was told is wrong: measurements contradict it"
         if self._dropout.lasts(stamp):
             unused["inertial sensor"] = "silent: the motion is bridged by what others see"
         return diagnostics(stamp, health, self._filter.hypotheses, ignored, self._offsets(), unused)

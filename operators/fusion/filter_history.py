@@ -47,10 +47,14 @@ Entry = Sample | Measurement | Command
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One of several estimates, with the logarithm of its weight."""
+    """One of several estimates, with the logarithm of its weight.
+
+    `until`: time (ns) until which it is kept against what was told of the first heading; 0 for one that agrees with it.
+    """
 
     weight: float
     state: State
+    until: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +76,9 @@ def plain_node(node: Node) -> dict[str, Any]:
         "time": node.time,
         "readings": [node.gyro, node.accel],
         "command": None if c is None else [c.time, c.linear, c.angular, c.lag],
-        "hypotheses": [[h.weight, *(getattr(h.state, f.name) for f in fields(State))] for h in node.hypotheses],
+        "hypotheses": [
+            [h.weight, *(getattr(h.state, f.name) for f in fields(State)), h.until] for h in node.hypotheses
+        ],
         "health": {
             name: [
                 *(h.used, h.widened, h.refused, h.unconfirmed, h.last_used, h.nis),
@@ -86,7 +92,11 @@ def plain_node(node: Node) -> dict[str, Any]:
 
 def node_of(content: Mapping[str, Any]) -> Node:
     """Returns the node that `plain_node` was given."""
-    hypotheses = tuple(Hypothesis(float(weight), State(*arrays)) for weight, *arrays in content["hypotheses"])
+    size = len(fields(State))
+    hypotheses = tuple(
+        Hypothesis(float(weight), State(*values[:size]), *(int(until) for until in values[size:]))
+        for weight, *values in content["hypotheses"]
+    )
     health = {}
     for name, (used, widened, refused, unconfirmed, last, nis, doubts, *sums) in content["health"].items():
         kept = tuple(Doubt(int(time), *rest) for time, *rest in doubts)

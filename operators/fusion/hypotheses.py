@@ -10,6 +10,9 @@ import numpy as np
 from operators.fusion.error_state import ROTATION, SIZE, State, difference
 from operators.fusion.filter_history import Hypothesis, Node
 
+_LIKELY = 5.0
+"""Logarithm of the ratio of weights beyond which a hypothesis does not count."""
+
 
 def with_errors(node: Node, sigmas: Sequence[float]) -> Node:
     """Returns the node with an error of a sensor, 0, for each standard deviation, unless it has them."""
@@ -25,9 +28,16 @@ def with_errors(node: Node, sigmas: Sequence[float]) -> Node:
     return replace(node, hypotheses=tuple(made))
 
 
+def likely(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Returns the hypotheses that are not much less likely than the best."""
+    best = max(h.weight for h in hypotheses)
+    return [h for h in hypotheses if h.weight >= best - _LIKELY]
+
+
 def combined(hypotheses: Sequence[Hypothesis]) -> State:
     """Returns the likeliest state, with a covariance that holds the others too."""
     best = max(hypotheses, key=lambda h: h.weight)
+    hypotheses = likely(hypotheses)
     if len(hypotheses) == 1:
         return best.state
     weights = np.exp([h.weight - best.weight for h in hypotheses])
@@ -39,10 +49,12 @@ def combined(hypotheses: Sequence[Hypothesis]) -> State:
     return replace(best.state, covariance=covariance)
 
 
-def reduced(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Drops hypotheses that have become unlikely, and unites those that have become alike."""
+def reduced(hypotheses: Sequence[Hypothesis], time: int) -> tuple[Hypothesis, ...]:
+    """Drops hypotheses that have become unlikely or outlived their time (ns), and unites those that are alike."""
     if len(hypotheses) == 1:
-        return (Hypothesis(0.0, hypotheses[0].state),)
+        return (replace(hypotheses[0], weight=0.0),)
+    best = max(hypotheses, key=lambda h: h.weight)
+    hypotheses = [h for h in hypotheses if h is best or not 0 < h.until < time]
     ordered = sorted(hypotheses, key=lambda h: -h.weight)
     kept: list[Hypothesis] = []
     for h in ordered:

@@ -27,6 +27,8 @@ from operators.geometry.se3 import skew
 Array = NDArray[np.float64]
 TILT = 0.1
 """Standard deviation of the first level, rad."""
+_MISTOLD, _DOUBTED = -7.0, 20_000_000_000
+"""Logarithm of the weight of a heading other than the one told, and nanoseconds for which it is followed."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def prior_of(
     """Returns what parameters say is known; `at_origin`: the first pose is the world's frame but for the heading."""
     prior = Prior(heading=heading, heading_sigma=heading_sigma, gyro_bias=gyro_bias, accel_bias=accel_bias)
     if at_origin:
-        return replace(prior, position_sigma=1e-3, heading=heading or 0.0, heading_sigma=1e-3)
+        return replace(prior, position_sigma=1e-3, heading=heading or 0.0, heading_sigma=1e-3, headings=1)
     return prior
 
 
@@ -90,13 +92,19 @@ def first_node(
     level = _turn(-math.atan2(forward[1], forward[0])) @ level  # now the base heads along x
     known = prior.heading is not None
     centre = prior.heading if prior.heading is not None else 0.0
-    headings = [centre] if known else [centre + 2 * math.pi * k / prior.headings for k in range(prior.headings)]
-    spread = prior.heading_sigma if known else math.pi / prior.headings
+    around = [centre + 2 * math.pi * k / prior.headings for k in range(prior.headings)]
+    even = math.pi / prior.headings
+    last = samples[-1]
+    headings = [(heading, even, 0.0, 0) for heading in around]
+    if known:  # it may have been told wrongly: the others are followed for a while too
+        headings = [(centre, prior.heading_sigma, 0.0, 0)]
+        if prior.heading_sigma < even:
+            headings += [(heading, even, _MISTOLD, last.time + _DOUBTED) for heading in around[1:]]
     period = (samples[-1].time - samples[0].time) * 1e-9 / max(count - 1, 1)
     noise = samples[-1].noise
     down = np.array([0.0, 0.0, -gravity])
     made = []
-    for heading in headings:
+    for heading, spread, weight, until in headings:
         R = _turn(heading) @ level
         P = np.zeros((SIZE, SIZE))
         P[POSITION, POSITION] = np.eye(3) * prior.position_sigma**2
@@ -113,8 +121,7 @@ def first_node(
             rate = AngularRate(np.zeros(3), np.eye(3))
             sigma2 = noise.gyro**2 / period / count + 1e-8
             state = updated(state, *rate.innovation(state, gyro), np.eye(3) * sigma2)
-        made.append(Hypothesis(0.0, state))
-    last = samples[-1]
+        made.append(Hypothesis(weight, state, until))
     return Node(last.time, tuple(made), last.gyro, last.accel)
 
 

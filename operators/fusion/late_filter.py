@@ -39,13 +39,15 @@ from operators.fusion.filter_history import (
     sample_of,
 )
 from operators.fusion.gate import Doubt, GateConfig, Health, judge, leap, threshold
-from operators.fusion.hypotheses import combined, reduced, with_errors
+from operators.fusion.hypotheses import combined, likely, reduced, with_errors
 from operators.fusion.measurements import from_plain, to_plain
 from operators.fusion.sensor_errors import SensorErrors
 
 Array = NDArray[np.float64]
 TOO_LATE = ": too late"
 """Suffix of a sensor's name in the counts of measurements that came after the window."""
+_STANDS = 40_000_000_000
+"""Nanoseconds for which a refuted first heading is reported after the others would have been dropped."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
 
@@ -101,7 +103,14 @@ class LateFilter:
 
     @property
     def hypotheses(self) -> int:
-        return len(self._newest().hypotheses)
+        return len(likely(self._newest().hypotheses))
+
+    @property
+    def refuted_heading(self) -> bool:
+        """Returns whether what was measured contradicts what was told of the first heading, of late."""
+        node = self._newest()
+        until = max(node.hypotheses, key=lambda h: h.weight).until
+        return until > 0 and node.time < until + _STANDS
 
     def feel(self, sample: Sample) -> None:
         """Takes an inertial sample, later than the last one."""
@@ -250,9 +259,7 @@ class LateFilter:
         if inertial and seconds <= self._config.max_gap:
             mean_gyro, mean_accel = 0.5 * (node.gyro + gyro), 0.5 * (node.accel + accel)
             hypotheses = tuple(
-                Hypothesis(
-                    h.weight, propagated(h.state, mean_gyro, mean_accel, seconds, noise, self._down, self._wander)
-                )
+                replace(h, state=propagated(h.state, mean_gyro, mean_accel, seconds, noise, self._down, self._wander))
                 for h in node.hypotheses
             )
         else:
@@ -305,9 +312,10 @@ class LateFilter:
         else:
             hypotheses = reduced(
                 [
-                    Hypothesis(h.weight - 0.5 * (nis + spread), updated(h.state, r, J, entry.noise))
+                    replace(h, weight=h.weight - 0.5 * (nis + spread), state=updated(h.state, r, J, entry.noise))
                     for h, (r, J), (nis, spread) in zip(hypotheses, found, scores, strict=True)
-                ]
+                ],
+                entry.time,
             )
         return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after}, node.command)
 

@@ -2,7 +2,9 @@
 
 A cloud settles in one of several places that look alike, and its spread does not reflect the others. So when the robot
 has been looked for, places elsewhere that explain the observation are tried, and the best is followed beside the cloud
-until the observations decide between the two. Multiple-hypothesis localisation: Jensfelt and Kristensen, "Active global
+until the observations decide between the two. Later, too, places that explain an observation better are tried now and
+then, and whenever the pose explains it badly: a robot that was carried to a place that looks alike loses no fit.
+Multiple-hypothesis localisation: Jensfelt and Kristensen, "Active global
 localization for a mobile robot using multiple hypothesis tracking", 2001.
 """
 
@@ -28,6 +30,10 @@ _FORGETTING = 0.02
 """Share of the evidence that each observation ages by: what neighbouring scans say is much alike."""
 _WORSE = 5.0
 """Logarithm of the ratio above which a place that was found explains the observation too badly to be followed."""
+_BETTER = 5.0
+"""Logarithm of the ratio by which a place must explain an observation better, once nowhere else was found."""
+_AGAIN = 10
+"""Observations after which places elsewhere are tried again."""
 _SEARCHES, _TRIED, _FOLLOWED = 3, 200, 100
 _NEAR = (0.1, 0.1, 0.05)
 
@@ -57,7 +63,7 @@ class CompetingHypothesis:
 
     def __init__(self) -> None:
         self._other: _Other | None = None
-        self._searched = 0
+        self._searched = self._since = 0
         self._expected: Array | None = None
         self._refuted = np.zeros((0, 3))  # places that were decided against
 
@@ -80,11 +86,11 @@ class CompetingHypothesis:
 
     def settle(self) -> None:
         """Takes the pose as known: nowhere else is looked for it."""
-        self._other, self._searched = None, _SEARCHES
+        self._other, self._searched, self._since = None, _SEARCHES, 0
 
     def forget(self) -> None:
         """Begins anew: the pose is another one than before."""
-        self._other, self._searched, self._expected = None, 0, None
+        self._other, self._searched, self._since, self._expected = None, 0, 0, None
         self._refuted = np.zeros((0, 3))
 
     def move(self, step: Array, covariance: Array, rng: np.random.Generator) -> None:
@@ -96,19 +102,28 @@ class CompetingHypothesis:
             self._other.poses = moved(self._other.poses, step, covariance, rng)
 
     def update(
-        self, mean: Array, evidence: float, observation: Observation, count: float, rng: np.random.Generator
+        self,
+        mean: Array,
+        evidence: float,
+        observation: Observation,
+        count: float,
+        doubtful: bool,
+        rng: np.random.Generator,
     ) -> Array | None:
         """Takes an observation that has the given evidence, a logarithm, where the pose's mean (3,) is.
 
-        `count`: what its sensor counts. Returns the cloud (N, 3) of the other place where that explains all so much
-        better that it is the pose.
+        `count`: what its sensor counts; `doubtful`: observations fit worse than usual. Returns the cloud (N, 3) of the
+        other place where that explains all so much better that it is the pose.
         """
         if self._expected is not None and apart(self._expected, mean):
             self.forget()
         self._expected = mean
         if self._other is None:
+            self._since += 1
             if self._searched < _SEARCHES:
-                self._search(mean, evidence, observation, count, rng)
+                self._search([mean, *self._refuted], evidence - _WORSE, observation, count, rng)
+            elif doubtful or self._since >= _AGAIN:
+                self._search([mean], evidence + _BETTER, observation, count, rng)
             return None
         gained = evidence - self._other.update(observation, count, rng)
         self._other.lead = (1.0 - _FORGETTING) * self._other.lead + gained
@@ -125,19 +140,19 @@ class CompetingHypothesis:
         return None
 
     def _search(
-        self, mean: Array, evidence: float, observation: Observation, count: float, rng: np.random.Generator
+        self, known: list[Array], least: float, observation: Observation, count: float, rng: np.random.Generator
     ) -> None:
-        self._searched += 1
+        """Follows the likeliest place that is none of the known ones, if it is likely enough."""
+        self._searched, self._since = self._searched + 1, 0
         if not observation.whole:
             return
         tried = observation.propose(_TRIED, rng)
-        known = [mean, *self._refuted]
         tried = tried[[all(apart(pose, one) for one in known) for pose in tried]]
         if not len(tried):
             return
         logarithms = count * observation.score(tried)[0]
         best = int(logarithms.argmax())
-        if logarithms[best] < evidence - _WORSE:
+        if logarithms[best] < least:
             return
         poses = tried[best] + np.array(_NEAR) * rng.standard_normal((_FOLLOWED, 3))
         poses[:, 2] = wrapped(poses[:, 2])
@@ -148,6 +163,7 @@ class CompetingHypothesis:
         return {
             "other": None if other is None else [other.poses, other.logarithms, other.lead],
             "searched": self._searched,
+            "since": self._since,
             "expected": self._expected,
             "refuted": self._refuted,
         }
@@ -158,7 +174,8 @@ class CompetingHypothesis:
         if state.get("other") is not None:
             poses, logarithms, lead = state["other"]
             self._other = _Other(poses, logarithms, float(lead))
-        self._searched, self._expected = int(state.get("searched", 0)), state.get("expected")
+        self._searched, self._since = int(state.get("searched", 0)), int(state.get("since", 0))
+        self._expected = state.get("expected")
         self._refuted = np.asarray(state.get("refuted", np.zeros((0, 3))), np.float64).reshape(-1, 3)
 
 

@@ -28,7 +28,7 @@ from operators.localization.observations import Observation
 Array = NDArray[np.float64]
 _TOLERATED = 0.75
 """Share of its usual fit below which a sensor's observations are worse than chance makes them."""
-_DOUBTFUL = 0.05
+DOUBTFUL = 0.05
 """Loss of fit from which on poses are injected."""
 _EXPLORED = 0.01
 """Share that is injected of a sensor that contradicts the others, and now and then of all: the pose may be wrong."""
@@ -121,7 +121,7 @@ class MonteCarlo:
         heard = self._heard[sensor] = self._heard.get(sensor, 0) + 1
         if trust.get(sensor, 1.0) < 0.5:  # an outvoted sensor proposes little: others judge it before it outweighs them
             self._draw(weights, rng, observation, _EXPLORED)
-        elif doubt > _DOUBTFUL:
+        elif doubt > DOUBTFUL:
             self._draw(weights, rng, observation, min(1.5 * doubt, self.config.largest))
         elif heard % self.config.explore == 0:
             self._draw(weights, rng, observation, _EXPLORED)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from operators.localization.competing_hypothesis import CompetingHypothesis
 from operators.localization.estimate import Estimate
-from operators.localization.monte_carlo import CloudConfig, MonteCarlo
+from operators.localization.monte_carlo import DOUBTFUL, CloudConfig, MonteCarlo
 from operators.localization.observations import Observation
 from operators.localization.sensor_weights import SensorWeights
 
@@ -61,10 +61,12 @@ class WeightedCloud:
         if share > _MOST / 2:
             trust[sensor] = self.sensor_weights.update(sensor, stamp, observation.misfit(mean, covariance))
         evidence = self._cloud.weigh(sensor, observation, rng, trust)
-        if self._cloud.doubt(trust) > _LOST:
+        doubt = self._cloud.doubt(trust)
+        if doubt > _LOST:
             self.competing.forget()
         elif self._narrow(covariance):
-            better = self.competing.update(mean, evidence, observation, trust.get(sensor, 1.0), rng)
+            counts = trust.get(sensor, 1.0)
+            better = self.competing.update(mean, evidence, observation, counts, doubt > DOUBTFUL, rng)
             if better is not None:
                 self._cloud.replace(better)
 

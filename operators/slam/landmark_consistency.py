@@ -72,5 +72,5 @@ class Consistency:
 
     @classmethod
     def restored(cls, state: Sequence[float]) -> Consistency:
-        *sums, strayed = state
-        return cls(*(float(value) for value in sums), int(strayed))
+        nis, freedom, motion, variance, spread, strayed = state
+        return cls(nis, freedom, motion, variance, spread, int(strayed))

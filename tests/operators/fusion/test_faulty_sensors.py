@@ -9,6 +9,7 @@ import pytest
 
 from dataflow.messages import Imu, Message, Odometry, Pose
 from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import yaw_of
 from dataflow.operator import Context
 from operators.fusion import EkfFusion
 
@@ -259,3 +260,32 @@ def test_snapshots_from_before_there_were_alarms_restore() -> None:
     other.setup()
     other.restore(old)
     assert other.summary() == operator.summary()
+
+
+@pytest.mark.parametrize("wrong", [0.5, -2.0])
+def test_a_first_heading_told_wrongly_is_found_out_and_reported(wrong: float) -> None:
+    drive = Drive(12.0)
+    operator = EkfFusion(patience=0.5, heading=drive.heading + wrong, heading_sigma=0.05)
+    operator.setup()
+    texts, off = set(), []
+    for now, name, message in sorted(drive.imu + drive.fixes(), key=lambda e: e[:2]):
+        made = operator.process({f"ns/robot/{name}": message}, Context(now)) or {}
+        if (status := made.get("status")) is not None:
+            texts |= {(n, level) for n, level in zip(status.names, status.levels, strict=True)}
+        if (pose := made.get("odometry")) is not None:
+            yaw = 0.9 * np.sin(0.7 * (now - 10**9) * 1e-9)
+            turned = abs((float(yaw_of(pose.orientation)) - yaw + np.pi) % (2 * np.pi) - np.pi)
+            off.append((turned, np.sqrt(pose.pose_covariance[5, 5])))
+    assert ("heading", Level.WARN) in texts
+    errors, claimed = np.array(off[-600:]).T
+    assert (errors <= 3 * claimed).mean() > 0.9, "and while it is not, the warning stands"
+    assert errors.mean() < 0.3
+
+
+def test_a_first_heading_told_rightly_raises_no_doubt_and_costs_no_confidence() -> None:
+    drive = Drive(6.0)
+    run = Run(drive, drive.fixes(), heading_sigma=0.05)
+    assert run.operator._filter is not None
+    assert run.operator._filter.hypotheses == 1
+    assert not run.operator._filter.refuted_heading
+    assert run.within(1.0, 6.0) > 0.95

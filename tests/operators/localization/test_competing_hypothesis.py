@@ -94,6 +94,46 @@ def test_what_is_followed_comes_back_from_a_snapshot() -> None:
     assert other.mean is None
 
 
+class TwoPlaces:
+    """An observation that two places explain: one with a logarithm of likelihood of 0, the other with `gain`."""
+
+    whole = True
+    here, there = np.zeros(3), np.array([6.0, 0.0, math.pi])
+
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
+
+    def score(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = np.linalg.norm(poses[:, None, :2] - np.array([self.here, self.there])[None, :, :2], axis=2)
+        logarithms = np.where(off[:, 0] < off[:, 1], 0.0, self.gain) - 0.5 * (off.min(axis=1) / 0.3) ** 2
+        return logarithms, np.exp(np.minimum(logarithms, 0.0))
+
+    def misfit(self, pose: np.ndarray, covariance: np.ndarray) -> float:
+        return 1.0
+
+    def propose(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        return np.tile([self.here, self.there], (count // 2, 1))
+
+
+@pytest.mark.parametrize(("gain", "doubtful", "within"), [(9.0, False, 12), (9.0, True, 3), (1.0, False, None)])
+def test_a_decided_pose_is_in_question_again_where_another_place_explains_more(
+    gain: float, doubtful: bool, within: int | None
+) -> None:
+    competing, rng = CompetingHypothesis(), np.random.default_rng(0)
+    competing.settle()
+    taken, better = 0, None
+    while better is None and taken < 30:
+        better = competing.update(TwoPlaces.here, 0.0, TwoPlaces(gain), 1.0, doubtful, rng)
+        taken += 1
+    if within is None:
+        assert better is None
+        assert competing.decided
+    else:
+        assert better is not None
+        assert taken <= within
+        np.testing.assert_allclose(better[:, :2].mean(axis=0), TwoPlaces.there[:2], atol=0.2)
+
+
 def test_places_are_apart_by_way_or_turn() -> None:
     here = np.array([1.0, 2.0, 3.1])
     assert not apart(here, np.array([1.3, 2.3, -3.1]))
