@@ -23,6 +23,8 @@ from dataflow.supervision.run import replay
 from dataflow.sync import MessageRef
 from dataflow.verification.verify import verify
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 SECOND = 1_000_000_000
 
 

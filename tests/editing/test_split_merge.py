@@ -18,6 +18,8 @@ from dataflow.recording.streams.copying import Origin
 from dataflow.records.reading import FiringLog
 from dataflow.verification.verify import verify
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 SECOND = 1_000_000_000
 
 

@@ -25,6 +25,8 @@ from dataflow.sinks.triggers import Triggers
 from dataflow.supervision.run import replay, run
 from dataflow.verification.verify import verify
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 RUNTIME = Path(__file__).resolve().parent.parent / "runtime"
 SECOND = 1_000_000_000
 GRAPH = """
