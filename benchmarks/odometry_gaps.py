@@ -30,8 +30,8 @@ EARLIER = 5  # frames from one earlier view to the next that is compared
 
 @dataclass(frozen=True)
 class Gap:
-    """What came of a gap: the claims of the frames after it to be in the old map, right or wrong, and whether the first
-    of them shows what was seen before."""
+    """Holds which of the frames after a gap claim to be in the old map, and are right or wrong, and whether the first
+    shows what was seen before."""
 
     seen: bool
     right: tuple[bool, ...]

@@ -85,7 +85,7 @@ class Model(_Row):
     - `operator`: the import path of the operator that runs it; `params`: its parameters where others are not given.
     - `classes`: a list of names, the name of one (`coco`), or None for networks without.
     - `sha256` of the file; None where it is exported by oneself. `bytes`: its size, where that is known. `exports`:
-      sha256 of other files with the same weights and outputs.
+      sha256 of other exports of the same network, which the row's parameters fit, too.
     - `published`: the authors' figure; `measured`: the one found here, with its command, or `not measured`.
     """
 

@@ -26,11 +26,11 @@ class LidarOdometry(Operator):
     A scan whose points have `time_offsets`, or get them by `sweep`, is deskewed with the velocity that its own pose
     means. Without either, its pose is that of the middle of the turn rather than that of the stamp. Scans that measure
     nothing are bridged with the velocity so far, for `patience`; then the LiDAR is lost, there are no poses, and it is
-    looked for within three metres of where it was, in any heading; after `give_up` a new map begins there. The
-    covariance is that of the whole way: it grows when the LiDAR leaves what it has mapped and with every bridge, and
-    along directions that the surroundings do not constrain (a bare corridor), which the status names. A scan that
-    repeats the last one means that the LiDAR stands: where a sensor may hang, ScanWatch before this operator holds it
-    back.
+    looked for within three metres of where it was, in any heading, and not believed where two places fit or a
+    direction is not constrained; after `give_up` a new map begins there. The covariance is that of the whole way: it
+    grows when the LiDAR leaves what it has mapped and with every bridge, and along directions that the surroundings do
+    not constrain (a bare corridor), which the status names. A scan that repeats the last one means that the LiDAR
+    stands: where a sensor may hang, ScanWatch before this operator holds it back.
 
     Method: scan to map, point to plane. Yuan et al., "Efficient and probabilistic adaptive voxel mapping for accurate
     online LiDAR odometry", 2022; prediction and kernel as in Vizzo et al., "KISS-ICP", 2023; directions without support

@@ -35,14 +35,14 @@ def same(known: Calibration | None, given: Calibration) -> bool:
 class VisualOdometry(Operator):
     """Tracks an RGB-D camera by its features and its depth; the first frame's depth camera is the origin.
 
-    The pose is that of the depth camera's optical frame, at every frame, also while nothing can be measured:
-    then it follows the motion so far and its covariance grows. `status` names at every frame the basis of the pose:
-    tracking, relocalised, predicted or lost, and why. A lost camera looks for its view among the keyframes; where it
-    sees something that is not among them for longer than `patience`, it begins a new map at the predicted pose, and
-    joins it to the old one when that is seen again. A place is believed where shape fixes it in every direction, or a
-    pattern that fits nowhere beside it, and taken back when what follows contradicts it. An image that is black or repeats the last one is not used. The
-    images need not be registered, but must be free of lens distortion. Without `extrinsics` the two cameras are
-    taken to coincide.
+    The pose is that of the depth camera's optical frame, at every frame, also while nothing can be measured: then it
+    follows the motion so far and its covariance grows. `status` names at every frame the basis of the pose: tracking,
+    relocalised, predicted or lost, and why. A lost camera looks for its view among the keyframes; where it sees
+    something that is not among them for longer than `patience`, it begins a new map at the predicted pose, and joins
+    it to the old one when that is seen again. A place is believed where shape fixes it in every direction, or a
+    pattern that fits nowhere beside it, and taken back when what follows contradicts it. An image that is black or
+    repeats the last one is not used. The images need not be registered, but must be free of lens distortion. Without
+    `extrinsics` the two cameras are taken to coincide.
 
     Methods: corners, Shi and Tomasi, "Good features to track", 1994; RANSAC PnP; point-to-plane alignment to the
     surfaces of keyframes, Newcombe et al., "KinectFusion", 2011; views found again by SIFT, Lowe, 2004.

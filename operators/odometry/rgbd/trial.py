@@ -35,6 +35,7 @@ class Trial:
         return Trial(since, found, np.asarray(T_before @ invert(T_found), np.float64), T_before, covariance)
 
     def over(self, stamp: int) -> bool:
+        """Returns whether the trial has lasted long enough."""
         return stamp - self.found > SECONDS * 1e9
 
     def heard(self, contradicts: bool) -> Trial:
@@ -43,6 +44,7 @@ class Trial:
 
     @property
     def failed(self) -> bool:
+        """Returns whether the place is to be taken back."""
         return self.against >= CONTRADICTIONS
 
     def taken_back(self, T_world_camera: Matrix) -> tuple[Matrix, Matrix]:

@@ -1,4 +1,4 @@
-"""Whether what a view and the map have in common is of one place, and not of every place along a floor or a wall.
+"""Tests that what a view and the map have in common is of one place, and not of all places along a floor or a wall.
 
 A surface slides over itself: where all that agrees lies on one plane, or on walls along a corridor, its shape fits at
 any place along it, and only its pattern is of one place. Patterns of tiles, carpets, bricks and shelves fit again a
