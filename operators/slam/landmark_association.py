@@ -11,7 +11,6 @@ mapping", 2001.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -185,6 +184,5 @@ def _evidence(residual: Array, covariance: Array, density: float) -> float:
     sign, size = np.linalg.slogdet(covariance)
     if sign <= 0 or not len(residual):
         return -math.inf
-    pairs: Sequence[float] = residual
     distance = float(residual @ np.linalg.solve(covariance, residual))
-    return -0.5 * (distance + float(size)) - len(pairs) / 2 * math.log(2 * math.pi * density)
+    return -0.5 * (distance + float(size)) - len(residual) / 2 * math.log(2 * math.pi * density)
