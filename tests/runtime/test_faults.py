@@ -21,6 +21,8 @@ from dataflow.supervision.core.watchers import heartbeats
 from dataflow.supervision.run import replay, run
 from dataflow.verification.verify import verify
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 AGAIN = "restart: {max: 5, backoff: 20ms}"
 
 
