@@ -59,7 +59,7 @@ class Outliner:
         self._first: Place = (-1, -1)
         self._begin = self._end = 0
         self._repeats = False
-        """Whether the newest run is, so far, what came before already."""
+        """The newest run has only what came before already, so far."""
         self._newest: dict[str, Place] = dict.fromkeys(outputs, (-1, -1))
         self._scattered: set[str] = set()
 
