@@ -73,7 +73,10 @@ class CameraMount(Operator):
         if extrinsics is not None and self.base_frame in (*extrinsics.frames, *extrinsics.child_frames):
             self._done, self._known = True, _digest(extrinsics)
             text = f"{self.base_frame} is given"
-            return {"base_extrinsics": extrinsics, "status": counted_status("camera_mount", cloud.stamp, text, Level.OK, {})}
+            return {
+                "base_extrinsics": extrinsics,
+                "status": counted_status("camera_mount", cloud.stamp, text, Level.OK, {}),
+            }
         self._counts["views"] += 1
         self._first = cloud.stamp if self._first is None else self._first
         expected, information = held()

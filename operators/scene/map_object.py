@@ -184,7 +184,12 @@ class MapObject:
         beside = sorted(self.beside.items())
         rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
         points = [np.concatenate([v.points for v in rows]), np.array([len(v.points) for v in rows])] if rows else []
-        more: dict[str, Any] = {"held": self.held, "fresh": self.fresh, "points": points, "answers": self.answers.snapshot()}
+        more: dict[str, Any] = {
+            "held": self.held,
+            "fresh": self.fresh,
+            "points": points,
+            "answers": self.answers.snapshot(),
+        }
         return plain | rest | more
 
     @classmethod
