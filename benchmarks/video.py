@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from fractions import Fraction
+from typing import Any
 
 import av
 import numpy as np
@@ -30,7 +31,7 @@ ENCODERS = {
 def packets(format_: str, width: int, height: int) -> list[bytes]:
     """A pattern of squares that moves across the image, at 6 Mbit/s and 30 Hz."""
     codec, options = ENCODERS[format_]
-    encoder = av.CodecContext.create(codec, "w")
+    encoder: Any = av.CodecContext.create(codec, "w")
     encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = width, height, "yuv420p", Fraction(1, 30)
     encoder.gop_size, encoder.thread_count, encoder.bit_rate, encoder.options = GROUP, 1, 6_000_000, options
     squares = np.random.default_rng(0).integers(0, 255, (height // 8 + 20, width // 8 + 20, 3))

@@ -92,7 +92,7 @@ class CameraMount(Operator):
         if patient and (found is None or _doubt(found) > 1):
             return None
         if self._best is None:
-            self._best = Vertical(expected, np.linalg.inv(information), 1.0, None)
+            self._best = Vertical(expected, np.asarray(np.linalg.inv(information), np.float64), 1.0, None)
         self._done = True
         return self._decided(cloud, extrinsics, self._best)
 
@@ -159,7 +159,7 @@ def _digest(extrinsics: Transforms | None) -> bytes:
 
 def _doubt(found: Vertical) -> float:
     """Returns how much is lacking to a decision: up to 1 nothing is."""
-    return max(found.rival / _RIVAL, found.sigma / _SURE)
+    return float(max(found.rival / _RIVAL, found.sigma / _SURE))
 
 
 def _on_base(found: Vertical) -> Array:

@@ -113,7 +113,7 @@ class EdgeAlignment:
         shifts = np.arange(-self._reach, self._reach + 0.25, 0.5)  # of the near ones, working pixels
         x, y = (each.ravel() for each in np.meshgrid(shifts, shifts))
         turned, displaced = (
-            sum(_sampled(layer, x * far, y * far, self._reach) for layer, far in zip(layers, scales, strict=True))
+            np.sum([_sampled(a, x * far, y * far, self._reach) for a, far in zip(layers, scales, strict=True)], axis=0)
             for scales in ((1.0, 1.0), (1.0, float(nearness[1] / nearness[0])))
         )
         focal = K[0, 0] / 2

@@ -120,6 +120,7 @@ def lift(
         if np.count_nonzero(inner) < s.min_points:
             continue
         box, contained = (left, upper, right, lower), None
+        rows: Indices | None
         if instances is not None:
             rows = _on(instances[k], seen, near[inner])
         elif (rows := _of_class(near, inner, classes, first, mask_classes[k], k in bodies, s)) is None:
@@ -132,6 +133,7 @@ def lift(
             body = _body(seen, columns, lines, classes == mask_classes[k], order, box, s)
             candidates += [] if body is None else [(k, *body)]
             continue
+        assert rows is not None
         found = _object(seen, np.sort(rows), pieces, contained, box, s)
         if found is not None:
             candidates.append((k, *found))
@@ -148,7 +150,7 @@ def lift(
 def _on(mask: Mask, seen: Seen, rows: Indices) -> Indices:
     """Returns those of some points that are on an object's mask (H, W)."""
     columns, lines = seen.places[:2].take(rows, axis=1).astype(np.intp)
-    return rows[mask[lines, columns]]
+    return np.asarray(rows[mask[lines, columns]])
 
 
 def _of_class(
@@ -324,7 +326,8 @@ def _among(values: NDArray[np.integer[Any]], chosen: NDArray[np.int64]) -> Mask:
 def _central(pixels: Array, box: tuple[float, float, float, float]) -> NDArray[np.intp]:
     """Returns 1 for pixels (2, N) in the inner half of a box, else 0: what shows around a thing has few there."""
     wide = np.abs(pixels[0] - (box[0] + box[2]) / 2) <= (box[2] - box[0]) / 4
-    return (wide & (np.abs(pixels[1] - (box[1] + box[3]) / 2) <= (box[3] - box[1]) / 4)).astype(np.intp)
+    high = np.abs(pixels[1] - (box[1] + box[3]) / 2) <= (box[3] - box[1]) / 4
+    return np.asarray(wide & high, np.intp)
 
 
 def _linked(places: Array, reach: float) -> NDArray[np.intp]:

@@ -36,7 +36,7 @@ def range_segments(points: Array, pixels: Array, inside: Mask, reach: Array) -> 
     there = owner >= 0
     P = np.full((3, grid.size), np.nan, np.float32)
     P[:, there] = points[rows[owner[there]]].T
-    near = np.zeros(grid.size, np.float32)
+    near: NDArray[np.float32] = np.zeros(grid.size, np.float32)
     near[there] = reach[rows[owner[there]]]
     P, near, number = P.reshape(3, *grid.shape), near.reshape(grid.shape), np.arange(grid.size).reshape(grid.shape)
     across, down = _links(P, near, number), _links(P.transpose(0, 2, 1).copy(), near.T.copy(), number.T)

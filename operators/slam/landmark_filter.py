@@ -278,9 +278,9 @@ class LandmarkFilter:
         if strayed > _STRAYED * (strayed + matched):
             told = self._P[:size, :size].copy()
             self._P[:size, :size] += (_SLIP - 1) * (self._step @ self._step.T)
-            again = self._constellation(offsets, noise)
-            if len(again) > max(_CONSTELLATION - 1, matched):
-                result, strayed = [again.get(k, _IGNORED) for k in range(len(offsets))], 0
+            found = self._constellation(offsets, noise)
+            if len(found) > max(_CONSTELLATION - 1, matched):
+                result, strayed = [found.get(k, _IGNORED) for k in range(len(offsets))], 0
                 self._slip = _SLIP
             else:
                 self._P[:size, :size] = told
@@ -344,7 +344,7 @@ class LandmarkFilter:
         self.consistency.update(float(r @ weighted[:, 0]), len(r), motion)
 
     @staticmethod
-    def _columns(landmarks: Sequence[int]) -> NDArray[np.intp]:
+    def _columns(landmarks: Sequence[int] | NDArray[np.intp]) -> NDArray[np.intp]:
         at = _FIRST + 2 * np.asarray(landmarks, int)
         return np.stack([at, at + 1], -1).ravel()
 

@@ -113,8 +113,8 @@ def list_7scenes(folder: Path, rate: float, first_stamp: int) -> Dataset:
         stamp = frame_stamp(number, rate, first_stamp)
         frames.append(Frame(numbers[number], stamp, folder / image, folder / f"{stem}.depth.png", pose))
     depth = _intrinsics_file(folder) or Intrinsics(585.0, 585.0, 320.0, 240.0)
-    image = Intrinsics(525.0, 525.0, depth.cx, depth.cy)
-    return Dataset(frames, 1000.0, (0, 65535), image, depth, (0.025, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    color = Intrinsics(525.0, 525.0, depth.cx, depth.cy)
+    return Dataset(frames, 1000.0, (0, 65535), color, depth, (0.025, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
 
 
 def list_tum(folder: Path) -> Dataset:
