@@ -1,4 +1,4 @@
-"""Directions along which surfaces slide over themselves, so that their shape tells of no motion there."""
+"""Directions along which surfaces slide over themselves, so that their shape shows no motion there."""
 
 from __future__ import annotations
 

@@ -98,7 +98,6 @@ def lift(
     not go on beyond it is the object, with those near it that make the overlap better. `mask_classes` (M,) is the
     mask's class of each box, -1 for none. Where the box holds enough of it, only such points count, wherever their
     piece goes on; otherwise points of `background` classes do not. Points go to the box that they fit best, once.
-
     `instances` (M) are masks (H, W) of the objects themselves; where they are known, their points count alone.
 
     For the boxes in `bodies` the mask counts more than the edges: the object is the connected part of its mask, also
@@ -137,8 +136,7 @@ def lift(
         found = _object(seen, np.sort(rows), pieces, contained, box, s)
         if found is not None:
             candidates.append((k, *found))
-    owned = _divided(seen.places[:2], boxes, candidates, bodies)
-    level = level_axes(seen.up)
+    owned, level = _divided(seen.places[:2], boxes, candidates, bodies), level_axes(seen.up)
     kept = [
         Lifted(k, own, value, *upright_box(seen.points[own], seen.up, level))
         for (k, points, value), own in zip(candidates, owned, strict=True)

@@ -52,7 +52,7 @@ WITHOUT_A_METHOD = {
     "CustomDetector", "DepthDecoder", "DepthSelfFilter",
     "DepthWatch", "ImageClassifier", "ImageDecoder", "ImageWatch", "MotionCheck", "OnnxDetector",
     "OnnxSegmenter", "ScanWatch", "SceneGraphMetrics", "ScoreFilter", "Segmenter", "SelfFilter",
-    "TorchvisionRigDetector", "TorchvisionRigSegmenter", "TrajectoryPlots",
+    "TorchvisionRigDetector", "TorchvisionRigSegmenter", "TrajectoryPlots", "VideoDecoder",
 }  # fmt: skip
 """Operators that apply a definition or a network of any make, or what this project thought of itself."""
 
