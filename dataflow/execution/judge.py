@@ -8,6 +8,7 @@ from pathlib import PurePath
 
 from dataflow.execution.calls import entries_of
 from dataflow.execution.failure import readable
+from dataflow.execution.snapshots import differing_fields
 from dataflow.messages.base import Message
 from dataflow.records.comparison import Difference, Verification
 from dataflow.records.firing import WITHHELD, Emission, FiringRecord
@@ -83,7 +84,8 @@ class Judge:
         """Compares a snapshot, if its state was not too large to be recorded."""
         if "state" in record.detail and (packed or b"") != record.detail["state"]:
             self.result.states += 1
-            self.differ(record, "", "the recorded state", "another state")
+            what = differing_fields(record.detail["state"], packed or b"")
+            self.differ(record, "", "the recorded state", f"another state: {what}")
 
     def files(self, record: FiringRecord, now: Mapping[str, str]) -> None:
         """Notes files whose content is that of no file of the same name that was read then, wherever that lay."""

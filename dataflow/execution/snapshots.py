@@ -27,6 +27,23 @@ def unpack_state(data: bytes) -> Any:
         raise StateError(f"not an operator's state: {error}") from error
 
 
+def differing_fields(recorded: bytes, here: bytes) -> str:
+    """Returns in words how two packed states differ, of which one may be empty. Raises `StateError` for other bytes."""
+    if not (recorded and here):
+        return "none is given now" if recorded else "none was recorded"
+    before, now = unpack_state(recorded), unpack_state(here)
+    if not (isinstance(before, Mapping) and isinstance(now, Mapping)):
+        return "another kind of value"
+    if before.keys() != now.keys():
+        lacks, more = (
+            ", ".join(sorted(names)) or "none" for names in (now.keys() - before.keys(), before.keys() - now.keys())
+        )
+        return f"of another version of the operator: the recorded one lacks {lacks} and has {more} besides"
+    return "in " + ", ".join(
+        name for name in sorted(now) if pack_state({"": before[name]}) != pack_state({"": now[name]})
+    )
+
+
 def _plain(value: Any, place: str) -> Any:
     match value:
         case np.ndarray() if value.dtype != object:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.execution.snapshots import differing_fields, pack_state, unpack_state
 from dataflow.state import StateError
 
 arrays = hnp.arrays(
@@ -91,3 +91,22 @@ def test_what_cannot_be_kept_is_named_with_its_place(state: dict[str, Any], word
 def test_bytes_that_are_no_state_are_refused(data: bytes) -> None:
     with pytest.raises(StateError, match="not an operator's state"):
         unpack_state(data)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "here", "words"),
+    [
+        ({"a": 1, "b": np.zeros(2)}, {"a": 1, "b": np.ones(2)}, "in b"),
+        (
+            {"a": 1},
+            {"a": 1, "b": 2},
+            "of another version of the operator: the recorded one lacks b and has none besides",
+        ),
+        ({}, None, "none is given now"),
+        (None, {}, "none was recorded"),
+    ],
+)
+def test_what_two_states_differ_in_is_said(recorded: Any, here: Any, words: str) -> None:
+    packed = [b"" if state is None else pack_state(state) for state in (recorded, here)]
+
+    assert differing_fields(packed[0], packed[1]) == words
