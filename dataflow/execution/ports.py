@@ -49,7 +49,8 @@ class OutputPorts:
 
     def __init__(self, node: Node, spec: OperatorSpec, emitter: Emitter, *, lossy: bool = False) -> None:
         self.node, self.emitter, self.lossy = node, emitter, lossy
-        self.states = {name: PortState(port, node.outputs[name]) for name, port in spec.outputs.items()}
+        streams = node.outputs  # a recorded graph lacks the ports that its operators have got since
+        self.states = {name: PortState(port, streams[name]) for name, port in spec.outputs.items() if name in streams}
         self.emitted = 0
         self.withheld: Counter[str] = Counter()
         """Messages that were not sent because their stamps did not increase, by port."""

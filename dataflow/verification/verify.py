@@ -22,7 +22,7 @@ from dataflow.records.reading import FiringLog
 from dataflow.records.repetition import Repetition
 from dataflow.records.window import records_from
 from dataflow.reexecution.engine import plan_feeding
-from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, processes_of
+from dataflow.reexecution.recorded_run import ReplayError, final_stamps, graph_that_is_here, processes_of
 from dataflow.supervision.core.report import OperatorCounts, Watch
 from dataflow.verification.books import Books
 from dataflow.verification.choice import (
@@ -188,6 +188,7 @@ def _prepare(
         require_records(recording, books.operators, operators)
         require_ports(recording, played, books, operators)
         plan_feeding(recording, played, operators, incomplete=incomplete)
+        final_stamps(recording, recording.streams)  # raises where an end cannot be read
         feeding = {played.streams[s].node for name in chosen for s in played.nodes[name].taken} - chosen
         sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
         stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, books, n)]

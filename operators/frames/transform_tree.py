@@ -85,6 +85,9 @@ class TransformTree(Operator, merge=True):
         self.state.asked.clear()
         return messages
 
+    def summary(self) -> Mapping[str, float | int]:
+        return {name: count for name, count in self.state.counts.items() if count}
+
     def _take_fixed(self, fixed: Mapping[str, Transforms]) -> None:
         for stream, transforms in fixed.items():
             if self._fixed.get(stream) is not transforms:

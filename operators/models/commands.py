@@ -30,7 +30,7 @@ models = typer.Typer(
 
       dataflow models list --task detection
       dataflow models get yolox_nano
-      dataflow run webcam --live --set detector=yolox_nano
+      dataflow models check
     """,
     no_args_is_help=True,
     rich_markup_mode="rich",

@@ -98,7 +98,7 @@ P = "\n    def process(self, image):\n        return None\n"
         (
             "Operator",
             "    image: In[Image]\n    def process(self, image) -> Image:\n        pass\n",
-            "X.process: returns one message, has 0 outputs (none): return a mapping",
+            "X.process: returns one message, but has 0 outputs (none): return a mapping",
         ),
         ("Source", "    image: In[Image]\n    out: Out[Image]\n", "X.image: a source has no inputs"),
         ("Source", "    gain: int = Param(1, doc='g')\n", "X.(outputs): a source needs at least one Out[...]"),

@@ -8,7 +8,18 @@ from dataclasses import dataclass
 
 from hypothesis import strategies as st
 
-from dataflow.sync import Aligner, AlignSpec, BatchSpec, Entry, Firing, SampledSpec, TriggerSpec
+from dataflow.sync import (
+    Aligner,
+    AlignSpec,
+    BatchSpec,
+    Entry,
+    Firing,
+    FiringInputs,
+    RecordedAligner,
+    SampledSpec,
+    TriggerSpec,
+    Uses,
+)
 
 Step = tuple[str, str, object]
 """(what, stream, argument) with what one of push, advance, end."""
@@ -60,7 +71,27 @@ def run(spec: AlignSpec, steps: Iterable[Step], after: Callable[[Aligner], None]
     return fired
 
 
-def poll_all(aligner: Aligner) -> list[Firing]:
+class Repeater(RecordedAligner):
+    """A recorded aligner with the records that it makes again, in order."""
+
+    def __init__(self, spec: AlignSpec, records: Iterable[FiringInputs]) -> None:
+        self._records = list(records)
+        uses = Uses()
+        for record in self._records:
+            uses.add(record.inputs)
+        super().__init__(spec, uses)
+
+    def poll(self) -> Firing | None:
+        firing = self.take(self._records[0]) if self._records else None
+        if firing is not None:
+            del self._records[0]
+        return firing
+
+    def ended(self) -> bool:
+        return not self._records
+
+
+def poll_all(aligner: Aligner | Repeater) -> list[Firing]:
     fired = []
     while (firing := aligner.poll()) is not None:
         fired.append(firing)

@@ -14,14 +14,13 @@ from dataflow.sync import (
     BatchSpec,
     Entry,
     Firing,
-    RecordedAligner,
     RunRef,
     SampledSpec,
     TriggerSpec,
     refs_of,
 )
 
-from .scenarios import HORIZON, Scenario, Step, entries, interleave, poll_all, run, scenarios, tell
+from .scenarios import HORIZON, Repeater, Scenario, Step, entries, interleave, poll_all, run, scenarios, tell
 
 A = TriggerSpec("a", ("a",))
 B = TriggerSpec("b", ("b",))
@@ -191,23 +190,16 @@ def test_firings_of_a_live_run_can_be_had_again_from_their_refs(scenario: Scenar
 
     records = [refs_of(firing) for firing in fired]
     messages = {s: [m for m in steps if m[0] == "push"] for s, steps in says.items()}
-    recorded = RecordedAligner(scenario.spec, iter(records))
-    again = poll_all_recorded(recorded)
+    recorded = Repeater(scenario.spec, iter(records))
+    again = poll_all(recorded)
     for _, stream, entry in interleave(messages, random.Random(seed + 1)):
         assert isinstance(entry, Entry)
         recorded.push(stream, entry)
-        again += poll_all_recorded(recorded)
+        again += poll_all(recorded)
     assert repr(again) == repr(fired)
     assert again == fired
     assert recorded.ended()
     assert not any(recorded.buffered().values())
-
-
-def poll_all_recorded(recorded: RecordedAligner) -> list[Firing]:
-    fired = []
-    while (firing := recorded.poll()) is not None:
-        fired.append(firing)
-    return fired
 
 
 @settings(max_examples=100, deadline=None)
@@ -244,7 +236,7 @@ def test_a_recorded_aligner_holds_only_what_a_later_record_takes() -> None:
         "x": [("push", "x", e) for e in entries("x", *range(5, 900, 10))],
     }
     fired = run(spec, interleave(says, random.Random(0)))
-    recorded = RecordedAligner(spec, [refs_of(f) for f in fired])
+    recorded = Repeater(spec, [refs_of(f) for f in fired])
 
     for step in says["x"]:
         tell(recorded, step)  # type: ignore[arg-type]
@@ -252,7 +244,7 @@ def test_a_recorded_aligner_holds_only_what_a_later_record_takes() -> None:
     for step in says["a"][: len(fired)]:
         tell(recorded, step)  # type: ignore[arg-type]
     assert recorded.buffered() == {"a": len(fired), "x": 0}
-    assert len(poll_all_recorded(recorded)) == len(fired)
+    assert len(poll_all(recorded)) == len(fired)
     assert recorded.buffered() == {"a": 0, "x": 0}
 
 
@@ -260,7 +252,7 @@ def test_a_recorded_aligner_says_which_message_it_waits_for() -> None:
     spec = AlignSpec((A,))
     says: dict[str, list[Step]] = {"a": [("push", "a", e) for e in entries("a", 1, 2)]}
     records = [refs_of(f) for f in run(spec, interleave(says, random.Random(0)))]
-    recorded = RecordedAligner(spec, records)
+    recorded = Repeater(spec, records)
     recorded.push("a", entries("a", 1, 2)[1])
     assert recorded.poll() is None
     missing = recorded.missing()

@@ -5,9 +5,9 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.sync import Aligner, AlignSpec, RecordedAligner, TriggerSpec, refs_of
+from dataflow.sync import Aligner, AlignSpec, TriggerSpec, refs_of
 
-from .scenarios import entries, poll_all
+from .scenarios import Repeater, entries, poll_all
 
 SPEC = AlignSpec((TriggerSpec("a", ("a",)),), every=10)
 
@@ -68,7 +68,7 @@ def test_stamps_increase_ticks_are_made_or_dropped_and_the_firings_can_be_had_ag
     assert fired == sorted(set(fired))
     ticks = [f.stamp for f in firings if f.tick] + [d.stamp for d in aligner.take_drops() if d.input == "@tick"]
     assert sorted(ticks) == list(range(-(-stamps[0] // 10) * 10, stamps[-1] + 1, 10))
-    again = RecordedAligner(SPEC, [refs_of(f) for f in firings])
+    again = Repeater(SPEC, [refs_of(f) for f in firings])
     for entry in entries("a", *stamps):
         again.push("a", entry)
     assert [f.stamp for f in poll_all(again)] == fired
