@@ -1,4 +1,4 @@
-"""Points of a cloud that belong to boxes in an image: smooth pieces of the view, and which of them are the object."""
+"""Points of a cloud that belong to boxes in an image: frustums, clusters, and which cluster is the object."""
 
 from __future__ import annotations
 
@@ -16,23 +16,19 @@ from scipy.spatial import cKDTree
 from operators.cloud.clustering import level_axes, upright_box
 from operators.cloud.filtering import Voxels
 from operators.scene.body_points import beyond, body_of
-from operators.scene.range_segments import range_segments
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 _FEWEST = 5  # points of a part
+_WHOLE = 0.6  # overlap from which points without a gap in range are not divided
 _MIDDLE = 0.5  # what holding all points in the middle of a box counts, beside the overlap
 _SAME = 0.5  # overlap from which two boxes are around the same thing
 _SAME_BODY = 0.2  # that overlap where most of the points are in both
 _SMALLER = 4.0  # times smaller, and a box in another is in front
 _LEFT = 0.3  # share of its points that an object keeps
-_GAIN = 0.01  # of overlap with its box by a further part of an object
-_LOSS = 0.05  # of it by a part that is on the object's mask
-_AROUND = 0.1  # of a box's sides, by which boxes are drawn too tight
-_OUTSIDE = 0.5  # what lying in the box as a whole counts, beside the overlap: what goes on is behind or below
-_CONTAINED = 0.6  # share of a piece in the box from which it may be a further part of the object
+_DENSE = 256  # so many places are compared each with each
 
 
 @dataclass(frozen=True)
@@ -44,6 +40,7 @@ class LiftSettings:
     gap: float = 0.3
     min_points: int = 8
     min_overlap: float = 0.3
+    slab: float = 0.03
     mask_share: float = 0.15
     body_share: float = 0.08
 
@@ -83,6 +80,21 @@ class Lifted:
     size: Array
 
 
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One cluster in a box: its points (indices), its bounds in the image (4,) and in space (2, 3)."""
+
+    rows: Indices
+    image: tuple[float, float, float, float]
+    bounds: Array
+
+    def joined(self, other: _Part) -> _Part:
+        (a, b, c, d), (e, f, g, h) = self.image, other.image
+        low, high = np.minimum(self.bounds[0], other.bounds[0]), np.maximum(self.bounds[1], other.bounds[1])
+        image = (min(a, e), min(b, f), max(c, g), max(d, h))
+        return _Part(np.concatenate([self.rows, other.rows]), image, np.stack([low, high]))
+
+
 def lift(
     seen: Seen,
     boxes: Array,
@@ -90,15 +102,13 @@ def lift(
     background: Sequence[int],
     s: LiftSettings,
     bodies: Collection[int] = (),
-    instances: Sequence[Mask] | None = None,
 ) -> list[Lifted]:
     """Finds the object of each image box (M, 4) among a cloud's points; boxes without one are left out.
 
-    The view is divided into smooth pieces once. Of those in a box the one whose image overlaps it best and that does
-    not go on beyond it is the object, with those near it that make the overlap better. `mask_classes` (M,) is the
-    mask's class of each box, -1 for none. Where the box holds enough of it, only such points count, wherever their
-    piece goes on; otherwise points of `background` classes do not. Points go to the box that they fit best, once.
-    `instances` (M) are masks (H, W) of the objects themselves; where they are known, their points count alone.
+    Points in a box are divided into clusters; the one whose image overlaps the box best is the object, with those near
+    it that make the overlap better. `mask_classes` (M,) is the mask's class of each box, -1 for none. Where the box
+    holds enough of it, only such points count. Otherwise points of `background` classes and on level surfaces that
+    reach beyond the box do not. Points go to the box that they fit best, once.
 
     For the boxes in `bodies` the mask counts more than the edges: the object is the connected part of its mask, also
     beyond the box, and its share of the mask in the box replaces the overlap.
@@ -109,67 +119,43 @@ def lift(
     columns, lines = seen.pixels[order, 0], seen.pixels[order, 1]
     classes = None if seen.classes is None else seen.classes[order]
     behind = None if classes is None else _among(classes, np.array(background, np.int64))
-    pieces = range_segments(seen.points, seen.pixels, seen.inside, _reach(seen.points, s))
-    whole = _counts(pieces, int(pieces.max(initial=-1)) + 1)
     for k, (left, upper, right, lower) in enumerate(boxes.tolist()):
-        wide, high = _AROUND * (right - left) + 2, _AROUND * (lower - upper) + 2
-        first, last = np.searchsorted(columns, [left - wide, right + wide], side="left")
+        ring = 0.15 * (right - left) + 2, 0.15 * (lower - upper) + 2
+        first, last = np.searchsorted(columns, [left - ring[0], right + ring[0]], side="left")
         u, v, near = columns[first:last], lines[first:last], order[first:last]
         inner = (u >= left) & (u <= right) & (v >= upper) & (v <= lower)
         if np.count_nonzero(inner) < s.min_points:
             continue
-        box, contained = (left, upper, right, lower), None
-        rows: Indices | None
-        if instances is not None:
-            rows = _on(instances[k], seen, near[inner])
-        elif (rows := _of_class(near, inner, classes, first, mask_classes[k], k in bodies, s)) is None:
+        if classes is None or behind is None:
+            around = near[~inner & (v >= upper - ring[1]) & (v <= lower + ring[1])]
+            rows = _off_support(seen, near[inner], around, s)
+        else:
+            of_class = inner & (classes[first:last] == mask_classes[k])
+            share = s.body_share if k in bodies else s.mask_share
+            masked = mask_classes[k] >= 0 and np.count_nonzero(of_class) >= max(
+                s.min_points, share * np.count_nonzero(inner)
+            )
             if k in bodies:
+                own = classes == mask_classes[k]
+                body = _body(seen, columns, lines, own, order, (left, upper, right, lower), s) if masked else None
+                candidates += [] if body is None else [(k, *body)]
                 continue
-            rows = near[inner if behind is None else inner & ~behind[first:last]]
-            around = near[(v >= upper - high) & (v <= lower + high)]
-            contained = _counts(pieces[around], len(whole)) / whole
-        elif k in bodies and classes is not None:
-            body = _body(seen, columns, lines, classes == mask_classes[k], order, box, s)
-            candidates += [] if body is None else [(k, *body)]
-            continue
-        assert rows is not None
-        found = _object(seen, np.sort(rows), pieces, contained, box, s)
+            if masked:
+                rows = near[of_class]
+            else:
+                around = near[~inner & (v >= upper - ring[1]) & (v <= lower + ring[1])]
+                rows = _off_support(seen, near[inner & ~behind[first:last]], around, s)
+        found = _object(seen, np.sort(rows), (left, upper, right, lower), s)
         if found is not None:
             candidates.append((k, *found))
-    owned, level = _divided(seen.places[:2], boxes, candidates, bodies), level_axes(seen.up)
+    owned = _divided(seen.places[:2], boxes, candidates, bodies)
+    level = level_axes(seen.up)
     kept = [
         Lifted(k, own, value, *upright_box(seen.points[own], seen.up, level))
         for (k, points, value), own in zip(candidates, owned, strict=True)
         if len(own) >= max(_FEWEST, _LEFT * len(points))  # else others have it
     ]
     return sorted(kept, key=lambda c: c.detection)
-
-
-def _on(mask: Mask, seen: Seen, rows: Indices) -> Indices:
-    """Returns those of some points that are on an object's mask (H, W)."""
-    columns, lines = seen.places[:2].take(rows, axis=1).astype(np.intp)
-    return np.asarray(rows[mask[lines, columns]])
-
-
-def _of_class(
-    near: Indices,
-    inner: Mask,
-    classes: NDArray[np.int32] | None,
-    first: int,
-    wanted: int,
-    body: bool,
-    s: LiftSettings,
-) -> Indices | None:
-    """Returns the points `near` a box that are in it and of its class in the mask; None where these are too few.
-
-    `classes` are those of all points by rising column, of which `near` begin at `first`.
-    """
-    if classes is None or wanted < 0:
-        return None
-    own = inner & (classes[first : first + len(near)] == wanted)
-    share = s.body_share if body else s.mask_share
-    enough = np.count_nonzero(own) >= max(s.min_points, share * np.count_nonzero(inner))
-    return near[own] if enough else None
 
 
 def _body(
@@ -230,85 +216,51 @@ def _divided(
     return [points[owner[points] == c] for c, (_, points, _) in enumerate(candidates)]
 
 
-def _reach(points: Array, s: LiftSettings) -> Array:
-    """Returns how near (N,) neighbours of one surface are to points (N, 3)."""
-    return np.asarray(s.reach + s.reach_growth * np.sqrt(np.einsum("ij,ij->i", points, points)))
-
-
-def _counts(pieces: NDArray[np.int32], number: int) -> NDArray[np.intp]:
-    """Returns how many points each piece has, -1 being none."""
-    return np.asarray(np.bincount(pieces[pieces >= 0], minlength=number), np.intp)
+def _off_support(seen: Seen, rows: Indices, ring: Indices, s: LiftSettings) -> Indices:
+    """Returns the points that are not on a level surface which goes on in the ring around the box."""
+    if not len(rows) or len(ring) < s.min_points:
+        return rows
+    heights, around = seen.points[rows] @ seen.up, seen.points[ring] @ seen.up
+    near = np.abs(np.linalg.norm(seen.points[ring], axis=1) - _median(np.linalg.norm(seen.points[rows], axis=1))) < 1
+    if np.count_nonzero(near) < _FEWEST:
+        return rows
+    slabs = np.floor(around[near] / s.slab).astype(np.int64)
+    level = np.flatnonzero(np.bincount(slabs - slabs.min()) >= max(_FEWEST, 0.15 * len(ring))) + slabs.min()
+    mine = np.floor(heights / s.slab).astype(np.int64)
+    kept = rows[~_among(mine, np.concatenate([level, level + 1]))] if len(level) else rows
+    return kept if len(kept) >= s.min_points else rows
 
 
 def _object(
-    seen: Seen,
-    rows: Indices,
-    pieces: NDArray[np.int32],
-    contained: Array | None,
-    box: tuple[float, float, float, float],
-    s: LiftSettings,
+    seen: Seen, rows: Indices, box: tuple[float, float, float, float], s: LiftSettings
 ) -> tuple[Indices, float] | None:
-    """Returns the points of the object in a box and the overlap of their image with it.
-
-    `rows` are those that may be of it, `contained` the share of each piece that is in the box; None where a mask shows
-    it.
-    """
-    rows = rows[pieces[rows] >= 0]
-    if not len(rows):
+    """Returns the points of the object in a box and the overlap of their image with it."""
+    if len(rows) < s.min_points:
         return None
-    rows = rows[np.argsort(pieces[rows], kind="stable")]
-    begin = np.flatnonzero(np.diff(pieces[rows], prepend=-1))
-    number, sizes = pieces[rows[begin]], np.diff(begin, append=len(rows))
-    places = seen.places.take(rows, axis=1)
-    low, high = np.minimum.reduceat(places, begin, axis=1), np.maximum.reduceat(places, begin, axis=1)
-    low[:2] -= seen.grain
-    high[:2] += seen.grain
-    whole = np.ones(len(number)) if contained is None else contained[number]
-    values = _overlaps(low[:2], high[:2], box)
-    central = np.add.reduceat(_central(places[:2], box), begin)
-    middle = _MIDDLE * central / max(int(central.sum()), _FEWEST)
-    ranks = np.where(sizes >= _FEWEST, values + middle + _OUTSIDE * whole, -1.0)
-    order = np.argsort(-ranks, kind="stable")
-    order = order[ranks[order] >= 0]
-    if not len(order):
+    points = seen.points[rows]
+    ranges = np.sort(np.sqrt(np.einsum("ij,ij->i", points, points)))
+    reach = s.reach + s.reach_growth * float(ranges[len(ranges) // 2])
+    value = _overlap(_image(seen, *seen.places[:2].take(rows, axis=1)), box)
+    if value >= _WHOLE and float(np.diff(ranges).max()) <= reach:
+        return rows, value  # nothing to divide
+    voxels = Voxels.by_size(points.astype(np.float32), reach / 2)
+    labels = _linked(voxels.means(points), reach)[voxels.of]
+    parts = [_part(seen, rows[labels == c]) for c in np.flatnonzero(np.bincount(labels) >= _FEWEST)]
+    if not parts:
         return None
-    best: tuple[float, list[int], float] = (-1.0, [], 0.0)
-    kept = order[whole[order] >= _CONTAINED]
-    for first in dict.fromkeys([int(order[0]), *kept[:1].tolist()]):
-        parts = [first, *(c for c in order.tolist() if c != first and whole[c] >= min(_CONTAINED, whole[first]))]
-        gain = _GAIN if contained is not None else -_LOSS
-        chosen, value = _joined(low, high, parts, float(values[first]), box, s.gap, gain)
-        rank = value + float(middle[chosen].sum() + _OUTSIDE * np.average(whole[chosen], weights=sizes[chosen]))
-        best = max(best, (rank, chosen, value), key=lambda each: each[0])
-    _, chosen, value = best
-    if value < s.min_overlap or sizes[chosen].sum() < s.min_points:
+    values = [_overlap(part.image, box) for part in parts]
+    central = [_central(seen, part.rows, box) for part in parts]
+    ranks = [v + _MIDDLE * n / max(sum(central), _FEWEST) for v, n in zip(values, central, strict=True)]
+    order = sorted(range(len(parts)), key=lambda c: (-ranks[c], c))
+    chosen, value = parts[order[0]], values[order[0]]
+    for c in order[1:]:
+        both = chosen.joined(parts[c])
+        better = _overlap(both.image, box)
+        if better > value + 0.01 and _apart(chosen.bounds, parts[c].bounds) <= s.gap:
+            chosen, value = both, better
+    if value < s.min_overlap or len(chosen.rows) < s.min_points:
         return None
-    return np.sort(np.concatenate([rows[begin[c] : begin[c] + sizes[c]] for c in chosen])), value
-
-
-def _joined(
-    low: Array,
-    high: Array,
-    parts: Sequence[int],
-    value: float,
-    box: tuple[float, float, float, float],
-    gap: float,
-    gain: float,
-) -> tuple[list[int], float]:
-    """Returns the first of some parts with those near it by which the overlap with the box gains, and that overlap.
-
-    The parts reach from `low` to `high` (5, N), in pixels and in space; `value` is the overlap of the first one.
-    """
-    chosen, least, most = [parts[0]], low[:, parts[0]], high[:, parts[0]]
-    for c in parts[1:]:
-        apart = np.maximum(np.maximum(least, low[:, c]) - np.minimum(most, high[:, c]), 0)[2:]
-        if float(apart @ apart) > gap * gap:
-            continue
-        both = np.minimum(least, low[:, c]), np.maximum(most, high[:, c])
-        better = _overlap((*both[0][:2], *both[1][:2]), box)
-        if better > value + gain:
-            chosen, value, least, most = [*chosen, c], better, *both
-    return chosen, value
+    return np.sort(chosen.rows), value
 
 
 def _among(values: NDArray[np.integer[Any]], chosen: NDArray[np.int64]) -> Mask:
@@ -321,25 +273,65 @@ def _among(values: NDArray[np.integer[Any]], chosen: NDArray[np.int64]) -> Mask:
     return np.asarray(table[values - low])
 
 
-def _central(pixels: Array, box: tuple[float, float, float, float]) -> NDArray[np.intp]:
-    """Returns 1 for pixels (2, N) in the inner half of a box, else 0: what shows around a thing has few there."""
-    wide = np.abs(pixels[0] - (box[0] + box[2]) / 2) <= (box[2] - box[0]) / 4
-    high = np.abs(pixels[1] - (box[1] + box[3]) / 2) <= (box[3] - box[1]) / 4
-    return np.asarray(wide & high, np.intp)
+def _median(values: Array) -> float:
+    """Returns the median of values (N,), N ≥ 1, none of them NaN: in a third of the time of `np.median` for a few."""
+    ranked, middle = np.sort(values), len(values) // 2
+    return float(ranked[middle] if len(values) % 2 else (ranked[middle - 1] + ranked[middle]) / 2)
+
+
+def _central(seen: Seen, rows: Indices, box: tuple[float, float, float, float]) -> int:
+    """Counts the points in the inner half of a box: of a thing; what shows around it has few."""
+    u, v = seen.places[:2].take(rows, axis=1)
+    wide = np.abs(u - (box[0] + box[2]) / 2) <= (box[2] - box[0]) / 4
+    return int(np.count_nonzero(wide & (np.abs(v - (box[1] + box[3]) / 2) <= (box[3] - box[1]) / 4)))
 
 
 def _linked(places: Array, reach: float) -> NDArray[np.intp]:
     """Returns the group of each place (N, 3): those within reach of each other, directly or by others, are one."""
-    pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(places), len(places)))
-    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+    count = len(places)
+    if count > _DENSE:
+        pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
+        graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
+        return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+    square = np.einsum("ij,ij->i", places, places)
+    linked = square[:, None] + square[None, :] - 2 * (places @ places.T) <= reach * reach
+    np.fill_diagonal(linked, True)
+    return _groups([int.from_bytes(row.tobytes(), "little") for row in np.packbits(linked, axis=1, bitorder="little")])
 
 
-def _overlaps(low: Array, high: Array, box: tuple[float, float, float, float]) -> Array:
-    """Returns the IoU (N,) of image boxes, from `low` to `high` (2, N), with one."""
-    corner, end = np.array(box[:2])[:, None], np.array(box[2:])[:, None]
-    shared = np.maximum(np.minimum(high, end) - np.maximum(low, corner), 0).prod(axis=0)
-    return np.asarray(shared / ((high - low).prod(axis=0) + (end - corner).prod() - shared))
+def _groups(linked: Sequence[int]) -> NDArray[np.intp]:
+    """Returns the group of each place (N,), its first place's number; bit j of `linked[i]` is set if i reaches j."""
+    group = np.empty(len(linked), np.intp)
+    left = (1 << len(linked)) - 1
+    while left:
+        first = (left & -left).bit_length() - 1
+        reached = waiting = 1 << first
+        members = []
+        while waiting:
+            place = waiting.bit_length() - 1
+            members.append(place)
+            new = linked[place] & ~reached
+            reached |= new
+            waiting = (waiting ^ (1 << place)) | new
+        group[members] = first
+        left &= ~reached
+    return group
+
+
+def _part(seen: Seen, rows: Indices) -> _Part:
+    u, v, *space = seen.places.take(rows, axis=1)
+    bounds = np.array([[values.min() for values in space], [values.max() for values in space]])
+    return _Part(rows, _image(seen, u, v), bounds)
+
+
+def _image(seen: Seen, u: Array, v: Array) -> tuple[float, float, float, float]:
+    """Returns the box around pixels, columns `u` (N,) and lines `v`, of which one in a hundred may stray."""
+    cut, g = len(u) // 100, seen.grain
+    if not cut:
+        return float(u.min()) - g, float(v.min()) - g, float(u.max()) + g, float(v.max()) + g
+    last = len(u) - 1 - cut
+    u, v = np.partition(u, (cut, last)), np.partition(v, (cut, last))
+    return float(u[cut]) - g, float(v[cut]) - g, float(u[last]) + g, float(v[last]) + g
 
 
 def _overlap(first: tuple[float, float, float, float], second: tuple[float, float, float, float]) -> float:
@@ -350,3 +342,9 @@ def _overlap(first: tuple[float, float, float, float], second: tuple[float, floa
         return 0.0
     areas = [(b[2] - b[0]) * (b[3] - b[1]) for b in (first, second)]
     return width * height / (areas[0] + areas[1] - width * height)
+
+
+def _apart(first: Array, second: Array) -> float:
+    """Returns the gap between the axis-parallel bounds (2, 3) of two groups of points."""
+    gap = np.maximum(first[0] - second[1], second[0] - first[1])
+    return float(np.linalg.norm(np.maximum(gap, 0)))

@@ -78,10 +78,7 @@ class SavedMap:
             votes = np.zeros(max(len(classes), 1))
             votes[place] = each["votes"]
             if not classes or "agent" not in labels.roles(classes[int(votes.argmax())]):
-                missed, given = each.get("answers", (0.0, []))  # not in those of earlier versions
-                answers = [missed, [[place[int(k)], row] for k, row in given]]
-                changed = {"votes": votes, "velocity": np.zeros(3), "answers": answers}
-                objects.append({**_before(each, stamp), **changed})
+                objects.append({**_before(each, stamp), "votes": votes, "velocity": np.zeros(3)})
         surfaces = [_before(each, stamp) for each in self.surfaces["surfaces"]]
         kept = {**self.objects, "objects": objects, "gone": [], "stamp": None}
         return kept, {**self.surfaces, "surfaces": surfaces}

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from operators.labels import SizePrior
 from operators.scene.cells import Cells, standing_box
 from operators.scene.cuboid import ImageView, fit_cuboid
-from operators.scene.existence import Answers
 
 Array = NDArray[np.float64]
 
@@ -44,7 +43,7 @@ class MapObject:
     `view` (2,) the horizontal directions of the views; `most` is the largest number of voxels that it had; `images` are
     the views that its box is fitted to, `form` which of the ways in which its class stands, -1 while that is open,
     `fresh` how many of them are new since the last fit; `held` whether it was last seen in a hand. `beside` counts by
-    id the views in which another object was seen too, in a separate place in the image. `answers` are the detector's.
+    id the views in which another object was seen too, in a separate place in the image.
     """
 
     id: int
@@ -67,7 +66,6 @@ class MapObject:
     beside: Counter[int] = field(default_factory=Counter)
     held: bool = False
     fresh: int = 0
-    answers: Answers = field(default_factory=Answers)
 
     def __post_init__(self) -> None:
         self.class_id = int(self.votes.argmax())
@@ -184,13 +182,7 @@ class MapObject:
         beside = sorted(self.beside.items())
         rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
         points = [np.concatenate([v.points for v in rows]), np.array([len(v.points) for v in rows])] if rows else []
-        more: dict[str, Any] = {
-            "held": self.held,
-            "fresh": self.fresh,
-            "points": points,
-            "answers": self.answers.snapshot(),
-        }
-        return plain | rest | more
+        return plain | rest | {"held": self.held, "fresh": self.fresh, "points": points}
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:
@@ -208,8 +200,6 @@ class MapObject:
             parts = np.split(np.array(state["points"][0]), np.cumsum(state["points"][1])[:-1])
             made.images = [replace(v, points=own) for v, own in zip(made.images, parts, strict=True)]
         made.fresh = int(state.get("fresh", 0))
-        if "answers" in state:  # not in those of earlier versions
-            made.answers = Answers.restored(state["answers"])
         return made
 
 

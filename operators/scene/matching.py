@@ -27,9 +27,8 @@ _SLACK = 0.02  # of the distance, by which points stray
 class MapSettings:
     """Lengths in metres, times in seconds, evidence in log odds; noise of ranges at one metre, grows by the square.
 
-    `odds` are the log odds, by its detector's answers, from which an object is given. `label` is the mean of what
-    labels of its class count, over its views, below which a small thing that moves or is carried is doubted: other
-    things are often called so, but not surely.
+    `label` is the mean of what labels of its class count, over its views, below which a small thing that moves or is
+    carried is doubted: other things are often called so, but not surely.
     """
 
     voxel: float = 0.03
@@ -38,7 +37,6 @@ class MapSettings:
     image_overlap: float = 0.3
     confirm: float = 1.25
     views: int = 3
-    odds: float = -0.7
     vacated: float = 1.0
     missed: float = 0.12
     miss_angle: float = 0.03

@@ -74,7 +74,6 @@ def merge(a: MapObject, b: MapObject, kinds: Kinds) -> MapObject:
     best.evidence = min(max(best.evidence, other.evidence), MOST_EVIDENCE)
     best.seen, best.views = max(best.seen, other.seen), best.views + other.views
     best.told += other.told
-    best.answers.take(other.answers)
     best.view = best.view + other.view
     best.beside += other.beside
     best.born, best.id = min((a.born, a.id), (b.born, b.id))

@@ -38,14 +38,11 @@ _MOST_GRAIN = 4.0  # pixels
 class ObjectLifter(Operator):
     """Finds the points of a cloud that belong to the boxes of an image and puts upright 3-D boxes around them.
 
-    The cloud may be a depth camera's or a lidar's. The view is divided into smooth pieces once: at jumps of
-    range, and where surfaces meet inwards, as a cup and its table. That piece of a box is the object whose image
-    overlaps the box best and that does not go on beyond it; the overlap is part of its score. With the masks of the
-    detections only an object's own points count, with those of the same image only points of the box's class. Boxes
-    hold what is seen of an object, not its far side.
+    The cloud may be a depth camera's or a lidar's. The points of a box's frustum are divided into clusters (DBSCAN),
+    and that one is the object whose image overlaps the box best; the overlap is part of its score. With masks of the
+    same image only points of the box's class count. Boxes hold what is seen of an object, not its far side.
 
-    Method: frustums as in Qi et al., "Frustum PointNets for 3D object detection", 2018, with pieces for the network, by
-    local convexity as in Stein et al., "Object partitioning using local convexity", 2014.
+    Method: frustums as in Qi et al., "Frustum PointNets for 3D object detection", 2018, with clusters for the network.
     """
 
     detections: In[Detections2D] = In(doc="boxes in the image of a pinhole camera without distortion")
@@ -115,11 +112,7 @@ class ObjectLifter(Operator):
             min_overlap=self.min_overlap,
         )
         boxes, bodies = detections.boxes[rows].astype(np.float64), frozenset(np.flatnonzero(body[rows]).tolist())
-        classes = [known.get(names[k], -1) for k in rows]
-        instances = (
-            None if detections.masks is None else [m for k in rows.tolist() if (m := detections.mask(k)) is not None]
-        )
-        found = lift(seen, boxes, classes, background, settings, bodies, instances)
+        found = lift(seen, boxes, [known.get(names[k], -1) for k in rows], background, settings, bodies)
         labels = np.full(cloud.count, -1, np.int32)
         for number, each in enumerate(found):
             labels[usable[each.points]] = number

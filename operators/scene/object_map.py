@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from operators.scene.carrying import carried
 from operators.scene.cells import Cells
-from operators.scene.existence import log_odds
 from operators.scene.heading import RoomHeading
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, WHOLE, MapObject
@@ -60,7 +59,6 @@ class ObjectMap:
         self._stamp: int | None = None
         self._room, self._updates = RoomHeading(), 0
         self._heading: float | None = None
-        self._odds: dict[int, float] = {}
         self.floor: float | None = None
         """Height of the floor, where it is known: what stands on it reaches down to it."""
 
@@ -89,7 +87,6 @@ class ObjectMap:
         self._note_beside(seen, [joined.get(k) for k in range(len(seen))])
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
-        self._odds = log_odds({i: (o.class_id, o.answers) for i, o in sorted(self.objects.items())})
         self._drop(stamp)
 
     @property
@@ -160,7 +157,6 @@ class ObjectMap:
         object.vote(each.class_id, each.score)
         told = min(stamp - object.seen, WHOLE)
         object.told += told
-        object.answers.add(each.class_id, each.score, since)
         gain = told / WHOLE * _log_odds(each.score, self._settings.gain)
         object.evidence = min(max(object.evidence, 0.0) + gain, MOST_EVIDENCE)
         object.seen = stamp
@@ -190,9 +186,7 @@ class ObjectMap:
             object.stand_on(self.floor, foot)
 
     def _is_sure(self, object: MapObject) -> bool:
-        s = self._settings
-        sure = object.evidence >= s.confirm and object.sightings >= s.views
-        return sure and self._odds.get(object.id, 0.0) >= s.odds
+        return object.evidence >= self._settings.confirm and object.sightings >= self._settings.views
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
@@ -202,7 +196,6 @@ class ObjectMap:
             made.color = each.color
         made.view = _direction(eye, cells)
         made.center = cells.middle
-        made.answers.add(each.class_id, each.score, WHOLE * 1e-9)
         image = each.image
         if image is not None and not self._kinds.is_mover(made):  # a single view is weaker evidence than the points
             made.look(image, cells.points)
@@ -303,7 +296,6 @@ class ObjectMap:
         self._next, self._stamp, self.moved = int(state["next"]), state["stamp"], int(state["moved"])
         objects = [MapObject.restored(row, side) for row in state["objects"]]
         self.objects = {o.id: o for o in objects}
-        self._odds = log_odds({i: (o.class_id, o.answers) for i, o in sorted(self.objects.items())})
         self.gone = {}
         for stamp, row in state["gone"]:
             old = MapObject.restored(row, side)

@@ -70,7 +70,6 @@ def look_at(
         plain = np.count_nonzero(sight.confirmed) >= _EMPTY * len(sight.looked)
         if plain and object.longest >= s.miss_angle * distance:
             object.evidence -= share * s.missed
-            object.answers.miss(seconds)
 
 
 def _is_empty(sight: Sight) -> bool:

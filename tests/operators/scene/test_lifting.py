@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from operators.scene.lifting import _divided, _linked
+from operators.scene.lifting import _DENSE, Seen, _divided, _image, _linked
 
 REACH = 0.1
 
 
-@pytest.mark.parametrize("count", [1, 2, 7, 100, 300])
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 100, _DENSE, _DENSE + 1])
 def test_places_linked_directly_or_by_others_are_one_group(count: int) -> None:
     places = np.random.default_rng(count).uniform(0, 0.5, (count, 3))
     near = np.linalg.norm(places[:, None] - places[None], axis=2) <= REACH
@@ -25,6 +25,14 @@ def test_a_chain_is_one_group_whatever_its_order() -> None:
     for seed in range(3):
         order = np.random.default_rng(seed).permutation(50)
         assert (_linked(places[order], REACH) == 0).all()
+
+
+@pytest.mark.parametrize(("count", "cut"), [(60, 0), (99, 0), (250, 2)])
+def test_one_in_a_hundred_pixels_may_stray_from_the_image_of_a_thing(count: int, cut: int) -> None:
+    u, v = np.random.default_rng(count).uniform(0, 100, (2, count))
+    seen = Seen(np.zeros((count, 3)), np.stack([u, v], axis=1), np.ones(count, bool), np.array([0, 0, 1.0]), grain=1.5)
+    low, high = np.sort(u)[[cut, -1 - cut]], np.sort(v)[[cut, -1 - cut]]
+    assert _image(seen, u, v) == (low[0] - 1.5, high[0] - 1.5, low[1] + 1.5, high[1] + 1.5)
 
 
 def test_points_in_two_boxes_go_to_the_one_whose_middle_is_nearer_by_its_sides() -> None:
