@@ -194,9 +194,8 @@ def _prepare(
         stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, books, n)]
         checks, unchecked = stored_checks(recording, played, books, [*operators, *stand_ins])
         cores = len(os.sched_getaffinity(0))
-        parts = partition.planned(
-            played, log, books, operators, held=held, jobs=jobs, cores=cores, divide=start is None
-        )
+        halves = start is None
+        parts = partition.planned(played, log, books, operators, held=held, jobs=jobs, cores=cores, divide=halves)
         begin, last = _span(recording, start)
         return _Task(
             path=path,
