@@ -95,7 +95,7 @@ class Pool(Hard):
 
 
 class Race(Hard):
-    """Takes the results of threads in the order in which they finish: of twelve, two runs hardly ever agree by chance."""
+    """Takes the results of threads in the order in which they finish, which two runs hardly ever share by chance."""
 
     def work(self, x: FeatureVector) -> list[int]:
         done: list[int] = []
