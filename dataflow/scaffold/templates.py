@@ -1,4 +1,4 @@
-"""The files as texts: `$name` and the like are filled in by `dataflow.scaffold.files`."""
+"""Holds the files as texts: `$name` and the like are filled in by `dataflow.scaffold.files`."""
 
 from __future__ import annotations
 

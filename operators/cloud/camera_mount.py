@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, Duration, In, Operator, Out, Param, Sampled
 from operators.cloud.held import accelerated, held
 from operators.cloud.vertical import Vertical, find_vertical
 from operators.geometry.extrinsics import transform_between, with_transform
@@ -21,6 +21,21 @@ Array = NDArray[np.float64]
 
 _RIVAL = 0.1  # likelihood of another direction, from which a view does not decide
 _SURE = np.radians(4.0)  # standard deviation from which it does not either
+
+
+@dataclass
+class State(Counts):
+    """Holds the best view so far and what was decided by it: T_base_camera (4, 4), None where the base was given.
+
+    `first` is the stamp since when a view is sought, `known` the digest of the extrinsics that were completed last.
+    """
+
+    done: bool = False
+    first: int | None = None
+    best: Vertical | None = None
+    T: Array | None = None
+    known: bytes = b""
+    figures: dict[str, float] = field(default_factory=dict)
 
 
 class CameraMount(Operator):
@@ -48,17 +63,7 @@ class CameraMount(Operator):
     base_frame: str = Param("base_link", min_length=1, doc="frame of the base: x ahead, z up")
     patience: Duration = Param("2s", ge=0, doc="time after which a view decides that shows little")
 
-    def setup(self) -> None:
-        self._begin()
-
-    def _begin(self) -> None:
-        self._done = False
-        self._first: int | None = None
-        self._best: Vertical | None = None
-        self._T: Array | None = None
-        self._known = b""
-        self._counts: Counter[str] = Counter()
-        self._figures: dict[str, float] = {}
+    state: State
 
     def process(
         self,
@@ -68,17 +73,17 @@ class CameraMount(Operator):
         motion: Odometry | None = None,
     ) -> dict[str, Any] | None:
         """Raises ValueError where the extrinsics do not relate the accelerometer to the cloud."""
-        if self._done:
+        if self.state.done:
             return self._again(cloud, extrinsics)
         if extrinsics is not None and self.base_frame in (*extrinsics.frames, *extrinsics.child_frames):
-            self._done, self._known = True, _digest(extrinsics)
+            self.state.done, self.state.known = True, _digest(extrinsics)
             text = f"{self.base_frame} is given"
             return {
                 "base_extrinsics": extrinsics,
                 "status": counted_status("camera_mount", cloud.stamp, text, Level.OK, {}),
             }
-        self._counts["views"] += 1
-        self._first = cloud.stamp if self._first is None else self._first
+        self.state.counts["views"] += 1
+        self.state.first = cloud.stamp if self.state.first is None else self.state.first
         expected, information = held()
         if imu is not None:
             R = transform_between(extrinsics, imu.frame, cloud.frame)[:3, :3]
@@ -86,22 +91,22 @@ class CameraMount(Operator):
         found = find_vertical(cloud.points, expected, information)
         if found is not None and motion is not None:
             found = found.before(motion.matrix())
-        if found is not None and (self._best is None or _doubt(found) < _doubt(self._best)):
-            self._best = found
-        patient = cloud.stamp - self._first < self.patience
+        if found is not None and (self.state.best is None or _doubt(found) < _doubt(self.state.best)):
+            self.state.best = found
+        patient = cloud.stamp - self.state.first < self.patience
         if patient and (found is None or _doubt(found) > 1):
             return None
-        if self._best is None:
-            self._best = Vertical(expected, np.asarray(np.linalg.inv(information), np.float64), 1.0, None)
-        self._done = True
-        return self._decided(cloud, extrinsics, self._best)
+        if self.state.best is None:
+            self.state.best = Vertical(expected, np.asarray(np.linalg.inv(information), np.float64), 1.0, None)
+        self.state.done = True
+        return self._decided(cloud, extrinsics, self.state.best)
 
     def _again(self, cloud: PointCloud, extrinsics: Transforms | None) -> dict[str, Any] | None:
         """Returns the completed extrinsics where those between the sensors have changed since."""
-        if extrinsics is None or _digest(extrinsics) == self._known:
+        if extrinsics is None or _digest(extrinsics) == self.state.known:
             return None
-        self._known = _digest(extrinsics)
-        T = self._T
+        self.state.known = _digest(extrinsics)
+        T = self.state.T
         completed = extrinsics
         if T is not None:
             completed = with_transform(extrinsics, cloud.stamp, self.base_frame, cloud.frame, T)
@@ -110,47 +115,21 @@ class CameraMount(Operator):
     def _decided(self, cloud: PointCloud, extrinsics: Transforms | None, found: Vertical) -> dict[str, Any]:
         T = _on_base(found)
         down, roll = np.degrees(np.arcsin(-found.up[2])), np.degrees(np.arctan2(found.up[0], -found.up[1]))
-        self._figures = {"looks down (°)": round(float(down), 1), "roll (°)": round(float(roll), 1)}
-        self._figures |= {"sigma (°)": round(float(np.degrees(found.sigma)), 1), "height (m)": round(T[2, 3], 3)}
+        self.state.figures = {"looks down (°)": round(float(down), 1), "roll (°)": round(float(roll), 1)}
+        self.state.figures |= {"sigma (°)": round(float(np.degrees(found.sigma)), 1), "height (m)": round(T[2, 3], 3)}
         guess = _doubt(found) > 1
         ground = "no ground in sight" if found.height is None else f"{found.height:.2f} m above the ground"
         text = f"the camera looks {down:.0f}° down, turned by {roll:.0f}°, {ground}"
         text = f"few surfaces show where up is; taken so: {text}" if guess else text
-        self._counts["guesses"] += guess
+        self.state.counts["guesses"] += guess
         made = with_transform(extrinsics, cloud.stamp, self.base_frame, cloud.frame, T)
-        self._T, self._known = T, _digest(extrinsics)
+        self.state.T, self.state.known = T, _digest(extrinsics)
         level = Level.WARN if guess else Level.OK
-        figures = {key: f"{value:g}" for key, value in self._figures.items()}
+        figures = {key: f"{value:g}" for key, value in self.state.figures.items()}
         return {"base_extrinsics": made, "status": counted_status("camera_mount", cloud.stamp, text, level, figures)}
 
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew: the camera may have been carried elsewhere."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        best = self._best
-        return {
-            "done": self._done,
-            "first": self._first,
-            "best": None if best is None else [best.up, best.covariance, best.rival, best.height],
-            "T": self._T,
-            "known": self._known,
-            "counts": dict(self._counts),
-            "figures": self._figures,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._done, self._first = bool(state["done"]), state["first"]
-        if state["best"] is not None:
-            up, covariance, rival, height = state["best"]
-            self._best = Vertical(np.array(up), np.array(covariance), float(rival), height)
-        self._T = None if state["T"] is None else np.array(state["T"], np.float64)
-        self._known = bytes(state["known"])
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-        self._figures = {key: float(value) for key, value in state["figures"].items()}
-
     def summary(self) -> Mapping[str, float | int]:
-        return {**self._counts, **self._figures}
+        return {**self.state.counts, **self.state.figures}
 
 
 def _digest(extrinsics: Transforms | None) -> bytes:

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Message, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
-from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between, with_transform
-from operators.monitoring.edge_alignment import Correction, EdgeAlignment, Shift, rims
+from operators.monitoring.edge_alignment import Array, Correction, EdgeAlignment, Shift, rims
 from operators.status import FINDING, counted_status
 
 _SHARE = 0.5  # of what is found, by which each correction changes the extrinsics
 _TRUSTED, _LEAST = 6, 2  # pairs after which a correction is made, and working pixels from which one is
 _OFTEN, _PAIRS = 0.2, 3  # share of the pairs, and fewest of them, that must not fit for a finding
+
+
+@dataclass
+class State(Counts):
+    """Holds how well edges fit, how the points are moved so that they do, (4, 4), and what was found.
+
+    `next` is the stamp from which the next pair is looked at, `since` the pairs since the last correction.
+    """
+
+    alignment: EdgeAlignment = field(default_factory=EdgeAlignment)
+    change: Array = field(default_factory=lambda: np.eye(4))
+    next: int = 0
+    since: int = 0
+    given: bool = False
+    finding: str = ""
 
 
 class ColorDepthCheck(Operator):
@@ -50,11 +64,7 @@ class ColorDepthCheck(Operator):
     period: Duration = Param("400ms", ge=0, live=True, doc="time between the pairs that are looked at")
     angle: float = Param(1.2, gt=0, live=True, doc="smallest angle that is warned of", unit="°")
 
-    def setup(self) -> None:
-        self._alignment = EdgeAlignment()
-        self._next = 0
-        self._counts: Counter[str] = Counter()
-        self._change, self._given, self._finding, self._since = np.eye(4), False, "", 0
+    state: State
 
     def process(
         self,
@@ -65,66 +75,58 @@ class ColorDepthCheck(Operator):
         extrinsics: Transforms | None = None,
     ) -> dict[str, Message] | None:
         """Raises ValueError where an image does not fit its calibration, or no transform relates the cameras."""
-        if depth.stamp < self._next:
+        if depth.stamp < self.state.next:
             return None
-        self._next = depth.stamp + self.period
+        self.state.next = depth.stamp + self.period
         check_calibration("image", image, image_info)
         check_calibration("depth", depth, depth_info)
-        T = self._change @ transform_between(extrinsics, depth.frame, image.frame)
+        T = self.state.change @ transform_between(extrinsics, depth.frame, image.frame)
         points = rims(depth.data, depth_info.K)
-        self._alignment.add(image.data, image_info.K, points @ T[:3, :3].T + T[:3, 3])
-        self._counts["pairs"] += 1
+        self.state.alignment.add(image.data, image_info.K, points @ T[:3, :3].T + T[:3, 3])
+        self.state.counts["pairs"] += 1
         out: dict[str, Message] = {"status": self._status(depth.stamp, image_info)}
-        self._since += 1
+        self.state.since += 1
         found = None
-        if self.calibrate and self._since >= _TRUSTED and any(shift.off(_LEAST) for shift in self._alignment.shifts()):
-            found = self._alignment.correction(image_info.K)
+        if (
+            self.calibrate
+            and self.state.since >= _TRUSTED
+            and any(shift.off(_LEAST) for shift in self.state.alignment.shifts())
+        ):
+            found = self.state.alignment.correction(image_info.K)
         if found is not None:
-            self._change = found.matrix(_SHARE) @ self._change
-            self._alignment, self._since = EdgeAlignment(), 0
-            self._counts["corrections"] += 1
-        if found is not None or not self._given:
-            self._given = True
-            T_depth_image = invert(self._change @ transform_between(extrinsics, depth.frame, image.frame))
+            self.state.change = found.matrix(_SHARE) @ self.state.change
+            self.state.alignment, self.state.since = EdgeAlignment(), 0
+            self.state.counts["corrections"] += 1
+        if found is not None or not self.state.given:
+            self.state.given = True
+            T_depth_image = invert(self.state.change @ transform_between(extrinsics, depth.frame, image.frame))
             out["corrected"] = with_transform(extrinsics, depth.stamp, depth.frame, image.frame, T_depth_image)
         return out
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew."""
-        self._next = 0
-
-    def snapshot(self) -> Mapping[str, Any]:
-        rest = {"change": self._change, "given": self._given, "finding": self._finding, "since": self._since}
-        return {"alignment": self._alignment.snapshot(), "next": self._next, "counts": dict(self._counts), **rest}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._alignment.restore(state["alignment"])
-        self._next = int(state["next"])
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-        self._change = np.array(state.get("change", np.eye(4)), np.float64)
-        self._given, self._finding = bool(state.get("given", False)), str(state.get("finding", ""))
-        self._since = int(state.get("since", 0))
+        self.state.next = 0
 
     def summary(self) -> Mapping[str, int | str]:
         """Returns the counts; and the finding, where a good part of the pairs did not fit."""
-        often = self._counts["off"] >= max(_PAIRS, _OFTEN * self._counts["pairs"])
-        return {**self._counts, **({FINDING: self._finding} if often else {})}
+        often = self.state.counts["off"] >= max(_PAIRS, _OFTEN * self.state.counts["pairs"])
+        return {**self.state.counts, **({FINDING: self.state.finding} if often else {})}
 
     def _status(self, stamp: int, info: CameraInfo) -> Diagnostics:
         focal = float(info.K[0, 0])
         least = max(2, round(float(np.deg2rad(self.angle)) * focal / 2))
-        shifts = self._alignment.shifts()
+        shifts = self.state.alignment.shifts()
         off = [shift for shift in shifts if shift.off(least)]
-        self._counts["off"] += bool(off)
-        found = self._alignment.correction(info.K) if off else None
+        self.state.counts["off"] += bool(off)
+        found = self.state.alignment.correction(info.K) if off else None
         text = "edges of colour and depth fit"
         if off:
-            text = self._finding = _text(off[0], focal) + ("" if found is None else _remedy(found))
+            text = self.state.finding = _text(off[0], focal) + ("" if found is None else _remedy(found))
         figures = {
             f"{shift.part} (°)": f"{_degrees(shift.x, focal):.1f} {_degrees(shift.y, focal):.1f}" for shift in shifts
         }
         level = Level.WARN if off else Level.OK
-        return counted_status("color_depth_check", stamp, text, level, {**figures, **self._counts})
+        return counted_status("color_depth_check", stamp, text, level, {**figures, **self.state.counts})
 
 
 def _degrees(pixels: int, focal: float) -> float:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from dataflow.operator import Remembered
 
 Array = NDArray[np.float64]
 Surface = NDArray[np.float32]
@@ -58,7 +58,7 @@ class Correction:
         return T
 
 
-class EdgeAlignment:
+class EdgeAlignment(Remembered):
     """Adds up, image by image and forgetting by `keep`, how well the edges fit at every shift up to `reach` pixels.
 
     The two halves of the image are kept apart: a turn about the optical axis moves them against each other. So are near
@@ -66,6 +66,10 @@ class EdgeAlignment:
     pixels are of half the resolution. A depth edge is the rim of what stands in front of something, which nearly
     always shows in the colour image; what else shows there is even over many images.
     """
+
+    _sums: Array
+    _edges: Array
+    _nearness: Array
 
     def __init__(self, reach: int = 16, keep: float = 0.9) -> None:
         self._reach, self._keep = reach, keep
@@ -123,14 +127,6 @@ class EdgeAlignment:
         best = int(np.argmax(displaced))
         metres = 1 / (focal * nearness[0])
         return Correction((float(x[best] * metres), float(y[best] * metres)), (0.0, 0.0))
-
-    def snapshot(self) -> dict[str, Any]:
-        return {"sums": self._sums, "edges": self._edges, "nearness": self._nearness}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        if np.ndim(state["sums"]) == 4:  # earlier versions kept near and far edges together: they begin anew
-            self._sums, self._edges = np.array(state["sums"], np.float64), np.array(state["edges"], np.float64)
-            self._nearness = np.array(state["nearness"], np.float64)
 
 
 def rims(depth: NDArray[np.float32], K: Array) -> Array:

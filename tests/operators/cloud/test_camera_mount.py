@@ -1,0 +1,102 @@
+"""The camera on a base that is level and on the ground, from what it sees first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_view import HEIGHT, Array, room, turned
+
+from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.messages import Imu, Odometry, PointCloud, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.testing import play
+from operators.cloud import CameraMount
+
+NOTHING = np.zeros((0, 3))
+
+
+def cloud(points: Array, stamp: int = 0) -> PointCloud:
+    return PointCloud(stamp=stamp, frame="depth", points=points.astype(np.float32))
+
+
+def test_base_is_level_on_the_ground_below_the_camera() -> None:
+    known = Transforms.from_matrix(np.eye(4), stamp=0, frame="depth", child_frame="color")
+    played = play(CameraMount(), {"cloud": [cloud(room(28, 5)), cloud(room(28, 5), 1)], "extrinsics": [known]})
+    (made,) = played["base_extrinsics"]
+    assert isinstance(made, Transforms)
+    assert made.frames == ("depth", "base_link")
+    T = made.matrix("depth")
+    assert T[:3, 3] == pytest.approx([0, 0, HEIGHT], abs=0.03)
+    assert T[:3, :3] @ turned(28, 5) @ [0, -1, 0] == pytest.approx([0, 0, 1], abs=0.02)
+    ahead = T[:3, 2]
+    assert ahead[1] == pytest.approx(0, abs=1e-9)
+    assert ahead[0] > 0.8
+    assert "looks 28° down" in played["status"][0].messages[0]  # type: ignore[attr-defined]
+
+
+def test_a_view_that_decides_later_counts_from_where_the_odometry_began() -> None:
+    first, later = turned(28, 0), turned(10, 0)
+    T = np.eye(4)
+    T[:3, :3] = first @ later.T
+    T[:3, 3] = first @ [0, -0.2, 0]  # 0.2 m higher by now
+    moved = Odometry.from_matrix(T, stamp=1, frame="odom", child_frame="depth")
+    nothing = cloud(np.zeros((0, 3)))
+    streams = {"cloud": [nothing, cloud(room(10, 0), 1)], "motion": [moved]}
+    (made,) = play(CameraMount(), streams)["base_extrinsics"]
+    assert isinstance(made, Transforms)
+    assert made.stamp == 1
+    T_base_camera = made.matrix("depth")
+    assert T_base_camera[2, 3] == pytest.approx(HEIGHT - 0.2, abs=0.03)
+    assert T_base_camera[:3, :3] @ first @ [0, -1, 0] == pytest.approx([0, 0, 1], abs=0.02)
+
+
+def test_after_a_while_without_surfaces_a_guess_is_taken_with_a_warning() -> None:
+    nothing = [cloud(np.zeros((0, 3)), stamp) for stamp in (0, 1_000_000_000, 2_000_000_000)]
+    played = play(CameraMount(patience="2s"), {"cloud": nothing})
+    assert [m.stamp for m in played["base_extrinsics"]] == [2_000_000_000]
+    assert played["status"][0].levels.tolist() == [Level.WARN]  # type: ignore[attr-defined]
+
+
+def test_a_base_that_is_given_is_kept() -> None:
+    given = Transforms.from_matrix(np.eye(4), stamp=0, frame="base_link", child_frame="depth")
+    (made,) = play(CameraMount(), {"cloud": [cloud(room(28, 5))], "extrinsics": [given]})["base_extrinsics"]
+    assert made.digest() == given.digest()
+
+
+def test_imu_of_a_frame_that_is_not_related_is_an_error() -> None:
+    sample = Imu(stamp=0, frame="imu", angular_velocity=np.zeros(3), linear_acceleration=np.array([0, 0, 9.81]))
+    known = Transforms.from_matrix(np.eye(4), stamp=0, frame="depth", child_frame="color")
+    with pytest.raises(Exception, match="no transform between 'imu' and 'depth'"):
+        play(CameraMount(), {"cloud": [cloud(room(0, 0))], "imu": [sample], "extrinsics": [known]})
+
+
+def test_equal_views_give_equal_mounts() -> None:
+    streams = {"cloud": [cloud(NOTHING), cloud(room(28, 5), 1)]}
+    assert play(CameraMount(), streams).digests() == play(CameraMount(), streams).digests()
+
+
+def test_a_restored_mount_waits_as_long_as_one_that_went_on() -> None:
+    whole, first, later = (CameraMount(patience="2s") for _ in range(3))
+    for each in (whole, first):
+        assert each.process(cloud(NOTHING)) is None
+    later.restore(unpack_state(pack_state(first.snapshot() or {})))
+    answers = [each.process(cloud(NOTHING, 2_000_000_000)) for each in (whole, later)]
+    assert answers[0] is not None
+    assert [{name: m.digest() for name, m in (a or {}).items()} for a in answers[1:]] == [
+        {name: m.digest() for name, m in answers[0].items()}
+    ]
+    restored = CameraMount()
+    restored.restore(unpack_state(pack_state(later.snapshot() or {})))
+    assert restored.process(cloud(room(28, 5), 3_000_000_000)) is None  # decided, and nothing changed since
+
+
+def test_a_clock_that_begins_anew_decides_anew() -> None:
+    mount = CameraMount()
+    before = mount.process(cloud(room(28, 0), 9))
+    mount.on_reset("cloud")
+    after = mount.process(cloud(room(10, 0), 1))
+    assert before is not None
+    assert after is not None
+    assert "looks 28° down" in before["status"].messages[0]
+    assert "looks 10° down" in after["status"].messages[0]
+    assert mount.summary()["views"] == 2
