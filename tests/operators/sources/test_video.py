@@ -68,7 +68,7 @@ def test_files_with_b_frames_give_the_frames_in_their_order(format_: str, tmp_pa
 
 def test_a_file_of_av1_is_refused_by_its_codec(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"its codec is AV01\. .* no AV1: encode it anew"):
-        VideoFile(input=str(mp4(tmp_path / "episode_000000.mp4", "libsvtav1"))).setup()
+        VideoFile(input=str(mp4(tmp_path / "episode_000000.mp4", "libaom-av1"))).setup()
 
 
 def test_part_of_a_file_at_another_rate(clip: Path) -> None:
