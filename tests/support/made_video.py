@@ -47,9 +47,8 @@ def clip(
 def mp4(path: Path, codec: str, count: int = 20) -> Path:
     """Writes a file as LeRobot does, with B-frames where the codec has them."""
     options = {"libx264": {"bf": "2"}, "libx265": {"x265-params": "bframes=2:pools=1:log-level=none"}}
-    options["libaom-av1"] = {"cpu-used": "8"}  # libsvtav1 would set the scheduling of the whole process
     with av.open(path, "w") as container:
-        stream = container.add_stream(codec, rate=25, options=options[codec])
+        stream = container.add_stream(codec, rate=25, options=options.get(codec, {"preset": "10"}))
         stream.width, stream.height, stream.pix_fmt, stream.thread_count = 96, 64, "yuv420p", 1
         for number in range(count):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pattern(number), format="rgb24")))
