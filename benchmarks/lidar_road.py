@@ -82,9 +82,13 @@ def scan(track: Array, boxes: Array, stamp: float, rng: np.random.Generator) -> 
     azimuth = np.repeat(np.linspace(-np.pi, np.pi, COLUMNS, endpoint=False), RINGS)
     elevation = np.tile(np.radians(np.linspace(-25, 10, RINGS)), COLUMNS)
     at = (stamp + offsets) * 100 + 10
-    x, y, heading = (np.interp(at, np.arange(len(track)), np.unwrap(track[:, i]) if i == 2 else track[:, i]) for i in range(3))
+    x, y, heading = (
+        np.interp(at, np.arange(len(track)), np.unwrap(track[:, i]) if i == 2 else track[:, i]) for i in range(3)
+    )
     flat = np.cos(elevation)
-    directions = np.column_stack([flat * np.cos(azimuth + heading), flat * np.sin(azimuth + heading), np.sin(elevation)])
+    directions = np.column_stack(
+        [flat * np.cos(azimuth + heading), flat * np.sin(azimuth + heading), np.sin(elevation)]
+    )
     origins = np.column_stack([x, y, np.full(len(x), 1.8)])
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.where(directions[:, 2] < 0, -origins[:, 2] / directions[:, 2], np.inf)
@@ -110,9 +114,7 @@ def road(seed: int, seconds: float) -> Drive:
     for k in range(1, int(seconds / PERIOD)):
         points, offsets = scan(track, boxes, k * PERIOD, rng)
         stamp = round(k * PERIOD * 1e9)
-        clouds.append(
-            PointCloud(stamp=stamp, frame="lidar", points=points, time_offsets=offsets.astype(np.float32))
-        )
+        clouds.append(PointCloud(stamp=stamp, frame="lidar", points=points, time_offsets=offsets.astype(np.float32)))
         x, y, heading, _ = track[round(k * PERIOD * 100) + 10]
         T = se3.exp(np.array([0, 0, 0, 0, 0, heading]))
         T[:3, 3] = x, y, 1.8
@@ -143,7 +145,11 @@ def errors(poses: Array, truth: list[Array]) -> Array:
     """Returns the error (N - 1, 2) of each step, metres and degrees; NaN where a pose is not given."""
     rows = []
     for k in range(1, len(truth)):
-        off = se3.log(invert(invert(truth[k - 1]) @ truth[k]) @ invert(poses[k - 1]) @ poses[k]) if np.isfinite(poses[k - 1 : k + 1]).all() else np.full(6, np.nan)
+        off = (
+            se3.log(invert(invert(truth[k - 1]) @ truth[k]) @ invert(poses[k - 1]) @ poses[k])
+            if np.isfinite(poses[k - 1 : k + 1]).all()
+            else np.full(6, np.nan)
+        )
         rows.append((np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:]))))
     return np.array(rows)
 
@@ -165,7 +171,9 @@ def main() -> None:
     parser.add_argument("--every", type=int, nargs="+", default=[1, 2, 3, 5, 7, 10])
     parser.add_argument("--seconds", type=float, default=20)
     options = parser.parse_args()
-    print("| road, odometry | every | scans | step, cm: median | worst | degrees | wrong | of these told | not tracking |")
+    print(
+        "| road, odometry | every | scans | step, cm: median | worst | degrees | wrong | of these told | not tracking |"
+    )
     print("| --- " * 9 + "|")
     for seed in options.roads:
         whole = road(seed, options.seconds)

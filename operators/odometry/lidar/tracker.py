@@ -27,7 +27,7 @@ _BASIN = 0.5  # metres: nearer to the truth a fit needs no search
 _FARTHEST = 30.0  # metres that a search for an unknown velocity covers
 _TURN, _LARGEST_TURN = np.radians(4.0), np.radians(24.0)  # steps and reach of headings beside the predicted one
 _START_TURN = np.radians(20.0)  # per second, of a sensor whose velocity is unknown
-_STARTS, _LOST_STARTS = 3, 5  # of which a pose is fitted
+_STARTS, _LOST_STARTS, _FAR_STARTS = 3, 5, 12  # of which a pose is fitted
 _RIVAL = 0.03  # a second place whose agreement is that near to the best one's makes the pose ambiguous
 
 
@@ -120,7 +120,8 @@ class LidarTracker:
             fits = self._second(scan, stamp, starts)
         else:
             fits = self._fitted(scan, stamp, starts)
-        reason = self._doubt(fits[0], stamp, lost) or (_elsewhere(fits) if lost else "")
+        far = lost or self._far(stamp)
+        reason = self._doubt(fits[0], stamp, lost, far) or (_elsewhere(fits) if far else "")
         if reason:
             return self._unmeasured(scan, stamp, reason)
         return self._measured(scan, stamp, fits[0], State.RELOCALISED if lost else State.TRACKING)
@@ -150,20 +151,34 @@ class LidarTracker:
         return self._result(State.LOST, reason, scan, self._motion, covariance)
 
     def _starts(self, scan: Scan, stamp: int, lost: bool) -> list[Matrix]:
-        """Returns where to look: at the predicted pose, and around it where the velocity or the place is unknown."""
+        """Returns where to look: at the predicted pose, and around it where the sensor may be far from there."""
         assert self._motion is not None
-        T, dt = self._motion.predicted(stamp, self._patience), self._motion.seconds(stamp)
-        reach, turns = _REACH, ANY_TURN
-        if not lost:
-            config, fresh = self._config, self._motion.fresh
-            reach = min(config.start_speed * dt if fresh else 0.5 * config.acceleration * dt**2, _FARTHEST)
-            turn = min(_START_TURN * dt if fresh else 0.5 * config.angular_acceleration * dt**2, _LARGEST_TURN)
+        T = self._motion.predicted(stamp, self._patience)
+        reach, turn = self._strays(stamp)
+        if lost:
+            turns, reach = ANY_TURN, _REACH
+        elif reach < _BASIN:
+            return [T]
+        else:
             turns = np.arange(-int(turn / _TURN), int(turn / _TURN) + 1) * _TURN
-            if reach < _BASIN:
-                return [T]
         best, scores = around(scan.points[scan.sample], self._map, T, reach, turns, self._config.noise)
-        wide = lost or reach > _REACH
-        return [T, *(places(best, scores, _LOST_STARTS) if wide else best[:_STARTS])]
+        if not lost and not self._far(stamp):
+            return [T, *best[:_STARTS]]
+        return [T, *places(best, scores, _LOST_STARTS if lost else _FAR_STARTS)]
+
+    def _strays(self, stamp: int) -> tuple[float, float]:
+        """Returns how far from the prediction the sensor may be, in metres and radians, as far as is searched."""
+        assert self._motion is not None
+        config, dt = self._config, self._motion.seconds(stamp)
+        if self._motion.fresh:
+            return min(config.start_speed * dt, _FARTHEST), min(_START_TURN * dt, _LARGEST_TURN)
+        turn = 0.5 * config.angular_acceleration * dt**2
+        return min(0.5 * config.acceleration * dt**2, _FARTHEST), min(turn, _LARGEST_TURN)
+
+    def _far(self, stamp: int) -> bool:
+        """Returns whether the sensor may be where a fit from the prediction is right by chance only."""
+        assert self._motion is not None
+        return self._strays(stamp)[0] > (_REACH if self._motion.fresh else _BASIN)
 
     def _fitted(self, scan: Scan, stamp: int, starts: list[Matrix]) -> list[Fit]:
         """Returns the pose that each start leads to, that of the most agreement first."""
@@ -193,12 +208,12 @@ class LidarTracker:
         self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], 0)
         return self._fitted(scan, stamp, [found.T])
 
-    def _doubt(self, found: Fit, stamp: int, lost: bool) -> str:
-        """Returns why a fit is not to be believed, or nothing."""
+    def _doubt(self, found: Fit, stamp: int, lost: bool, far: bool) -> str:
+        """Returns why a fit is not to be believed, or nothing; more is asked of one that may be `far` away."""
         assert self._motion is not None
         config = self._config
         min_known = max(config.min_known, 0.5) if lost else config.min_known
-        min_inliers = max(config.min_inliers, 0.7) if lost else config.min_inliers
+        min_inliers = max(config.min_inliers, 0.7) if far else config.min_inliers
         if found.known < min_known:
             return f"{found.known:.0%} of the scan lie in mapped places"
         if found.paired < FEWEST / 2:
