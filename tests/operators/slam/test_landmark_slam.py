@@ -305,6 +305,7 @@ def test_victoria_park_is_mapped(data_dir: Path) -> None:
             made.move(step.motion[:2], float(step.motion[2]), step.covariance)
         if step.ids:
             made.see(step.ids, np.array(step.points), np.array(step.spreads))
+            assert made.consistency.odometry_variance == 1.0, "too little motion between sightings to learn its noise"
     assert len(made.ids) == 151
     spread = np.sqrt(np.linalg.eigvalsh(made.landmark_covariances())[:, 1])
-    assert spread.max() < 5.5  # the innovations show that the odometry errs by more than the file says
+    assert spread.max() < 5.0
