@@ -59,7 +59,10 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor."""
+    """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor.
+
+    `refuted`: measurements contradict what was told of the first heading.
+    """
 
     time: int
     hypotheses: tuple[Hypothesis, ...]
@@ -67,6 +70,7 @@ class Node:
     accel: Array
     health: Mapping[str, Health] = field(default_factory=dict)
     command: Command | None = None
+    refuted: bool = False
 
 
 def plain_node(node: Node) -> dict[str, Any]:
@@ -87,6 +91,7 @@ def plain_node(node: Node) -> dict[str, Any]:
             ]
             for name, h in node.health.items()
         },
+        "refuted": node.refuted,
     }
 
 
@@ -104,7 +109,7 @@ def node_of(content: Mapping[str, Any]) -> Node:
     gyro, accel = content["readings"]
     told = content.get("command")
     command = None if told is None else Command(int(told[0]), told[1], told[2], float(told[3]))
-    return Node(int(content["time"]), hypotheses, gyro, accel, health, command)
+    return Node(int(content["time"]), hypotheses, gyro, accel, health, command, bool(content.get("refuted", False)))
 
 
 def plain_sample(sample: Sample) -> list[Any]:

@@ -34,6 +34,14 @@ def likely(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [h for h in hypotheses if h.weight >= best - _LIKELY]
 
 
+def refuted(hypotheses: Sequence[Hypothesis], before: bool) -> bool:
+    """Returns whether what was told of the first heading is refuted: by the best hypothesis, and from then on
+    (`before`) until none of the likely ones is against it.
+    """
+    best = max(hypotheses, key=lambda h: h.weight)
+    return any(h.until > 0 for h in (likely(hypotheses) if before else [best]))
+
+
 def combined(hypotheses: Sequence[Hypothesis]) -> State:
     """Returns the likeliest state, with a covariance that holds the others too."""
     best = max(hypotheses, key=lambda h: h.weight)

@@ -39,7 +39,7 @@ from operators.fusion.filter_history import (
     sample_of,
 )
 from operators.fusion.gate import Doubt, GateConfig, Health, judge, leap, threshold
-from operators.fusion.hypotheses import combined, likely, reduced, with_errors
+from operators.fusion.hypotheses import combined, likely, reduced, refuted, with_errors
 from operators.fusion.measurements import from_plain, to_plain
 from operators.fusion.sensor_errors import SensorErrors
 
@@ -109,8 +109,7 @@ class LateFilter:
     def refuted_heading(self) -> bool:
         """Returns whether what was measured contradicts what was told of the first heading, of late."""
         node = self._newest()
-        until = max(node.hypotheses, key=lambda h: h.weight).until
-        return until > 0 and node.time < until + _STANDS
+        return node.refuted and node.time < max(h.until for h in node.hypotheses) + _STANDS
 
     def feel(self, sample: Sample) -> None:
         """Takes an inertial sample, later than the last one."""
@@ -264,7 +263,7 @@ class LateFilter:
             )
         else:
             hypotheses = tuple(replace(h, state=self._coasted(h.state, seconds, gyro, node)) for h in node.hypotheses)
-        return Node(time, hypotheses, gyro, accel, node.health, node.command)
+        return replace(node, time=time, hypotheses=hypotheses, gyro=gyro, accel=accel)
 
     def _coasted(self, state: State, seconds: float, gyro: Array, node: Node) -> State:
         """Goes on at the same velocities, or those that the body was told: what is felt is gravity alone."""
@@ -317,7 +316,8 @@ class LateFilter:
                 ],
                 entry.time,
             )
-        return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after}, node.command)
+        told_wrongly = refuted(hypotheses, node.refuted)
+        return replace(node, hypotheses=hypotheses, health={**node.health, entry.sensor: after}, refuted=told_wrongly)
 
     def _found(
         self, entry: Measurement, hypotheses: Sequence[Hypothesis], node: Node
