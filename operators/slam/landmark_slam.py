@@ -199,7 +199,7 @@ class LandmarkSlam(Operator, merge=True):
             reach = self.max_speed * span * 1e-9
             if math.hypot(step[0], step[1]) > reach:
                 self._ignored["step of odometry: a jump"] += 1
-                step, covariance = np.zeros(3), np.diag([reach**2, reach**2, min(math.pi, 10.0 * span * 1e-9) ** 2])
+                step, covariance = None, np.diag([reach**2, reach**2, min(math.pi, 10.0 * span * 1e-9) ** 2])
             else:
                 covariance = self._noise(odometry, step, span * 1e-9)
         due, self._pending = self._pending, []
@@ -212,9 +212,12 @@ class LandmarkSlam(Operator, merge=True):
         self._move(step, covariance, done, 1.0)
         return bool(due)
 
-    def _move(self, step: Array, covariance: Array, begin: float, end: float) -> None:
-        """Moves along a part of a step: on an arc, at constant speed."""
+    def _move(self, step: Array | None, covariance: Array, begin: float, end: float) -> None:
+        """Moves along a part of a step: on an arc, at constant speed; a jump if there is none."""
         if end <= begin or not covariance.any():
+            return
+        if step is None:
+            self._filter.jump(covariance * (end - begin))
             return
         T = invert(_arc(step, begin)) @ _arc(step, end)
         self._filter.move(T[:2, 3], step[2] * (end - begin), covariance * (end - begin))
