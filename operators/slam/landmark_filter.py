@@ -454,14 +454,12 @@ class LandmarkFilter:
         place = np.full(len(self.ids), -1)
         place[kept] = np.arange(len(kept))
         rows = np.concatenate([np.arange(_FIRST), self._columns(kept)])
-        landmarks, P = self._landmarks[kept], self._P[np.ix_(rows, rows)]
-        together, anonymous, seen = self._together[np.ix_(kept, kept)], self._anonymous[kept], self._seen[kept]
-        times = self._times[kept]
-        count = len(kept)
-        self._hold(len(self._landmarks))
-        self._landmarks[:count], self._P[: len(rows), : len(rows)] = landmarks, P
-        self._together[:count, :count], self._anonymous[:count], self._seen[:count] = together, anonymous, seen
-        self._times[:count] = times
+        count, before = len(kept), len(self.ids)
+        self._P[: len(rows), : len(rows)] = self._P[np.ix_(rows, rows)]
+        self._together[:count, :count] = self._together[np.ix_(kept, kept)]
+        self._together[count:before, :before] = self._together[:before, count:before] = False
+        for values in (self._landmarks, self._anonymous, self._seen, self._times):
+            values[:count], values[count:before] = values[kept], 0
         if self.lost_among is not None:
             self.lost_among = int((kept < self.lost_among).sum())
         self.ids = [self.ids[k] for k in kept]
