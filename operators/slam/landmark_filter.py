@@ -200,7 +200,7 @@ class LandmarkFilter:
         B[0, 2] = 1.0
         B[1:, 2] = -_J @ self.position
         B[1, 0], B[1, 1], B[2, 0], B[2, 1] = c, -s, s, c
-        self._moved += B @ covariance @ B.T
+        self._moved = self._moved + B @ covariance @ B.T
 
     def _settle(self) -> None:
         """Takes the motion since the last sighting into the covariance of everything.
