@@ -15,7 +15,7 @@ _RECENT = 2_000_000_000
 
 
 class Alarms:
-    """Decides when a status is due: every second, and at once where a sensor gives a new alarm."""
+    """Decides when a status is due: every second, and at once where there is a new alarm."""
 
     def __init__(self) -> None:
         self._reported = -1
@@ -23,13 +23,19 @@ class Alarms:
         self._late: dict[str, tuple[int, int]] = {}
 
     def due(
-        self, stamp: int, health: Mapping[str, Health], ignored: Mapping[str, int], gates: Mapping[str, GateConfig]
+        self,
+        stamp: int,
+        health: Mapping[str, Health],
+        ignored: Mapping[str, int],
+        gates: Mapping[str, GateConfig],
+        others: Mapping[str, str],
     ) -> dict[str, str] | None:
-        """Returns the text of each sensor's alarm at a time (ns) if a status is due, which counts as given then.
+        """Returns the text of each alarm at a time (ns) if a status is due, which counts as given then.
 
-        `ignored` counts what was passed over; sensors whose gate never yields may be refused.
+        `ignored` counts what was passed over; sensors whose gate never yields may be refused; `others` are alarms
+        that are of no sensor's measurements.
         """
-        standing = self._standing(stamp, health, ignored, gates)
+        standing = {**self._standing(stamp, health, ignored, gates), **others}
         fresh = not self._raised.issuperset(standing)
         self._raised = set(standing)
         if self._reported >= 0 and stamp - self._reported < 10**9 and not fresh:
@@ -40,7 +46,7 @@ class Alarms:
     def _standing(
         self, stamp: int, health: Mapping[str, Health], ignored: Mapping[str, int], gates: Mapping[str, GateConfig]
     ) -> dict[str, str]:
-        found = {}
+        found: dict[str, str] = {}
         for name, h in health.items():
             if h.room is not None and stamp - h.room <= _RECENT:
                 found[name] = "the filter made room for it: one of them was wrong"

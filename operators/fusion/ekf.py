@@ -338,15 +338,18 @@ class EkfFusion(Operator):
     def _status(self, stamp: int) -> Diagnostics | None:
         assert self._filter is not None
         health, ignored = self._filter.health, self._ignored + self._filter.ignored
-        if (unused := self._alarms.due(stamp, health, self._filter.ignored, self._gates)) is None:
-            return None
-        unused |= {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
-        unused |= unmeasured(self._filter.estimate(stamp)[0].covariance)
+        others = {}
+        if (count := self._filter.hypotheses) > 1:
+            others["filter"] = f"{count} headings in question"
         if self._filter.refuted_heading:
-            unused["heading"] = "the first heading that was told is wrong: measurements contradict it"
+            others["heading"] = "the first heading that was told is wrong: measurements contradict it"
         if self._dropout.lasts(stamp):
-            unused["inertial sensor"] = "silent: the motion is bridged by what others see"
-        return diagnostics(stamp, health, self._filter.hypotheses, ignored, self._offsets(), unused)
+            others["inertial sensor"] = "silent: the motion is bridged by what others see"
+        if (warnings := self._alarms.due(stamp, health, self._filter.ignored, self._gates, others)) is None:
+            return None
+        warnings |= {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
+        warnings |= unmeasured(self._filter.estimate(stamp)[0].covariance)
+        return diagnostics(stamp, health, ignored, self._offsets(), warnings)
 
     def _unheard(self) -> list[tuple[str, str]]:
         return list(unheard(tuple(self.sensors), sorted(self._last.streams)).items())

@@ -49,17 +49,20 @@ Entry = Sample | Measurement | Command
 class Hypothesis:
     """One of several estimates, with the logarithm of its weight.
 
-    `until`: time (ns) until which it is kept against what was told of the first heading; 0 for one that agrees with it.
+    `against`: what was told of the first heading, which it is followed against for a time in motion.
     """
 
     weight: float
     state: State
-    until: int = 0
+    against: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor."""
+    """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor.
+
+    `refuted`: measurements contradict what was told of the first heading; `moving`: nanoseconds in motion so far.
+    """
 
     time: int
     hypotheses: tuple[Hypothesis, ...]
@@ -67,6 +70,8 @@ class Node:
     accel: Array
     health: Mapping[str, Health] = field(default_factory=dict)
     command: Command | None = None
+    refuted: bool = False
+    moving: int = 0
 
 
 def plain_node(node: Node) -> dict[str, Any]:
@@ -77,7 +82,7 @@ def plain_node(node: Node) -> dict[str, Any]:
         "readings": [node.gyro, node.accel],
         "command": None if c is None else [c.time, c.linear, c.angular, c.lag],
         "hypotheses": [
-            [h.weight, *(getattr(h.state, f.name) for f in fields(State)), h.until] for h in node.hypotheses
+            [h.weight, *(getattr(h.state, f.name) for f in fields(State)), h.against] for h in node.hypotheses
         ],
         "health": {
             name: [
@@ -87,6 +92,8 @@ def plain_node(node: Node) -> dict[str, Any]:
             ]
             for name, h in node.health.items()
         },
+        "refuted": node.refuted,
+        "moving": node.moving,
     }
 
 
@@ -94,7 +101,7 @@ def node_of(content: Mapping[str, Any]) -> Node:
     """Returns the node that `plain_node` was given."""
     size = len(fields(State))
     hypotheses = tuple(
-        Hypothesis(float(weight), State(*values[:size]), *(int(until) for until in values[size:]))
+        Hypothesis(float(weight), State(*values[:size]), *(bool(against) for against in values[size:]))
         for weight, *values in content["hypotheses"]
     )
     health = {}
@@ -104,7 +111,8 @@ def node_of(content: Mapping[str, Any]) -> Node:
     gyro, accel = content["readings"]
     told = content.get("command")
     command = None if told is None else Command(int(told[0]), told[1], told[2], float(told[3]))
-    return Node(int(content["time"]), hypotheses, gyro, accel, health, command)
+    told = bool(content.get("refuted", False)), int(content.get("moving", 0))
+    return Node(int(content["time"]), hypotheses, gyro, accel, health, command, *told)
 
 
 def plain_sample(sample: Sample) -> list[Any]:

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from operators.fusion.error_state import ROTATION, SIZE, State, difference
+from operators.fusion.error_state import ROTATION, SIZE, VELOCITY, State, difference
 from operators.fusion.filter_history import Hypothesis, Node
 
 _LIKELY = 5.0
 """Logarithm of the ratio of weights beyond which a hypothesis does not count."""
+_DOUBTED = 20_000_000_000
+"""Nanoseconds in motion for which headings are followed against the one told: nothing shows a heading at rest."""
 
 
 def with_errors(node: Node, sigmas: Sequence[float]) -> Node:
@@ -34,6 +36,14 @@ def likely(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [h for h in hypotheses if h.weight >= best - _LIKELY]
 
 
+def refuted(hypotheses: Sequence[Hypothesis], before: bool) -> bool:
+    """Returns whether what was told of the first heading is refuted: by the best hypothesis, and from then on
+    (`before`) until none of the likely ones is against it.
+    """
+    best = max(hypotheses, key=lambda h: h.weight)
+    return any(h.against for h in (likely(hypotheses) if before else [best]))
+
+
 def combined(hypotheses: Sequence[Hypothesis]) -> State:
     """Returns the likeliest state, with a covariance that holds the others too."""
     best = max(hypotheses, key=lambda h: h.weight)
@@ -49,12 +59,17 @@ def combined(hypotheses: Sequence[Hypothesis]) -> State:
     return replace(best.state, covariance=covariance)
 
 
-def reduced(hypotheses: Sequence[Hypothesis], time: int) -> tuple[Hypothesis, ...]:
-    """Drops hypotheses that have become unlikely or outlived their time (ns), and unites those that are alike."""
+def moves(state: State) -> bool:
+    """Returns whether the body moves beyond doubt."""
+    return float(state.velocity @ state.velocity) > 9.0 * float(np.trace(state.covariance[VELOCITY, VELOCITY]))
+
+
+def reduced(hypotheses: Sequence[Hypothesis], moving: int) -> tuple[Hypothesis, ...]:
+    """Drops hypotheses that have become unlikely or outlived their time in motion (ns), and unites those alike."""
     if len(hypotheses) == 1:
         return (replace(hypotheses[0], weight=0.0),)
     best = max(hypotheses, key=lambda h: h.weight)
-    hypotheses = [h for h in hypotheses if h is best or not 0 < h.until < time]
+    hypotheses = [h for h in hypotheses if h is best or not (h.against and moving > _DOUBTED)]
     ordered = sorted(hypotheses, key=lambda h: -h.weight)
     kept: list[Hypothesis] = []
     for h in ordered:

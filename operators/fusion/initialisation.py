@@ -27,8 +27,8 @@ from operators.geometry.se3 import skew
 Array = NDArray[np.float64]
 TILT = 0.1
 """Standard deviation of the first level, rad."""
-_MISTOLD, _DOUBTED = -7.0, 20_000_000_000
-"""Logarithm of the weight of a heading other than the one told, and nanoseconds for which it is followed."""
+_MISTOLD = -7.0
+"""Logarithm of the weight of a heading other than the one told."""
 
 
 @dataclass(frozen=True)
@@ -95,16 +95,16 @@ def first_node(
     around = [centre + 2 * math.pi * k / prior.headings for k in range(prior.headings)]
     even = math.pi / prior.headings
     last = samples[-1]
-    headings = [(heading, even, 0.0, 0) for heading in around]
+    headings = [(heading, even, 0.0, False) for heading in around]
     if known:  # it may have been told wrongly: the others are followed for a while too
-        headings = [(centre, prior.heading_sigma, 0.0, 0)]
+        headings = [(centre, prior.heading_sigma, 0.0, False)]
         if prior.heading_sigma < even:
-            headings += [(heading, even, _MISTOLD, last.time + _DOUBTED) for heading in around[1:]]
+            headings += [(heading, even, _MISTOLD, True) for heading in around[1:]]
     period = (samples[-1].time - samples[0].time) * 1e-9 / max(count - 1, 1)
     noise = samples[-1].noise
     down = np.array([0.0, 0.0, -gravity])
     made = []
-    for heading, spread, weight, until in headings:
+    for heading, spread, weight, against in headings:
         R = _turn(heading) @ level
         P = np.zeros((SIZE, SIZE))
         P[POSITION, POSITION] = np.eye(3) * prior.position_sigma**2
@@ -121,7 +121,7 @@ def first_node(
             rate = AngularRate(np.zeros(3), np.eye(3))
             sigma2 = noise.gyro**2 / period / count + 1e-8
             state = updated(state, *rate.innovation(state, gyro), np.eye(3) * sigma2)
-        made.append(Hypothesis(weight, state, until))
+        made.append(Hypothesis(weight, state, against))
     return Node(last.time, tuple(made), last.gyro, last.accel)
 
 

@@ -39,15 +39,15 @@ from operators.fusion.filter_history import (
     sample_of,
 )
 from operators.fusion.gate import Doubt, GateConfig, Health, judge, leap, threshold
-from operators.fusion.hypotheses import combined, likely, reduced, with_errors
+from operators.fusion.hypotheses import combined, likely, moves, reduced, refuted, with_errors
 from operators.fusion.measurements import from_plain, to_plain
 from operators.fusion.sensor_errors import SensorErrors
 
 Array = NDArray[np.float64]
 TOO_LATE = ": too late"
 """Suffix of a sensor's name in the counts of measurements that came after the window."""
-_STANDS = 40_000_000_000
-"""Nanoseconds for which a refuted first heading is reported after the others would have been dropped."""
+_STANDS = 60_000_000_000
+"""Nanoseconds in motion until which a refuted first heading is reported."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
 
@@ -109,8 +109,7 @@ class LateFilter:
     def refuted_heading(self) -> bool:
         """Returns whether what was measured contradicts what was told of the first heading, of late."""
         node = self._newest()
-        until = max(node.hypotheses, key=lambda h: h.weight).until
-        return until > 0 and node.time < until + _STANDS
+        return node.refuted and node.moving < _STANDS
 
     def feel(self, sample: Sample) -> None:
         """Takes an inertial sample, later than the last one."""
@@ -264,7 +263,8 @@ class LateFilter:
             )
         else:
             hypotheses = tuple(replace(h, state=self._coasted(h.state, seconds, gyro, node)) for h in node.hypotheses)
-        return Node(time, hypotheses, gyro, accel, node.health, node.command)
+        moving = node.moving + (time - node.time) * moves(max(hypotheses, key=lambda h: h.weight).state)
+        return replace(node, time=time, hypotheses=hypotheses, gyro=gyro, accel=accel, moving=moving)
 
     def _coasted(self, state: State, seconds: float, gyro: Array, node: Node) -> State:
         """Goes on at the same velocities, or those that the body was told: what is felt is gravity alone."""
@@ -315,9 +315,10 @@ class LateFilter:
                     replace(h, weight=h.weight - 0.5 * (nis + spread), state=updated(h.state, r, J, entry.noise))
                     for h, (r, J), (nis, spread) in zip(hypotheses, found, scores, strict=True)
                 ],
-                entry.time,
+                node.moving,
             )
-        return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after}, node.command)
+        told_wrongly = refuted(hypotheses, node.refuted)
+        return replace(node, hypotheses=hypotheses, health={**node.health, entry.sensor: after}, refuted=told_wrongly)
 
     def _found(
         self, entry: Measurement, hypotheses: Sequence[Hypothesis], node: Node

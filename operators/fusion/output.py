@@ -63,20 +63,19 @@ def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame
 def diagnostics(
     stamp: int,
     health: Mapping[str, Health],
-    hypotheses: int,
     ignored: Mapping[str, int],
     offsets: Mapping[str, tuple[float, float]],
     warnings: Mapping[str, str],
 ) -> Diagnostics:
     """Returns a status for the filter, one for every sensor, and one for every warning, a text by what it is about.
 
-    A warning with the name of a sensor stands in the sensor's row.
+    A warning with the name of a sensor, or `filter`, stands in its row.
 
     `offsets`: the estimated time offset of a sensor and its standard deviation, s. `nis` is the sum of the normalised
     innovations squared of all used measurements, and `freedom` its expectation for a consistent covariance.
     """
-    text = "one hypothesis" if hypotheses == 1 else f"{hypotheses} headings in question"
-    rows: list[Row] = [("filter", text, Level.OK if hypotheses == 1 else Level.WARN, dict(ignored))]
+    level = Level.WARN if "filter" in warnings else Level.OK
+    rows: list[Row] = [("filter", warnings.get("filter", "one hypothesis"), level, dict(ignored))]
     for name, h in sorted(health.items()):
         silent = h.last_used is None or stamp - h.last_used > 2e9
         if h.doubts and silent:
@@ -94,7 +93,7 @@ def diagnostics(
         if (found := offsets.get(name.partition(" ")[0])) is not None:
             values |= {"offset, s": f"{found[0]:.4f}", "offset sigma, s": f"{found[1]:.4f}"}
         rows.append((name, text, level, values))
-    rows += [(name, text, Level.WARN, {}) for name, text in sorted(warnings.items()) if name not in health]
+    rows += [(name, text, Level.WARN, {}) for name, text in sorted(warnings.items()) if name not in {"filter", *health}]
     return status_of_rows(stamp, rows)
 
 

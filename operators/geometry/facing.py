@@ -10,15 +10,11 @@ Array = NDArray[np.float64]
 LEANS = 0.3  # cosine from which a surface faces along a direction: the normals of a plane err by less
 
 
-def facing(normals: Array) -> Array:
-    """Returns the shares (3,) of surfaces, of unit normals (N, 3), that face along the principal axes of these."""
-    along = normals @ np.linalg.eigh(normals.T @ normals)[1]
-    return np.asarray(np.where(np.abs(along) > LEANS, along**2, 0.0).mean(axis=0), np.float64)
-
-
 def free_directions(normals: Array, share: float) -> Array:
     """Returns orthonormal directions (K, 3) along which less than a share of the surfaces faces, normals (N, 3)."""
     if not len(normals):
         return np.eye(3)
     axes = np.linalg.eigh(normals.T @ normals)[1]
-    return np.asarray(axes.T[facing(normals) < share], np.float64)
+    along = normals @ axes
+    facing = np.where(np.abs(along) > LEANS, along**2, 0.0).mean(axis=0)
+    return np.asarray(axes.T[facing < share], np.float64)

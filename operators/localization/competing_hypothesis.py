@@ -35,6 +35,8 @@ _BETTER = 5.0
 _AGAIN = 10
 """Observations after which places elsewhere are tried again."""
 _SEARCHES, _TRIED, _FOLLOWED = 3, 200, 100
+_REFUTED = 16
+"""Places that were decided against last and are not tried again, at most."""
 _NEAR = (0.1, 0.1, 0.05)
 
 
@@ -132,7 +134,7 @@ class CompetingHypothesis:
         if not apart(place, mean):
             self._other = None
         elif self._other.lead > _DECIDED:
-            self._other, self._refuted = None, np.vstack([self._refuted, place])
+            self._other, self._refuted = None, np.vstack([self._refuted, place])[-_REFUTED:]
         elif self._other.lead < -_DECIDED:
             poses = self._other.poses[systematic(normalised(self._other.logarithms), _FOLLOWED, float(rng.random()))]
             self.forget()

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from dataflow.messages import Odometry, Transforms
 from dataflow.messages.geometry import invert
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 
 
@@ -33,17 +29,16 @@ class BaseOdometry(Operator):
     base_frame: str = Param("base_link", min_length=1, doc="frame of the robot's base")
     frame: str = Param("odom_base", min_length=1, doc="name of the frame in which the base began")
 
-    def setup(self) -> None:
-        self._counts: Counter[str] = Counter()
+    state: Counts
 
     def process(self, sensor: Odometry, extrinsics: Transforms) -> Odometry | None:
         """Raises ValueError where the extrinsics do not hold the sensor."""
         T_base_sensor = transform_between(extrinsics, sensor.child_frame, self.base_frame)
         if _without_scale(sensor) and T_base_sensor[:3, 3].any():
-            self._counts["poses without scale"] += 1
+            self.state.counts["poses without scale"] += 1
             return None
         if not (np.isfinite(sensor.position).all() and np.isfinite(sensor.orientation).all()):
-            self._counts["poses not finite"] += 1
+            self.state.counts["poses not finite"] += 1
             return None
         T = T_base_sensor @ sensor.matrix() @ invert(T_base_sensor)
         return Odometry.from_matrix(
@@ -53,15 +48,6 @@ class BaseOdometry(Operator):
             child_frame=self.base_frame,
             pose_covariance=_carried(sensor, T_base_sensor, T),
         )
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, int]:
-        return dict(self._counts)
 
 
 def _without_scale(sensor: Odometry) -> bool:

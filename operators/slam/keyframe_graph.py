@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -87,7 +87,7 @@ class KeyframeGraph(Generic[V]):
         """
         before = [e for e in self.edges if e.last == number]
         after = [e for e in self.edges if e.first == number]
-        self.edges = [e for e in self.edges if number not in (e.first, e.last)]
+        self.remove({number})
         chain = [e for e in before if not e.loop]
         for one in chain[-1:]:
             for two in after:
@@ -100,7 +100,11 @@ class KeyframeGraph(Generic[V]):
                     back = turned(two)
                     T, covariance = composed(one, back)
                     self.join(one.first, back.last, T, covariance, loop=True)
-        del self.nodes[number]
+
+    def remove(self, numbers: Collection[int]) -> None:
+        """Removes nodes and all edges to them."""
+        self.nodes = {k: node for k, node in self.nodes.items() if k not in numbers}
+        self.edges = [e for e in self.edges if e.first not in numbers and e.last not in numbers]
 
 
 def turned(edge: Edge) -> Edge:

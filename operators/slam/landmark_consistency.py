@@ -14,6 +14,9 @@ from dataclasses import astuple, dataclass
 _KEPT = 0.995
 """Share of the sums that remains at each message: they are of about 200 messages."""
 _SIGNIFICANT = 3.0
+_KNOWN = 3.0
+"""Standard deviation, over what was told, up to which the odometry's variance as innovations show it counts: where
+sightings outweigh the motion, chance decides it."""
 _MOST = 100.0
 """Variance of the odometry over what was told, at most."""
 _FEW, _LOST = 2, 3
@@ -39,7 +42,8 @@ class Consistency:
     @property
     def odometry_variance(self) -> float:
         """Variance of the odometry over what was told; 1 unless it is larger beyond chance."""
-        if self.variance - _SIGNIFICANT * math.sqrt(self.spread) <= self.motion:
+        known = self.freedom > 0 and math.sqrt(2 * self.freedom) <= _KNOWN * self.motion
+        if not known or self.variance - _SIGNIFICANT * math.sqrt(self.spread) <= self.motion:
             return 1.0
         return min(_MOST, self.variance / self.motion)
 

@@ -158,8 +158,7 @@ class LandmarkFilter:
         return A @ (self._P[:3, :3] + self._moved) @ A.T
 
     def landmark_covariances(self) -> Array:
-        """Covariances (N, 2, 2) of the landmarks in the map frame."""
-        self._settle()
+        """Covariances (N, 2, 2) of the landmarks in the map frame, which motion leaves as they are."""
         at = _FIRST + 2 * np.arange(len(self.ids))
         rows = np.stack([np.zeros_like(at), at, at + 1], -1)
         A = np.zeros((len(at), 2, 3))
@@ -182,15 +181,26 @@ class LandmarkFilter:
     # Motion
 
     def move(self, forward: Array, turn: float, covariance: Array) -> None:
-        """Moves the robot by `forward` (x, y in its own frame) and `turn`, with covariance (3, 3) of (x, y, turn)."""
-        c, s = math.cos(self.heading), math.sin(self.heading)
-        self.position = self.position + np.array([c * forward[0] - s * forward[1], s * forward[0] + c * forward[1]])
-        self.heading = _wrapped(self.heading + turn)
+        """Moves the robot by `forward` (x, y in its own frame) and `turn`, with covariance (3, 3) of (x, y, turn).
+
+        Where innovations show that the odometry is noisier, the covariance counts for as much more.
+        """
+        before = self.heading
+        self.position = self.position + _rotation(before) @ forward
+        self.heading = _wrapped(before + turn)
+        self._scatter(before, self.consistency.odometry_variance * covariance)
+
+    def jump(self, covariance: Array) -> None:
+        """Takes a motion that nothing measured, with covariance (3, 3) of (x, y, turn) in the robot's frame."""
+        self._scatter(self.heading, covariance)
+
+    def _scatter(self, heading: float, covariance: Array) -> None:
+        c, s = math.cos(heading), math.sin(heading)
         B = np.zeros((3, 3))
         B[0, 2] = 1.0
         B[1:, 2] = -_J @ self.position
         B[1, 0], B[1, 1], B[2, 0], B[2, 1] = c, -s, s, c
-        self._moved += self.consistency.odometry_variance * (B @ covariance @ B.T)
+        self._moved = self._moved + B @ covariance @ B.T
 
     def _settle(self) -> None:
         """Takes the motion since the last sighting into the covariance of everything.
@@ -251,7 +261,7 @@ class LandmarkFilter:
         elif self.consistency.lost:
             self.lost_among = len(self.ids)
             self.consistency.strayed = 0
-            self.move(np.zeros(2), 0.0, np.diag(np.square(_ASTRAY)))
+            self.jump(np.diag(np.square(_ASTRAY)))
 
     def _relative(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
         """Covariances (N, 2, 2) of xi of one point less that of another, given by their first rows in the state."""
@@ -444,14 +454,12 @@ class LandmarkFilter:
         place = np.full(len(self.ids), -1)
         place[kept] = np.arange(len(kept))
         rows = np.concatenate([np.arange(_FIRST), self._columns(kept)])
-        landmarks, P = self._landmarks[kept], self._P[np.ix_(rows, rows)]
-        together, anonymous, seen = self._together[np.ix_(kept, kept)], self._anonymous[kept], self._seen[kept]
-        times = self._times[kept]
-        count = len(kept)
-        self._hold(len(self._landmarks))
-        self._landmarks[:count], self._P[: len(rows), : len(rows)] = landmarks, P
-        self._together[:count, :count], self._anonymous[:count], self._seen[:count] = together, anonymous, seen
-        self._times[:count] = times
+        count, before = len(kept), len(self.ids)
+        self._P[: len(rows), : len(rows)] = self._P[np.ix_(rows, rows)]
+        self._together[:count, :count] = self._together[np.ix_(kept, kept)]
+        self._together[count:before, :before] = self._together[:before, count:before] = False
+        for values in (self._landmarks, self._anonymous, self._seen, self._times):
+            values[:count], values[count:before] = values[kept], 0
         if self.lost_among is not None:
             self.lost_among = int((kept < self.lost_among).sum())
         self.ids = [self.ids[k] for k in kept]

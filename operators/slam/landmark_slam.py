@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +20,18 @@ from operators.slam.landmark_filter import LandmarkFilter
 from operators.status import counted_status
 
 Array = NDArray[np.float64]
+
+
+@dataclass
+class State:
+    """The filter, the last odometry, and the sightings since: stamp (ns), identities, positions and covariances."""
+
+    filter: LandmarkFilter
+    last: Odometry | None = None
+    pending: list[tuple[int, NDArray[np.int64], Array, Array]] = field(default_factory=list)
+    ignored: Counter[str] = field(default_factory=Counter)
+    reported: int = -1
+    word: str = ""
 
 
 class LandmarkSlam(Operator, merge=True):
@@ -68,15 +81,10 @@ class LandmarkSlam(Operator, merge=True):
         50.0, gt=0, doc="odometry that is faster has jumped and is not used for this step", unit="m/s"
     )
 
-    def setup(self) -> None:
-        self._begin()
+    state: State
 
-    def _begin(self) -> None:
-        self._filter = LandmarkFilter(Association(self.gate, self.new_landmark))
-        self._last: Odometry | None = None
-        self._pending: list[tuple[int, NDArray[np.int64], Array, Array]] = []
-        self._ignored: Counter[str] = Counter()
-        self._reported, self._word = -1, ""
+    def initial_state(self) -> State:
+        return State(LandmarkFilter(Association(self.gate, self.new_landmark)))
 
     def process(
         self, odometry: Odometry | None, sightings: LandmarkSightings | None, extrinsics: Transforms | None = None
@@ -84,17 +92,17 @@ class LandmarkSlam(Operator, merge=True):
         """Raises ValueError where no transform relates the sightings' frame to the robot's."""
         if odometry is not None and not self._moves(odometry):
             odometry = None
-        base = odometry or self._last
+        base = odometry or self.state.last
         if sightings is not None:
             if base is None:
-                self._ignored["before odometry"] += sightings.count
+                self.state.ignored["before odometry"] += sightings.count
             else:
                 T_base_sensor = transform_between(extrinsics, sightings.frame, base.child_frame)
-                self._pending.append((sightings.stamp, *self._planar(sightings, T_base_sensor)))
+                self.state.pending.append((sightings.stamp, *self._planar(sightings, T_base_sensor)))
         if odometry is None:
             return None
         seen = self._advance(odometry)
-        T_map_base = _matrix(self._filter.position, self._filter.heading)
+        T_map_base = _matrix(self.state.filter.position, self.state.filter.heading)
         result: dict[str, Any] = {"pose": self._pose(odometry, T_map_base)}
         if seen:
             result["correction"] = Transforms.from_matrix(
@@ -106,66 +114,38 @@ class LandmarkSlam(Operator, merge=True):
             result["landmarks"] = LandmarkSightings(
                 stamp=odometry.stamp,
                 frame=self.map_frame,
-                ids=np.array(self._filter.ids, np.int64),
-                positions=self._filter.landmarks,
-                covariances=self._filter.landmark_covariances(),
+                ids=np.array(self.state.filter.ids, np.int64),
+                positions=self.state.filter.landmarks,
+                covariances=self.state.filter.landmark_covariances(),
             )
-        word, level, text = self._filter.state
-        if self._reported < 0 or odometry.stamp - self._reported >= 10**9 or word != self._word:
-            self._reported, self._word = odometry.stamp, word
+        word, level, text = self.state.filter.state
+        if self.state.reported < 0 or odometry.stamp - self.state.reported >= 10**9 or word != self.state.word:
+            self.state.reported, self.state.word = odometry.stamp, word
             figures = {name: f"{n:.3g}" if isinstance(n, float) else n for name, n in self.summary().items()}
             result["status"] = counted_status("landmarks", odometry.stamp, text, level, figures)
         return result
 
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew: so does the map."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        last = self._last
-        return {
-            "filter": self._filter.snapshot(),
-            "last": None
-            if last is None
-            else [last.stamp, last.position, last.orientation, last.frame, last.child_frame],
-            "pending": [list(item) for item in self._pending],
-            "ignored": dict(self._ignored),
-            "reported": [self._reported, self._word],
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._filter.restore(state["filter"])
-        if state["last"] is not None:
-            stamp, position, orientation, frame, child_frame = state["last"]
-            self._last = Odometry(
-                stamp=stamp, position=position, orientation=orientation, frame=frame, child_frame=child_frame
-            )
-        self._pending = [(int(stamp), ids, p, C) for stamp, ids, p, C in state["pending"]]
-        self._ignored = Counter(state["ignored"])
-        self._reported, self._word = int(state["reported"][0]), str(state["reported"][1])
-
     def summary(self) -> Mapping[str, float | int]:
-        counts = self._filter.counts
-        ignored = {f"ignored, {reason}": number for reason, number in sorted(self._ignored.items())}
+        counts = self.state.filter.counts
+        ignored = {f"ignored, {reason}": number for reason, number in sorted(self.state.ignored.items())}
         return {
-            "landmarks": len(self._filter.ids),
+            "landmarks": len(self.state.filter.ids),
             "sightings matched": counts.matched,
             "sightings of new landmarks": counts.added,
             "ignored, ambiguous": counts.ambiguous,
             "landmarks found to be one": counts.merged,
             "landmarks dropped": counts.dropped,
-            "odometry's noise over what was told": math.sqrt(self._filter.consistency.odometry_variance),
-            "innovations squared over their expectation": self._filter.consistency.ratio,
+            "odometry's noise over what was told": math.sqrt(self.state.filter.consistency.odometry_variance),
+            "innovations squared over their expectation": self.state.filter.consistency.ratio,
         } | ignored
 
     def _moves(self, odometry: Odometry) -> bool:
         """Returns whether odometry can be used; if not, it is counted, and the next one covers both steps."""
         if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
-            self._ignored["odometry: not finite"] += 1
+            self.state.ignored["odometry: not finite"] += 1
             return False
-        if self._last is not None and odometry.stamp <= self._last.stamp:
-            self._ignored["odometry: stamp not later than the last"] += 1
+        if self.state.last is not None and odometry.stamp <= self.state.last.stamp:
+            self.state.ignored["odometry: stamp not later than the last"] += 1
             return False
         return True
 
@@ -177,18 +157,18 @@ class LandmarkSlam(Operator, merge=True):
         flat = transform_points(T_base_sensor, points)[:, :2]
         usable = np.asarray(np.isfinite(flat).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)))
         usable &= np.linalg.det(np.where(usable[:, None, None], spread, 0.0)) > 0
-        self._ignored["invalid"] += int((~usable).sum())
+        self.state.ignored["invalid"] += int((~usable).sum())
         ids = sightings.ids if self.association == "known" else np.full(sightings.count, -1)
         first = np.zeros(len(ids), bool)
         first[np.unique(ids, return_index=True)[1]] = True
         again = ~first & (ids >= 0)  # one landmark is one sighting of a message
-        self._ignored["twice in a message"] += int((usable & again).sum())
+        self.state.ignored["twice in a message"] += int((usable & again).sum())
         usable &= ~again
         return ids[usable], flat[usable], R @ spread[usable] @ R.T
 
     def _advance(self, odometry: Odometry) -> bool:
         """Moves to an odometry message, with the sightings on the way; returns whether there were any."""
-        last, self._last = self._last, odometry
+        last, self.state.last = self.state.last, odometry
         if last is None:
             step, covariance, span = np.zeros(3), np.zeros((3, 3)), 1
             begin = odometry.stamp
@@ -198,26 +178,29 @@ class LandmarkSlam(Operator, merge=True):
             step = np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
             reach = self.max_speed * span * 1e-9
             if math.hypot(step[0], step[1]) > reach:
-                self._ignored["step of odometry: a jump"] += 1
-                step, covariance = np.zeros(3), np.diag([reach**2, reach**2, min(math.pi, 10.0 * span * 1e-9) ** 2])
+                self.state.ignored["step of odometry: a jump"] += 1
+                step, covariance = None, np.diag([reach**2, reach**2, min(math.pi, 10.0 * span * 1e-9) ** 2])
             else:
                 covariance = self._noise(odometry, step, span * 1e-9)
-        due, self._pending = self._pending, []
+        due, self.state.pending = self.state.pending, []
         done = 0.0
         for stamp, ids, points, spread in due:
             share = min(1.0, max(done, (stamp - begin) / span)) if last is not None else 0.0
             self._move(step, covariance, done, share)
             done = share
-            self._filter.see(ids.tolist(), points, spread)
+            self.state.filter.see(ids.tolist(), points, spread)
         self._move(step, covariance, done, 1.0)
         return bool(due)
 
-    def _move(self, step: Array, covariance: Array, begin: float, end: float) -> None:
-        """Moves along a part of a step: on an arc, at constant speed."""
+    def _move(self, step: Array | None, covariance: Array, begin: float, end: float) -> None:
+        """Moves along a part of a step: on an arc, at constant speed; a jump if there is none."""
         if end <= begin or not covariance.any():
             return
+        if step is None:
+            self.state.filter.jump(covariance * (end - begin))
+            return
         T = invert(_arc(step, begin)) @ _arc(step, end)
-        self._filter.move(T[:2, 3], step[2] * (end - begin), covariance * (end - begin))
+        self.state.filter.move(T[:2, 3], step[2] * (end - begin), covariance * (end - begin))
 
     def _noise(self, odometry: Odometry, step: Array, seconds: float) -> Array:
         """Covariance (3, 3) of a step (x, y, heading)."""
@@ -226,7 +209,7 @@ class LandmarkSlam(Operator, merge=True):
             given = odometry.twist_covariance[np.ix_(planar, planar)]
             if np.isfinite(given).all() and (np.diag(given) >= 0).all():
                 return np.asarray(given * seconds**2)
-            self._ignored["covariance of odometry: not finite or negative"] += 1
+            self.state.ignored["covariance of odometry: not finite or negative"] += 1
         way, turned = float(np.hypot(step[0], step[1])) + 1e-6, abs(float(step[2]))
         heading = self.turn_noise**2 * way + self.spin_noise**2 * turned
         return np.diag([self.forward_noise**2 * way, self.side_noise**2 * way, heading])
@@ -234,7 +217,7 @@ class LandmarkSlam(Operator, merge=True):
     def _pose(self, odometry: Odometry, T_map_base: Array) -> Odometry:
         covariance = np.diag([0.0, 0.0, 1e-9, 1e-9, 1e-9, 0.0])
         planar = [0, 1, 5]
-        covariance[np.ix_(planar, planar)] = self._filter.pose_covariance()
+        covariance[np.ix_(planar, planar)] = self.state.filter.pose_covariance()
         return Odometry.from_matrix(
             T_map_base,
             stamp=odometry.stamp,

@@ -111,9 +111,7 @@ class PlaceGraph(Generic[V]):
     def withdraw(self, since: int) -> None:
         """Forgets the nodes from a stamp on, and what was tied by them: the odometry took back where they are."""
         gone = {k for k, node in self.nodes.items() if node.stamp >= since and k not in self.graph.fixed}
-        for k in gone:
-            del self.nodes[k]
-        self.graph.edges = [e for e in self.graph.edges if e.first not in gone and e.last not in gone]
+        self.graph.remove(gone)
         self.graph.settle()
         self.surprises = []
         self.index_views()

@@ -1,5 +1,6 @@
 """The keyframes that an odometry remembers."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -10,7 +11,7 @@ from operators.geometry.se3 import Matrix, orthonormalised
 from operators.odometry.keyframes import redundant, view_distance
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.surface import Surface
-from operators.odometry.rgbd.trial import Trial
+from operators.odometry.rgbd.trial import Trial, taken_back
 
 RECENT = 5  # newest keyframes, never forgotten
 EARLIER = 6  # keyframes back, at most, to one that reveals motion since
@@ -24,7 +25,8 @@ def drifted(a: Keyframe, b: Keyframe) -> bool:
 
 
 class LocalMap:
-    """Keyframes in order of time; those that others make up for are forgotten first.
+    """Keyframes in order of time, those of the segment that the camera is in last; those that others make up for are
+    forgotten first.
 
     After a loss a new segment begins: keyframes whose place among the older ones is unknown until one of those is
     recognised. Only keyframes of the newest segment are compared with directly.
@@ -43,6 +45,11 @@ class LocalMap:
         """The keyframes of older segments."""
         return [k for k in self.keyframes if k.segment != self.newest.segment]
 
+    @property
+    def unused_segment(self) -> int:
+        """The number of a segment that no keyframe is of."""
+        return 1 + max((k.segment for k in self.keyframes), default=-1)
+
     def add(self, keyframe: Keyframe) -> None:
         """Remembers a keyframe. Older ones keep their grids alone: the planes that frames are compared with take five
         times their memory, and are made anew of those few keyframes that are near again."""
@@ -52,9 +59,9 @@ class LocalMap:
         for older in self.keyframes[:-RECENT]:
             older.surface.let_go()
 
-    def drop_newest_segment(self) -> None:
-        """Forgets a segment that never found its place."""
-        self.keyframes = self.elsewhere
+    def drop_newest_segment(self, known: Keyframe) -> None:
+        """Forgets a segment that never found its place, for a camera that is in another one."""
+        self.keyframes = sorted(self.elsewhere, key=lambda k: k.segment == known.segment)
 
     def join(self, known: Keyframe, T_known_newest: Matrix) -> None:
         """Moves the newest segment rigidly as given by one of its motions in an older segment's world."""
@@ -72,15 +79,16 @@ class LocalMap:
             for k in self.keyframes
         ]
 
-    def part(self, trial: Trial) -> None:
-        """Makes a segment of the newest keyframes, those that rest on a place, and takes that back."""
-        segment = self.newest.segment
+    def part(self, trials: Sequence[Trial], fresh: int) -> None:
+        """Makes a segment, of a number that is unused, of the newest keyframes, those that rest on places, and takes
+        these back."""
+        segment, since = self.newest.segment, min(trial.since for trial in trials)
         self.keyframes = [
-            replace(k, T_world_camera=orthonormalised(T), covariance=covariance, sunk=np.zeros(6), segment=segment + 1)
-            if k.segment == segment and k.stamp >= trial.since
+            replace(k, T_world_camera=orthonormalised(T), covariance=covariance, sunk=np.zeros(6), segment=fresh)
+            if k.segment == segment and k.stamp >= since
             else k
             for k in self.keyframes
-            for T, covariance in [trial.taken_back(k.T_world_camera)]
+            for T, covariance in [taken_back(trials, k.stamp, k.T_world_camera, k.covariance)]
         ]
 
     def nearby(self, T_world_camera: Matrix, count: int, segment: int, reach: float = REACH) -> list[Keyframe]:

@@ -29,7 +29,7 @@ def to_plain(state: State) -> dict[str, Any]:
         "watch": fields_of(state.watch),
         "recalls": state.recalls,
         "apart_since": state.apart_since,
-        "trial": None if state.trial is None else fields_of(state.trial),
+        "trials": [fields_of(trial) for trial in state.trials],
     }
 
 
@@ -45,7 +45,7 @@ def from_plain(values: Mapping[str, Any]) -> State:
         watch=Watch(**values.get("watch", {})),
         recalls=values.get("recalls", 0),
         apart_since=values.get("apart_since"),
-        trial=None if values.get("trial") is None else Trial(**values["trial"]),
+        trials=tuple(Trial(**trial) for trial in values.get("trials", [values.get("trial")]) if trial is not None),
     )
 
 

@@ -28,7 +28,7 @@ from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.relocalizer import believed, contradicted, recognised
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
-from operators.odometry.rgbd.trial import Trial
+from operators.odometry.rgbd.trial import Trial, taken_back, with_trial
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
@@ -46,7 +46,7 @@ class State:
     watch: Watch = field(default_factory=Watch)
     recalls: int = 0  # frames that the map was searched for since the last loss
     apart_since: int | None = None  # stamp at which the newest segment began, while its place is unknown
-    trial: Trial | None = None  # of the place that was found last
+    trials: tuple[Trial, ...] = ()  # of the places that were found last
 
 
 class RgbdOdometry:
@@ -64,7 +64,7 @@ class RgbdOdometry:
         self._watch = Watch()
         self._recalls = 0
         self._apart_since: int | None = None
-        self._trial: Trial | None = None
+        self._trials: tuple[Trial, ...] = ()
 
     def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> TrackResult:
         """Returns the pose of the next frame: (H, W) or (H, W, 3) RGB uint8, (H', W') float32 metres, nanoseconds.
@@ -90,8 +90,8 @@ class RgbdOdometry:
         # 6. Decide what the pose rests on, and remember it.
         if recalled is not None:
             return self._relocalised(frame, fit if measured else None, T_predicted, *recalled)
-        if measured and self._contradicted(frame, fit):
-            return self._taken_back(frame, fit)
+        if measured and (refuted := self._contradicted(frame, fit)):
+            return self._taken_back(frame, fit, refuted)
         return self._followed(frame, fit) if measured else self._guessed(frame, fit)
 
     # -- the steps ---------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ class RgbdOdometry:
             if tracked is not None:
                 self._map.join(known, T @ invert(tracked.T_world_camera))
             else:
-                self._map.drop_newest_segment()
+                self._map.drop_newest_segment(known)
             self._apart_since = None
         self._recalls = 0
         self._motion = Motion(frame.stamp, T, np.zeros(6))
@@ -198,35 +198,35 @@ class RgbdOdometry:
         assert self._motion is not None
         spread = self._motion.spread(stamp, self.config.acceleration, self.config.angular_acceleration)
         covariance = moved_covariance(self._covariance, self._motion.T_world_camera, T_before) + spread
-        self._trial = Trial.of(since, stamp, T_before, covariance, T_found)
+        running = [trial for trial in self._trials if not trial.over(stamp)]
+        self._trials = with_trial(running, Trial.of(since, stamp, T_before, covariance, T_found))
 
-    def _contradicted(self, frame: Frame, fit: Fit) -> bool:
-        """Returns whether this view, as those just before it, contradicts the place that was found last."""
-        trial = self._trial
-        if trial is None or frame.flaws:
-            return False
-        if trial.over(frame.stamp):
-            self._trial = None
-            return False
-        segment = self._map.newest.segment
-        there = [k for k in self._map.keyframes if k.segment == segment and k.stamp < trial.since]
-        says = contradicted(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise)
-        if says is not None:
-            self._trial = trial.heard(says)
-        return self._trial is not None and self._trial.failed
+    def _contradicted(self, frame: Frame, fit: Fit) -> tuple[Trial, ...]:
+        """Returns the first place on trial that this view, as those just before, contradicts, and any found since."""
+        if frame.flaws:
+            return ()
+        segment, heard = self._map.newest.segment, []
+        for trial in self._trials:
+            if not trial.over(frame.stamp):
+                there = [k for k in self._map.keyframes if k.segment == segment and k.stamp < trial.since]
+                says = contradicted(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise)
+                heard.append(trial if says is None else trial.heard(says))
+        self._trials = tuple(heard)
+        first = next((k for k, trial in enumerate(heard) if trial.failed), len(heard))
+        return self._trials[first:]
 
-    def _taken_back(self, frame: Frame, fit: Fit) -> TrackResult:
-        """Takes back a place and all that rests on it: a new map, at the pose as it would be without it."""
-        trial = self._trial
-        assert trial is not None
-        segment = self._map.newest.segment
-        self._map.part(trial)
-        T, self._covariance = trial.taken_back(fit.T_world_camera)
+    def _taken_back(self, frame: Frame, fit: Fit, trials: tuple[Trial, ...]) -> TrackResult:
+        """Takes back places and all that rests on them: a new map, at the pose as it would be without them."""
+        segment = self._map.unused_segment
+        self._map.part(trials, segment)
+        T, self._covariance = taken_back(trials, frame.stamp, fit.T_world_camera, self._covariance)
         self._motion = Motion(frame.stamp, T, np.zeros(6))
-        self._map.add(replace(self._keyframe(frame, None), segment=segment + 1))
-        self._apart_since, self._recalls, self._trial = frame.stamp, 0, None
-        reason = f"{trial.against} views contradict the place that was found: taken back"
-        return replace(self._result(Status.LOST, reason, fit, keyframe=True), taken_back=trial.since)
+        self._map.add(replace(self._keyframe(frame, None), segment=segment))
+        self._apart_since, self._recalls = frame.stamp, 0
+        self._trials = self._trials[: -len(trials)]
+        reason = f"{trials[0].against} views contradict the place that was found: taken back"
+        since = min(trial.since for trial in trials)
+        return replace(self._result(Status.LOST, reason, fit, keyframe=True), taken_back=since)
 
     def _guessed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Goes on by the motion so far, and begins a new map where the old one stays out of sight."""
@@ -243,7 +243,7 @@ class RgbdOdometry:
         if frame.image_flaw is None:
             fresh = self._keyframe(frame, None)
             if len(fresh.points) >= 2 * config.min_inliers:
-                self._map.add(replace(fresh, segment=self._map.newest.segment + 1))
+                self._map.add(replace(fresh, segment=self._map.unused_segment))
                 self._apart_since = frame.stamp
                 self._motion = Motion(frame.stamp, T, np.zeros(6))
                 return self._result(Status.LOST, "nothing here is in the map: a new one begins", fit, keyframe=True)
@@ -321,14 +321,14 @@ class RgbdOdometry:
         """Returns all that the next result depends on, as immutable values of plain arrays; it pickles."""
         return State(
             self._motion, self._covariance, tuple(self._map.keyframes), self._shapes,
-            self._noise, self._watch, self._recalls, self._apart_since, self._trial,
+            self._noise, self._watch, self._recalls, self._apart_since, self._trials,
         )  # fmt: skip
 
     def restore(self, state: State) -> None:
         """Goes on from a snapshot of an odometry with the same camera and configuration."""
         self._motion, self._covariance, self._shapes = state.motion, state.covariance, state.shapes
         self._noise, self._watch = state.noise, state.watch
-        self._recalls, self._apart_since, self._trial = state.recalls, state.apart_since, state.trial
+        self._recalls, self._apart_since, self._trials = state.recalls, state.apart_since, state.trials
         self._map.keyframes = list(state.keyframes)
 
     def _placed(self, status: Status, reason: str, fit: Fit, keyframe: bool) -> TrackResult:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dataflow.messages.geometry import invert
+from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.tracking import moved_covariance
 
 SECONDS = 10.0  # that a trial lasts
 CONTRADICTIONS = 5  # views, one after the other, of which most lies elsewhere than the map has it
+MOST = 4  # places on trial at a time
+SAME = 0.3  # metres and radians, by which a find does not move a camera whose place is on trial already
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,3 +55,20 @@ class Trial:
         """Returns a pose that rests on the place, and its covariance (6, 6), as they would be without it."""
         T = np.asarray(self.T_back @ T_world_camera, np.float64)
         return T, moved_covariance(self.covariance, self.T_before, T)
+
+
+def with_trial(trials: Sequence[Trial], fresh: Trial) -> tuple[Trial, ...]:
+    """Adds a trial to those that run, in the order of finds, unless it moves nothing; the last of `MOST` makes room."""
+    apart = se3.log(invert(fresh.T_before) @ fresh.T_back @ fresh.T_before)
+    still = np.linalg.norm(apart[:3]) < SAME and np.linalg.norm(apart[3:]) < SAME
+    return tuple(trials) if trials and still else (*trials[: MOST - 1], fresh)
+
+
+def taken_back(
+    trials: Sequence[Trial], stamp: int, T_world_camera: Matrix, covariance: Matrix
+) -> tuple[Matrix, Matrix]:
+    """Returns a pose of a stamp and its covariance (6, 6) without any place that it rests on, the last find first."""
+    for trial in reversed(trials):
+        if stamp >= trial.since:
+            T_world_camera, covariance = trial.taken_back(T_world_camera)
+    return T_world_camera, covariance

@@ -13,7 +13,7 @@ RECENT = 5  # newest keyframes, never forgotten
 
 @dataclass(frozen=True, eq=False)
 class StereoMap:
-    """Keyframes in order of time, and what is known of the place of the newest among them.
+    """Keyframes in order of time, those of the segment that the camera is in last, and what is known of their place.
 
     After a loss a new segment begins: keyframes whose place among the older ones is unknown until one of those is
     recognised.
@@ -28,6 +28,11 @@ class StereoMap:
     def segment(self) -> int:
         """The number of the newest segment."""
         return self.keyframes[-1].segment if self.keyframes else 0
+
+    @property
+    def unused_segment(self) -> int:
+        """The number of a segment that no keyframe is of."""
+        return 1 + max((k.segment for k in self.keyframes), default=-1)
 
     @property
     def elsewhere(self) -> list[StereoKeyframe]:
@@ -56,7 +61,8 @@ class StereoMap:
         if known.segment == self.segment:
             return replace(self, recalls=0)
         kept = [k if k.segment != self.segment else _moved(k, known, T_known_newest) for k in self.keyframes]
-        return replace(self, keyframes=tuple(k for k in kept if k is not None), apart_since=None, recalls=0)
+        left = sorted((k for k in kept if k is not None), key=lambda k: k.segment == known.segment)
+        return replace(self, keyframes=tuple(left), apart_since=None, recalls=0)
 
 
 def _moved(keyframe: StereoKeyframe, known: StereoKeyframe, T_known_newest: Matrix | None) -> StereoKeyframe | None:

@@ -195,7 +195,8 @@ class StereoOdometry:
         """Keeps a pair at its pose; the first since a new map began begins its segment."""
         known = self._state.map
         begins = known.apart_since == pair.stamp
-        keyframe = self._view(pair, self._state.poses[-1], known.segment + int(begins))
+        segment = known.unused_segment if begins else known.segment
+        keyframe = self._view(pair, self._state.poses[-1], segment)
         self._state = replace(self._state, map=known.with_keyframe(keyframe, self.config.keyframes))
 
     def _believed(self, pair: StereoPair, T_world_camera: Matrix) -> bool:

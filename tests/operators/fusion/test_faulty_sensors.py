@@ -262,24 +262,39 @@ def test_snapshots_from_before_there_were_alarms_restore() -> None:
     assert other.summary() == operator.summary()
 
 
-@pytest.mark.parametrize("wrong", [0.5, -2.0])
-def test_a_first_heading_told_wrongly_is_found_out_and_reported(wrong: float) -> None:
-    drive = Drive(12.0)
+def heading_of(drive: Drive, wrong: float) -> Array:
+    """Returns of each pose its time (s), error and claimed deviation of the heading (rad), and if a warning stood."""
     operator = EkfFusion(patience=0.5, heading=drive.heading + wrong, heading_sigma=0.05)
     operator.setup()
-    texts, off = set(), []
+    rows, warned = [], False
     for now, name, message in sorted(drive.imu + drive.fixes(), key=lambda e: e[:2]):
         made = operator.process({f"ns/robot/{name}": message}, Context(now)) or {}
         if (status := made.get("status")) is not None:
-            texts |= {(n, level) for n, level in zip(status.names, status.levels, strict=True)}
+            levels = dict(zip(status.names, status.levels, strict=True))
+            warned = Level.WARN in (levels["filter"], levels.get("heading"))
         if (pose := made.get("odometry")) is not None:
-            yaw = 0.9 * np.sin(0.7 * (now - 10**9) * 1e-9)
-            turned = abs((float(yaw_of(pose.orientation)) - yaw + np.pi) % (2 * np.pi) - np.pi)
-            off.append((turned, np.sqrt(pose.pose_covariance[5, 5])))
-    assert ("heading", Level.WARN) in texts
-    errors, claimed = np.array(off[-600:]).T
-    assert (errors <= 3 * claimed).mean() > 0.9, "and while it is not, the warning stands"
-    assert errors.mean() < 0.3
+            time = (now - 10**9) * 1e-9
+            turned = (float(yaw_of(pose.orientation)) - 0.9 * np.sin(0.7 * time) + np.pi) % (2 * np.pi) - np.pi
+            rows.append((time, abs(turned), np.sqrt(pose.pose_covariance[5, 5]), warned))
+    return np.array(rows)
+
+
+ABSORBED = pytest.mark.xfail(
+    strict=True,
+    reason="the accelerometer's bias explains it at first: warned after 6 s, 55 % within or warned",
+)
+
+
+@pytest.mark.parametrize("wrong", [0.5, pytest.param(-0.5, marks=ABSORBED), 1.0, -2.0, 3.1])
+def test_a_first_heading_told_wrongly_is_warned_of_within_a_second_and_while_it_is_wrong(wrong: float) -> None:
+    told = []
+    for seed in range(3):
+        time, errors, claimed, warned = heading_of(Drive(12.0, seed), wrong).T
+        late = time >= time[0] + 1.0
+        told.append(((errors <= 3 * claimed) | (warned > 0))[late])
+        assert warned[~late].any()
+        assert errors[-600:].mean() < 0.3
+    assert np.concatenate(told).mean() >= 0.95
 
 
 def test_a_first_heading_told_rightly_raises_no_doubt_and_costs_no_confidence() -> None:

@@ -11,6 +11,7 @@ from made_motion import Motion
 from operators.fusion.error_state import Noise
 from operators.fusion.filter_history import Measurement, Sample
 from operators.fusion.gate import GateConfig
+from operators.fusion.hypotheses import reduced
 from operators.fusion.initialisation import Prior, first_node
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.measurements import Position
@@ -181,6 +182,30 @@ def test_without_inertial_sensor_the_velocity_stays() -> None:
     at, _ = filter.estimate(50 * 10**8)
     np.testing.assert_allclose(at.position, [5.0, -2.5, 0.0], atol=0.1)
     np.testing.assert_allclose(at.velocity, [1.0, -0.5, 0.0], atol=0.05)
+
+
+def test_headings_against_the_one_told_are_followed_for_a_time_in_motion_and_not_at_rest() -> None:
+    rng, still = np.random.default_rng(0), np.array([0.0, 0.0, 9.80665])
+    samples = [
+        Sample(ns(0.05 * k), 4e-3 * rng.standard_normal(3), still + 0.05 * rng.standard_normal(3), NOISE)
+        for k in range(600)
+    ]
+    node = first_node(samples[:20], Prior(heading=0.0, heading_sigma=0.05), 9.80665, at_rest=True)
+    filter = LateFilter(FilterConfig(), node)
+    for k in range(20, 600):
+        filter.feel(samples[k])
+        if k % 20 == 0:
+            place = Position(0.03 * rng.standard_normal(3), np.zeros(3))
+            filter.measure(Measurement(samples[k].time, "fix", place, np.eye(3) * 0.03**2))
+    resting = filter._newest()
+    assert resting.moving < ns(1.0)
+    assert sum(h.against for h in resting.hypotheses) == 11
+    assert not any(h.against for h in reduced(resting.hypotheses, ns(21.0)))
+
+    made = Made()
+    moving = made.filter()
+    made.fed(moving, made.fixes)
+    assert moving._newest().moving > ns(3.0)
 
 
 @pytest.mark.parametrize("heading", [0.0, None])

@@ -134,6 +134,29 @@ def test_a_decided_pose_is_in_question_again_where_another_place_explains_more(
         np.testing.assert_allclose(better[:, :2].mean(axis=0), TwoPlaces.there[:2], atol=0.2)
 
 
+class EverNewPlaces(TwoPlaces):
+    """An observation that explains a new place at every search, a little worse than the pose."""
+
+    searches = 0
+
+    def propose(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        self.searches += 1
+        return np.tile([5.0 * self.searches, 0.0, 0.0], (count, 1))
+
+    def score(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(len(poses), -4.0), np.full(len(poses), 0.5)
+
+
+def test_places_that_were_decided_against_are_remembered_in_bounded_number() -> None:
+    competing, rng, observation = CompetingHypothesis(), np.random.default_rng(0), EverNewPlaces(0.0)
+    for _ in range(150):
+        competing.update(TwoPlaces.here, 0.0, observation, 1.0, False, rng)
+    refuted = competing.snapshot()["refuted"]
+    assert observation.searches > 30
+    assert len(refuted) <= 16
+    assert refuted[-1, 0] > 5.0 * (observation.searches - 3), "the last ones"
+
+
 def test_places_are_apart_by_way_or_turn() -> None:
     here = np.array([1.0, 2.0, 3.1])
     assert not apart(here, np.array([1.3, 2.3, -3.1]))

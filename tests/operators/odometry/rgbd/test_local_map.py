@@ -9,6 +9,7 @@ import numpy as np
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import DRIFTED, RECENT, LocalMap
 from operators.odometry.rgbd.surface import Surface
+from operators.odometry.rgbd.trial import Trial
 
 K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 59.5], [0.0, 0.0, 1.0]])
 
@@ -90,3 +91,26 @@ def test_what_moves_is_not_told_by_a_keyframe_that_the_odometry_has_drifted_from
         known.add(keyframe(number))
 
     assert [k.stamp for k in known.earlier(keyframe(0).T_world_camera, 0)] == [1]
+
+
+def of_segments(*segments: int) -> LocalMap:
+    known = LocalMap(20)
+    for number, segment in enumerate(segments):
+        known.add(replace(keyframe(number), segment=segment))
+    return known
+
+
+def test_a_new_segment_has_a_number_that_no_other_has() -> None:
+    """The third part was joined to the first; the place of the second is still unknown."""
+    known = of_segments(0, 1, 2)
+    known.join(known.keyframes[0], np.eye(4))
+    assert [k.segment for k in known.keyframes] == [0, 1, 0]
+    trial = Trial.of(2, 2, np.eye(4), np.zeros((6, 6)), np.eye(4))
+    known.part([trial], known.unused_segment)
+    assert [k.segment for k in known.keyframes] == [0, 1, 2]
+
+
+def test_a_camera_found_elsewhere_goes_on_in_the_segment_that_it_was_found_in() -> None:
+    known = of_segments(0, 1, 2)
+    known.drop_newest_segment(known.keyframes[0])
+    assert [k.segment for k in known.keyframes] == [1, 0]

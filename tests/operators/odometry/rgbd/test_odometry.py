@@ -30,7 +30,7 @@ from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import Surface
 from operators.odometry.rgbd.tracker import RgbdOdometry, State
-from operators.odometry.rgbd.trial import Trial
+from operators.odometry.rgbd.trial import Trial, with_trial
 from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
 
 SIZE = (320, 240)
@@ -364,7 +364,7 @@ def at_a_wrong_place(state: State, since: int, T_wrong: NDArray[np.float64]) -> 
     ]
     wrong = replace(state.motion, T_world_camera=T_wrong @ T)
     trial = Trial.of(since, state.motion.stamp, T, 1e-2 * np.eye(6), T_wrong @ T)
-    return replace(state, motion=wrong, keyframes=tuple(keyframes), trial=trial)
+    return replace(state, motion=wrong, keyframes=tuple(keyframes), trials=with_trial(state.trials, trial))
 
 
 def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
@@ -382,6 +382,30 @@ def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
     assert (taken_back.status, taken_back.taken_back) == (Status.LOST, since)
     assert Status.RELOCALISED in [r.status for r in results]
     assert errors(results[-5:], poses[-5:])[0] < 0.03
+
+
+def test_a_wrong_place_is_taken_back_with_another_that_was_found_meanwhile() -> None:
+    frames, poses = sequence(60, 1.5)
+    stamps = [int(i * 1e9 / 30) for i in range(len(frames))]
+    odometry = RgbdOdometry(camera())
+    for i in range(17):
+        odometry.track(*frames[i], stamps[i])
+    first, second = (k.stamp for k in odometry.snapshot().keyframes[-2:])
+    state = at_a_wrong_place(odometry.snapshot(), first, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0])))
+    odometry.restore(at_a_wrong_place(state, second, se3.exp(np.array([0.4, -0.4, 0.3, 0, 0, 0.3]))))
+    results = [odometry.track(*frames[i], stamps[i]) for i in range(17, 60)]
+    taken_back = next(k for k, result in enumerate(results) if result.taken_back is not None)
+    assert results[taken_back].taken_back == first
+    assert np.linalg.norm((results[taken_back].T_world_camera - poses[17 + taken_back])[:3, 3]) < 0.05
+    assert errors(results[-5:], poses[-5:])[0] < 0.03
+
+
+def test_a_find_that_moves_nothing_leaves_the_place_that_is_on_trial() -> None:
+    there = se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 1.0]))
+    running = with_trial((), Trial.of(0, 0, np.eye(4), np.eye(6), there))
+    near, far = se3.exp(np.array([0.1, 0, 0, 0, 0, 0])), se3.exp(np.array([0, 0, 0, 0, 3.0, 0]))
+    assert with_trial(running, Trial.of(1, 1, there, np.eye(6), there @ near)) == running
+    assert len(with_trial(running, Trial.of(1, 1, there, np.eye(6), there @ far))) == 2
 
 
 def test_a_right_place_is_not_taken_back() -> None:

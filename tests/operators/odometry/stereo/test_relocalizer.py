@@ -149,6 +149,15 @@ def test_no_more_pairs_are_kept_than_asked_for_and_the_first_and_newest_stay() -
     assert stamps[-5:] == [15, 16, 17, 18, 19]
 
 
+def test_a_segment_is_numbered_anew_and_one_that_was_found_again_is_gone_on_with() -> None:
+    """The place of the second is unknown while the camera is found in the first."""
+    known = StereoMap(tuple(kept(np.eye(4), number, segment=number) for number in range(3)))
+    joined = known.placed(known.keyframes[0], np.eye(4))
+    assert [k.segment for k in joined.keyframes] == [1, 0, 0]
+    assert joined.unused_segment == 2
+    assert known.placed(known.keyframes[0], None).segment == 0
+
+
 def test_a_pose_elsewhere_than_shape_and_brightness_say_is_not_believed() -> None:
     pairs, poses = sequence(25)
     known = [kept(poses[k], k, pairs[k]) for k in (4, 8)]
