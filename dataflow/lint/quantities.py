@@ -39,6 +39,7 @@ class _Seen:
     accelerations: list[float] = field(default_factory=list)
     rates: list[float] = field(default_factory=list)
     negative: int = 0
+    returns: int = 0
     deepest: float = 0.0
     depths: list[npt.NDArray[np.float32]] = field(default_factory=list)
     sweep: float = 0.0
@@ -75,6 +76,7 @@ def _look(message: Message, seen: _Seen) -> bool:
             data = message.data[np.isfinite(message.data)]
             seen.depths.append(data[:: 1 + data.size // SAMPLED])
             seen.negative += int((data < 0).sum())
+            seen.returns += int((data > 0).sum())
             seen.deepest = max(seen.deepest, float(np.quantile(data, 0.9)) if data.size else 0.0)
         case PointCloud():
             if message.time_offsets is not None and len(message.time_offsets):
@@ -118,6 +120,8 @@ def _findings(name: str, seen: _Seen) -> Iterator[Finding]:
     if seen.negative:
         text = f"{seen.negative:,} depths are negative; no return is 0 or NaN"
         yield found(text, pixels=seen.negative)
+    elif seen.depths and not seen.returns:
+        yield found(f"no pixel of {seen.looked:,} depth images has a return")
     if seen.deepest > DEEPEST:
         metres = seen.deepest / 1000
         text = (

@@ -38,6 +38,7 @@ STAMPS = every(0.1)
         ([imu(s, 0.0) for s in STAMPS], "it is taken out"),
         ([imu(s, rate=40.0) for s in STAMPS], "in degrees"),
         ([depth(s, -1.0) for s in STAMPS], "depths are negative"),
+        ([depth(s, 0.0) for s in STAMPS], "no pixel of"),
         ([depth(s, 1500.0) for s in STAMPS], "in millimetres"),
         ([depth(s, 15.0) for s in STAMPS], "with 5000 units a metre it is 3 to 3 m"),
         ([depth(s, 0.25) for s in STAMPS], "if its units were millimetres, it is 1.2 to 1.2 m"),
