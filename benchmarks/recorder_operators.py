@@ -16,7 +16,7 @@ PERIOD = 1 / 30
 class Camera(Source):
     """Emits the images of a file again and again."""
 
-    live = True
+    real_time = True
     image: Out[Image]
     depth: Out[DepthImage]
     file: str = Param(doc="what numpy.savez made of arrays `color` (N, H, W, 3) and `depth` (N, H, W)")

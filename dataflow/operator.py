@@ -43,7 +43,7 @@ from dataflow.ports import (
     ParameterError,
     Sampled,
     SourceError,
-    is_live,
+    is_tunable,
 )
 from dataflow.state import KEPT, Counts, Remembered, StateOf, fresh_state, plain, reset_state, state_hints, take_over
 
@@ -70,8 +70,8 @@ __all__ = [
     "Sampled",
     "Source",
     "SourceError",
-    "is_live",
     "is_source",
+    "is_tunable",
     "outputs_of",
     "validate_parameters",
 ]
@@ -188,7 +188,7 @@ class Operator:
             reset_state(old, self.state)
 
     def on_parameter(self, name: str) -> None:
-        """A `live` parameter was changed between two firings; `self.<name>` holds the new value."""
+        """A `tunable` parameter was changed between two firings; `self.<name>` holds the new value."""
 
     def snapshot(self) -> Mapping[str, Any] | None:
         """Returns the state, such that `restore` of it in a fresh operator goes on alike: by default `state` or None.
@@ -208,10 +208,10 @@ class Operator:
         take_over(self.state, state_hints(self.state), state)
 
     def set_parameter(self, name: str, value: Any) -> Any:
-        """Changes a `live` parameter; returns the value as validated. Raises `ParameterError`."""
+        """Changes a `tunable` parameter; returns the value as validated. Raises `ParameterError`."""
         cls = type(self)
         fields = cls.spec.parameters.model_fields
-        able = [n for n, field in fields.items() if is_live(field)]
+        able = [n for n, field in fields.items() if is_tunable(field)]
         which = f"; those that can: {', '.join(able)}" if able else "; none of its parameters can"
         if name in fields and name not in able:
             raise ParameterError(f"{cls.__name__}.{name} cannot change while the graph runs{which}")
@@ -251,13 +251,18 @@ class Operator:
 class Source(Operator, abstract=True):
     """An operator without inputs: a device, a dataset folder, a simulator, a log.
 
-    `live=False` (a dataset, a log) means that it can wait: it is read as fast as the graph takes it and loses nothing.
-    `live=True` (a device, a simulator in real time) means that time passes whether the graph keeps up or not.
+    `real_time = False` (a dataset, a log): it can wait, so that it is read as fast as the graph takes it, without loss.
+    `real_time = True` (a camera, a simulator in real time): time passes whether the graph keeps up or not.
     """
 
-    live: ClassVar[bool] = False
+    real_time: ClassVar[bool] = False
     simulated: ClassVar[bool] = False
     """Its messages are computed, not measured by a sensor."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if isinstance(vars(cls).get("live"), bool):
+            raise OperatorDefinitionError(f"{cls.__name__}.live was renamed: a source that cannot wait is real_time")
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         """Yields what is emitted at one stamp: a mapping from port to message. Stamps strictly increase."""

@@ -124,13 +124,16 @@ def Param(
     max_length: int | None = None,
     pattern: str | None = None,
     unit: str = "",
-    live: bool = False,
+    tunable: bool = False,
+    live: None = None,
 ) -> Any:
     """Declares a parameter with its default, bounds and documentation. Without a default it must be given.
 
-    `live`: it may be changed while the graph runs (`dataflow param set`): `process()` reads `self.<name>` anew each
-    time, or `on_parameter` does what else is needed.
+    `tunable`: it may be changed while the graph runs (`dataflow param set`): `process()` reads `self.<name>` anew each
+    time, or `on_parameter` does what else is needed. Raises TypeError for `live`, its name in the past.
     """
+    if live is not None:
+        raise TypeError("Param(live=...) was renamed: a parameter that changes while the graph runs is tunable=True")
     info = pydantic.Field(
         default,
         description=doc,
@@ -141,7 +144,7 @@ def Param(
         min_length=min_length,
         max_length=max_length,
         pattern=pattern,
-        json_schema_extra={**({"unit": unit} if unit else {}), **({"live": True} if live else {})} or None,
+        json_schema_extra={**({"unit": unit} if unit else {}), **({"tunable": True} if tunable else {})} or None,
     )
     assert isinstance(info, FieldInfo)
     return info
@@ -235,6 +238,6 @@ class Context:
     late: frozenset[str] = frozenset()
 
 
-def is_live(field: FieldInfo) -> bool:
+def is_tunable(field: FieldInfo) -> bool:
     """Says whether a parameter may be changed while the graph runs."""
-    return isinstance(field.json_schema_extra, dict) and bool(field.json_schema_extra.get("live"))
+    return isinstance(field.json_schema_extra, dict) and bool(field.json_schema_extra.get("tunable"))

@@ -25,7 +25,7 @@ MOST: Final = 256
 class Remote(Source, abstract=True):
     """Emits what it is given with `put`, by any thread. It has one port, and runs in live runs alone."""
 
-    live = True
+    real_time = True
 
     def __init__(self, **params: Any) -> None:
         super().__init__(**params)

@@ -22,7 +22,7 @@ def vector(stamp: int, numbers: np.ndarray) -> FeatureVector:
 class Ping(Source):
     """Sends arrays whose first eight bytes say when, ns on the monotonic clock."""
 
-    live = True
+    real_time = True
     array: Out[FeatureVector]
     nbytes: int = Param(1008, ge=8, doc="bytes of the array")
     count: int = Param(100, ge=1, doc="messages")

@@ -20,7 +20,7 @@ from dataflow.graph.document import parse
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.problems import Place, Problems, did_you_mean
 from dataflow.graph.tree import at, plain
-from dataflow.operator import ParameterError, is_live, validate_parameters
+from dataflow.operator import ParameterError, is_tunable, validate_parameters
 from dataflow.sync.stamps import parse_duration
 
 
@@ -211,7 +211,7 @@ def _check(entry: Any, graph: Graph, where: tuple[str | int, ...]) -> None:
 def _check_parameter(entry: _Param, node: Node, where: tuple[str | int, ...]) -> None:
     """The parameter can change while the graph runs, and the operator takes each of the values."""
     fields = node.spec.parameters.model_fields
-    able = [name for name, field in fields.items() if is_live(field)]
+    able = [name for name, field in fields.items() if is_tunable(field)]
     if entry.name not in fields:
         hint = did_you_mean(entry.name, able, "those that can change while the graph runs")
         raise ChaosError(f"{entry.operator!r} has no parameter {entry.name!r}", (*where, "name"), hint)

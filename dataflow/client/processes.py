@@ -55,7 +55,7 @@ class Parameter:
     """The value that a parameter has now, and whether it can change while the graph runs."""
 
     value: Any
-    live: bool
+    tunable: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -202,7 +202,7 @@ class SourceRunner:
         self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
         self.ports.resume(incarnation, last)
         self.last = max(last.values(), default=NEVER)
-        self._resumed = not self.source.live
+        self._resumed = not self.source.real_time
         self._change(changed)
 
     def start_again(self) -> None:
@@ -214,7 +214,7 @@ class SourceRunner:
         incarnation = self.records.incarnation + 1
         self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
         self.ports.begin(incarnation)
-        self._resumed = not self.source.live
+        self._resumed = not self.source.real_time
         try:
             old.close()
         except Exception as error:  # the first failure is known

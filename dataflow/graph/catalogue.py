@@ -21,7 +21,7 @@ from dataflow.extras import missing_extra
 from dataflow.graph.lookup import NotFound, find_operator, is_concrete, lost_exports, offered
 from dataflow.graph.model import current_path
 from dataflow.graph.problems import did_you_mean
-from dataflow.operator import InputPort, Operator, OutputPort, is_live, is_source
+from dataflow.operator import InputPort, Operator, OutputPort, is_source, is_tunable
 from dataflow.sync.stamps import format_duration, parse_duration
 
 ENTRY_POINTS = "dataflow.operators"
@@ -142,7 +142,7 @@ class Described:
             "name": spec.name,
             "doc": spec.doc,
             "source": is_source(cls),
-            "live": bool(getattr(cls, "live", False)),
+            "real_time": bool(getattr(cls, "real_time", False)),
             "external": cls.external,
             "stateless": cls.stateless,
             "fires": fires(cls),
@@ -186,7 +186,7 @@ def fires(cls: type[Operator]) -> str:
     """Tells when the operator fires, in words."""
     spec = cls.spec
     if is_source(cls):
-        return "by itself (a device)" if getattr(cls, "live", False) else "by itself (can wait)"
+        return "by itself (a device)" if getattr(cls, "real_time", False) else "by itself (can wait)"
     ways = []
     names = " and ".join(port.name for port in spec.triggers)
     if len(spec.triggers) > 1 and not spec.merge:
@@ -241,7 +241,7 @@ def parameters(cls: type[Operator]) -> list[Mapping[str, Any]]:
                 "default": default,
                 "bounds": _bounds(declared),
                 "unit": declared.get("unit", ""),
-                "live": is_live(info),
+                "tunable": is_tunable(info),
                 "doc": info.description or "",
             }
         )
@@ -352,7 +352,7 @@ def parameter_notes(row: Mapping[str, Any]) -> list[str]:
     """Returns what is particular to a parameter: its bounds, and whether it may change while the graph runs."""
     unit = "" if not row["unit"] or row["bounds"].startswith(("items", "length", "matches")) else f" {row['unit']}"
     notes = [row["bounds"] + unit] if row["bounds"] else []
-    return [*notes, "changes while running"] if row["live"] else notes
+    return [*notes, "changes while running"] if row["tunable"] else notes
 
 
 def output_notes(port: OutputPort) -> list[str]:

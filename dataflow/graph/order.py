@@ -68,11 +68,11 @@ def refuse_stuck_cycles(wired: Iterable[Wired], streams: Mapping[str, Stream], p
 
 
 def fed_by_devices(wired: Iterable[Wired], streams: Mapping[str, Stream], *, live: bool) -> set[str]:
-    """Names of the operators that have a source upstream that cannot wait (`Source.live`; in a live run, any)."""
+    """Names of the operators that have a source upstream that cannot wait (`Source.real_time`; in a live run, any)."""
     downstream: dict[str, list[str]] = {}
     reached: list[str] = []
     for w in wired:
-        if issubclass(w.draft.cls, Source) and (w.draft.cls.live or live):
+        if issubclass(w.draft.cls, Source) and (w.draft.cls.real_time or live):
             reached.append(w.draft.name)
         for taken in w.inputs.values():
             for stream in taken:

@@ -31,7 +31,7 @@ class Account:
 
     - `notes`: damage and oddities of the file; `short`: topics with fewer messages than are promised.
     - By topic: `repaired`, messages by what was done; `unread`; `lost`, messages by what of them is not carried over;
-      `static`, what was made of several messages of a static topic.
+      `static`, what was made of several messages of a static topic; `doubted`, values that are hardly in their unit.
     """
 
     notes: list[str] = field(default_factory=list)
@@ -40,6 +40,7 @@ class Account:
     unread: dict[str, Unread] = field(default_factory=dict)
     lost: dict[str, Counter[str]] = field(default_factory=dict)
     static: dict[str, str] = field(default_factory=dict)
+    doubted: dict[str, str] = field(default_factory=dict)
 
     def pass_over(self, topic: str, reason: str) -> None:
         """Counts a message that cannot be read."""
@@ -56,7 +57,7 @@ class Account:
         for name, done in self.repaired.items():
             topic = called(name)
             found += [f"{topic}: {_messages(number)} {WORDS[what]}" for what, number in done.items()]
-        found += [f"{called(topic)}: {text}" for topic, text in self.static.items()]
+        found += [f"{called(topic)}: {text}" for topic, text in (*self.static.items(), *self.doubted.items())]
         found += [
             f"{called(topic)}: {_messages(unread.count)} that cannot be read passed over, the first: {unread.reason}"
             for topic, unread in self.unread.items()
@@ -74,6 +75,7 @@ class Account:
             "unread": {topic: {"messages": u.count, "first": u.reason} for topic, u in self.unread.items()},
             "lost": {topic: dict(lost) for topic, lost in self.lost.items()},
             "static": self.static,
+            "doubted": self.doubted,
         }
 
 

@@ -20,8 +20,9 @@ from dataflow.messages import (
     Pose,
     RangeReading,
 )
+from dataflow.messages.depth_units import MILLIMETRES
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.streams.pixels import as_depth
+from dataflow.recording.streams.pixels import as_depth, as_millimetres
 
 
 def image_of(message: CompressedImage) -> Image:
@@ -69,6 +70,19 @@ def depth_in_millimetres(message: Image16) -> DepthImage:
 def depth_of_grey(message: CompressedImage) -> DepthImage:
     """Decodes a PNG of 16-bit grey values, which are millimetres."""
     return depth_in_millimetres(image16_of(message))
+
+
+def in_units(message: Message, scale: float) -> Message:
+    """Depth that is read as 16-bit millimetres as that of `scale` units a metre; raises `RecordingError` for other."""
+    if scale == MILLIMETRES:
+        return message
+    if isinstance(message, CompressedDepth) and message.quantizer == "linear":
+        return message.replace(scale=1 / scale)
+    raw = as_millimetres(message.data) if isinstance(message, DepthImage) else None
+    if raw is None:
+        raise RecordingError("its depth is not of 16-bit units, so that its scale is given")
+    assert isinstance(message, DepthImage)
+    return message.replace(data=(raw / scale).astype(np.float32))
 
 
 def number_of(message: Measurement) -> Number:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from dataflow.graph.model import Graph
@@ -15,6 +15,7 @@ from dataflow.interop.opening import open_bag
 from dataflow.interop.streams import BagStreams, Played
 from dataflow.interop.topics import Reading, is_known
 from dataflow.messages import CompressedDepth, DepthImage, Image, Image16, Message, Transforms
+from dataflow.messages.depth_units import MILLIMETRES
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,10 +100,11 @@ def play(
 
 @dataclass(frozen=True, slots=True)
 class Wishes:
-    """Wishes for the reading of a bag: `depth`, topics that are depth although their messages do not say so; `lossy`,
-    whether 16-bit images become 8-bit ones; `strict`, whether a message that cannot be read is an error."""
+    """Wishes for the reading of a bag: `depth`, topics of 16-bit depth, be it that their messages do not say so, and
+    how many of their units a metre has; `lossy`, whether 16-bit images become 8-bit ones; `strict`, whether a message
+    that cannot be read is an error."""
 
-    depth: tuple[str, ...] = ()
+    depth: Mapping[str, float] = field(default_factory=dict)
     lossy: bool = False
     strict: bool = False
 
@@ -130,7 +132,10 @@ def readable(
     found = [r for r in readings if r.playable and r.topic.count]
     played = {
         r.topic.name: Played(
-            r.topic.name, _wished(r, wishes).SCHEMA, r.read_as is Transforms and is_static(r.topic.name)
+            r.topic.name,
+            _wished(r, wishes).SCHEMA,
+            r.read_as is Transforms and is_static(r.topic.name),
+            wishes.depth.get(r.topic.name, MILLIMETRES),
         )
         for r in found
         if r.read_as is not None

@@ -10,17 +10,19 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from dataflow.interop.account import Account, Unread
 from dataflow.interop.bag import Bag, BagError, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
-from dataflow.interop.conversions import NARROWING, convert, offers
+from dataflow.interop.conversions import NARROWING, convert, in_units, offers
 from dataflow.interop.found import Found
 from dataflow.interop.opening import open_bag
 from dataflow.interop.ranking import Ranking, within
 from dataflow.interop.topics import Reading
 from dataflow.interop.transform_sets import joined, places_of
-from dataflow.messages import Message, MessageError, Transforms, message_type
+from dataflow.messages import DepthImage, Message, MessageError, Transforms, message_type
+from dataflow.messages.depth_units import MILLIMETRES, DepthSpan
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
 
 MAX_HELD = 1 << 30
@@ -29,11 +31,15 @@ MAX_HELD = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """A topic that stands in for a stream: as which message type, and whether as one message, valid always."""
+    """A topic that stands in for a stream: as which message type, and whether as one message, valid always.
+
+    `depth_scale`: how many units of 16-bit depth a metre has (REP 118: millimetres).
+    """
 
     topic: str
     type: str
     static: bool = False
+    depth_scale: float = MILLIMETRES
 
 
 class BagStreams:
@@ -65,6 +71,7 @@ class BagStreams:
             self.account = Account(list(self._bag.notes), shortfalls(self._bag))
             self._readings = {p.topic: self._reading(p) for p in self.played.values()}
             self._unstamped: dict[str, Unread] = {}
+            self._depths: dict[str, list[npt.NDArray[np.float32]]] = {}
             self._moving = sorted({p.topic for p in self.played.values() if not p.static})
             self._found = self._scan(watch)
             self._unstamped = {topic: Unread(u.count, u.reason) for topic, u in self.account.unread.items()}
@@ -109,7 +116,7 @@ class BagStreams:
 
     def opening(self) -> Mapping[str, Any] | None:
         """Plain values with which `recorded_streams` gives the same streams in another process."""
-        played = {stream: [p.topic, p.type, p.static] for stream, p in self.played.items()}
+        played = {stream: [p.topic, p.type, p.static, p.depth_scale] for stream, p in self.played.items()}
         return {"played": played, "clock": self.clock.kind, "strict": self._strict}
 
     def facts(self) -> dict[str, str]:
@@ -230,7 +237,7 @@ class BagStreams:
             parts = range(max(1, len(reader.stamps(stored.data))))
             stamp = max(stored.log_time, 0)
             read = [reader.read(stored.data, part, stamp, losses) for part in parts]
-            made = [convert(message, message_type(played.type)) for message in read]
+            made = [in_units(convert(message, message_type(played.type)), played.depth_scale) for message in read]
         except (RecordingError, MessageError) as error:
             self._pass_over(stored, error)
             return []
@@ -298,6 +305,9 @@ class BagStreams:
                 pending = _Pending(stream, message, seq)
         if pending is not None:
             yield pending.done()
+        for topic, depths in self._depths.items():
+            if (span := DepthSpan.of(np.concatenate(depths), 1.0)) and (doubt := span.doubt()):
+                self.account.doubted[topic] = f"{doubt}: --depth {topic}=UNITS sets the units of a metre"
 
     def _read(self, stream: str, stored: Stored, part: int, stamp: int) -> Message | None:
         """The message as the type that is played; None for one that cannot be read."""
@@ -308,7 +318,7 @@ class BagStreams:
         wanted = message_type(played.type)
         try:
             read = reader.read(stored.data, part, stamp, losses)
-            message = convert(read, wanted)
+            message = in_units(convert(read, wanted), played.depth_scale)
         except (RecordingError, MessageError) as error:
             self._pass_over(stored, error)
             return None
@@ -317,6 +327,8 @@ class BagStreams:
                 losses.append(lost)
             if losses:
                 self.account.lose(played.topic, losses)
+            if isinstance(message, DepthImage) and not stored.number & (stored.number - 1):  # 1, 2, 4, 8 ...
+                self._depths.setdefault(played.topic, []).append(message.data[::8, ::8].ravel())
         return message
 
     def _pass_over(self, stored: Stored, error: Exception) -> None:

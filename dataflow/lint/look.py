@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from dataflow.lint.cameras import check_cameras
 from dataflow.lint.clocks import NONE, ClockDifference, agreed, clock_difference
 from dataflow.lint.contract import Contract, StreamTerms, means
 from dataflow.lint.finding import Finding
@@ -78,6 +79,7 @@ def lint(material: Material, contract: Contract | None = None, *, clocks: bool =
             report.findings += check_gaps(name, stamps, timing, None if wanted is None else wanted.max_gap)
     report.findings += check_ends(report.timings)
     report.findings += check_quantities(material, report.timings)
+    report.findings += check_cameras(material)
     tree = _frames_of(material)
     report.findings += check_frames(tree, terms.frames.root, terms.frames.required)
     report.root = tree.roots()[0] if tree.parents else None

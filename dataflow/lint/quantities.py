@@ -7,12 +7,16 @@ from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
+import numpy.typing as npt
 
 from dataflow.lint.finding import Finding
 from dataflow.lint.material import Material
 from dataflow.lint.timing import Timing
 from dataflow.messages import DepthImage, Imu, LaserScan, Message, NavSatFix, PointCloud
+from dataflow.messages.depth_units import DepthSpan
 
+SAMPLED = 2000
+"""Pixels of a depth image that are kept."""
 LOOKED_AT = 200
 """Messages of a stream that are looked at, evenly spread where their number is known."""
 GRAVITY = 9.81
@@ -35,7 +39,9 @@ class _Seen:
     accelerations: list[float] = field(default_factory=list)
     rates: list[float] = field(default_factory=list)
     negative: int = 0
+    returns: int = 0
     deepest: float = 0.0
+    depths: list[npt.NDArray[np.float32]] = field(default_factory=list)
     sweep: float = 0.0
     farthest: float = 0.0
     ranges: list[float] = field(default_factory=list)
@@ -68,7 +74,9 @@ def _look(message: Message, seen: _Seen) -> bool:
             seen.rates.append(float(np.linalg.norm(message.angular_velocity)))
         case DepthImage():
             data = message.data[np.isfinite(message.data)]
+            seen.depths.append(data[:: 1 + data.size // SAMPLED])
             seen.negative += int((data < 0).sum())
+            seen.returns += int((data > 0).sum())
             seen.deepest = max(seen.deepest, float(np.quantile(data, 0.9)) if data.size else 0.0)
         case PointCloud():
             if message.time_offsets is not None and len(message.time_offsets):
@@ -112,12 +120,16 @@ def _findings(name: str, seen: _Seen) -> Iterator[Finding]:
     if seen.negative:
         text = f"{seen.negative:,} depths are negative; no return is 0 or NaN"
         yield found(text, pixels=seen.negative)
+    elif seen.depths and not seen.returns:
+        yield found(f"no pixel of {seen.looked:,} depth images has a return")
     if seen.deepest > DEEPEST:
         metres = seen.deepest / 1000
         text = (
             f"a tenth of its depths is beyond {seen.deepest:.0f} m; if they are in millimetres, beyond {metres:.1f} m"
         )
         yield found(text, depth=seen.deepest)
+    elif seen.depths and (span := DepthSpan.of(np.concatenate(seen.depths), 1.0)) and (text := span.doubt()):
+        yield found(text, depth=span.median)
     if max(seen.sweep, seen.farthest) > LONGEST_SWEEP:
         worst = max(seen.sweep, seen.farthest)
         fits = next((u for u, s in (("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9)) if worst * s < 1.0), "")

@@ -85,7 +85,7 @@ class Reader:
             step = runner.take()
             if step is None:
                 return True
-            if not runner.source.live and not self._paced(step_stamp(step)):
+            if not runner.source.real_time and not self._paced(step_stamp(step)):
                 continue
             if self._faults.begun:
                 for given in self._faults.apply(step, time.monotonic()):
@@ -171,7 +171,7 @@ class LiveSources:
 
     def first_stamps(self) -> list[int]:
         """The stamps that those sources begin with which need not be waited for."""
-        able = [runner for runner in self.runners if not runner.source.live]
+        able = [runner for runner in self.runners if not runner.source.real_time]
         return [stamp for runner in able if (stamp := runner.look_ahead()) is not None]
 
     def start(self) -> None:
@@ -231,7 +231,7 @@ class LiveSources:
             self._window.clear()
             self.backlog.clear()
             self._channel.send("jumped", operator=runner.node.name, stamp=runner.last)
-        if not runner.source.live:
+        if not runner.source.real_time:
             reader.sent_late = max(0.0, -self.pace.due_in(runner.last))
         runner.promise()
         self._window.add(runner.last, *admitted)
@@ -252,7 +252,7 @@ class LiveSources:
 
     def behind(self) -> dict[str, list[float]]:
         """For each source that could wait: seconds by which its last step was read and sent behind the clock."""
-        readers = {name: reader for name, reader in self._readers.items() if not reader.runner.source.live}
+        readers = {name: reader for name, reader in self._readers.items() if not reader.runner.source.real_time}
         return {name: [reader.read_late, reader.sent_late] for name, reader in readers.items()}
 
     # Restarts

@@ -12,7 +12,7 @@ from dataflow.execution.driver import Driver, Maker
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.source import SourceRunner
 from dataflow.messages.base import MessageError
-from dataflow.operator import ParameterError, is_live
+from dataflow.operator import ParameterError, is_tunable
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.live_sources import LiveSources
@@ -148,7 +148,7 @@ class Requests:
         if asked.get("get"):
             fields = maker.operator.spec.parameters.model_fields
             values = maker.operator.params.model_dump(mode="json")
-            return {n: {"value": values[n], "live": is_live(field)} for n, field in fields.items()}
+            return {n: {"value": values[n], "tunable": is_tunable(field)} for n, field in fields.items()}
         return maker.set_parameter(asked["name"], asked["value"])
 
     def _answer_status(self, query: Any) -> None:

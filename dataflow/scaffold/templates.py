@@ -28,7 +28,7 @@ class $Class(Operator):
     image: In[Image] = In(doc="what the camera sees")
     brightness: Out[Number] = Out(doc="mean of all pixels, 0 to 1")
 
-    scale: float = Param(1.0, gt=0, live=True, doc="factor on the result")
+    scale: float = Param(1.0, gt=0, tunable=True, doc="factor on the result")
     state: State
 
     def process(self, image: Image) -> Number:
@@ -147,7 +147,7 @@ class Device:
 class $Class(Source):
     """Readings of a thermometer, as they come."""
 
-    live = True  # it waits for no consumer: `dataflow run --live` reads it on a separate thread
+    real_time = True  # it waits for no consumer: `dataflow run --live` reads it on a separate thread
 
     temperature: Out[Number] = Out(doc="degrees Celsius")
 

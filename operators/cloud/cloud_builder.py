@@ -37,13 +37,13 @@ class CloudBuilder(Operator):
         doc="pixels, points, points that the colour camera sees; a warning where there is none"
     )
 
-    stride: int = Param(2, ge=1, live=True, doc="keep every stride-th pixel in both directions")
-    min_range: float = Param(0.3, ge=0, live=True, doc="nearest depth kept", unit="m")
-    max_range: float = Param(6.0, gt=0, live=True, doc="farthest depth kept", unit="m")
+    stride: int = Param(2, ge=1, tunable=True, doc="keep every stride-th pixel in both directions")
+    min_range: float = Param(0.3, ge=0, tunable=True, doc="nearest depth kept", unit="m")
+    max_range: float = Param(6.0, gt=0, tunable=True, doc="farthest depth kept", unit="m")
     edge_ratio: float = Param(
         0.05,
         ge=0,
-        live=True,
+        tunable=True,
         doc="drop pixels whose depth differs from a neighbour's by more than this share: they fly between foreground "
         "and background; 0 keeps them",
     )

@@ -37,10 +37,12 @@ class CloudColorizer(Operator):
     )
     status: Out[Diagnostics] = Out(doc="points seen, hidden, outside the image, behind; a warning where none is seen")
 
-    seen_only: bool = Param(False, live=True, doc="leave out the points that the camera does not see")
-    cell: int = Param(6, ge=1, live=True, doc="side of the squares in which the nearest point is looked for", unit="px")
+    seen_only: bool = Param(False, tunable=True, doc="leave out the points that the camera does not see")
+    cell: int = Param(
+        6, ge=1, tunable=True, doc="side of the squares in which the nearest point is looked for", unit="px"
+    )
     slack: float = Param(
-        0.1, ge=0, live=True, doc="share of depth behind the nearest that still counts as seen; 0: all"
+        0.1, ge=0, tunable=True, doc="share of depth behind the nearest that still counts as seen; 0: all"
     )
     state: Counts
 

@@ -37,17 +37,21 @@ class CloudFilter(Operator):
     max_range: float = Param(100.0, gt=0, doc="farthest distance from the origin that is kept", unit="m")
     lower: Corner | None = Param(None, doc="smallest x, y, z of the box that is kept; no box if none", unit="m")
     upper: Corner | None = Param(None, doc="largest x, y, z of the box that is kept; no box if none", unit="m")
-    voxel: float = Param(0.0, ge=0, live=True, doc="side of the voxels; 0 keeps all points", unit="m")
+    voxel: float = Param(0.0, ge=0, tunable=True, doc="side of the voxels; 0 keeps all points", unit="m")
     outlier_neighbours: int = Param(
-        0, ge=0, le=200, live=True, doc="neighbours whose mean distance decides on statistical outliers; 0 removes none"
+        0,
+        ge=0,
+        le=200,
+        tunable=True,
+        doc="neighbours whose mean distance decides on statistical outliers; 0 removes none",
     )
     outlier_ratio: float = Param(
-        2.0, gt=0, live=True, doc="standard deviations by which that distance may exceed the cloud's mean"
+        2.0, gt=0, tunable=True, doc="standard deviations by which that distance may exceed the cloud's mean"
     )
-    radius: float = Param(0.0, ge=0, live=True, doc="radius in which a point needs others; 0 removes none", unit="m")
-    radius_neighbours: int = Param(3, ge=1, live=True, doc="how many others it needs there")
+    radius: float = Param(0.0, ge=0, tunable=True, doc="radius in which a point needs others; 0 removes none", unit="m")
+    radius_neighbours: int = Param(3, ge=1, tunable=True, doc="how many others it needs there")
     normal_neighbours: int = Param(0, ge=0, le=200, doc="points that a normal is estimated from; 0 for none")
-    normal_radius: float = Param(0.3, gt=0, live=True, doc="they lie within this radius", unit="m")
+    normal_radius: float = Param(0.3, gt=0, tunable=True, doc="they lie within this radius", unit="m")
     state: Counts
 
     def setup(self) -> None:

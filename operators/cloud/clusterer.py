@@ -59,15 +59,15 @@ class Clusterer(Operator):
 
     up: tuple[float, float, float] = Param((0.0, 0.0, 1.0), doc="direction up in the cloud's frame where no pose comes")
     voxel: float = Param(0.02, gt=0.001, doc="side of the voxels that are clustered", unit="m")
-    reach: float = Param(0.04, gt=0, live=True, doc="points so near are neighbours", unit="m")
+    reach: float = Param(0.04, gt=0, tunable=True, doc="points so near are neighbours", unit="m")
     reach_growth: float = Param(
-        0.02, ge=0, live=True, doc="and this times their distance from the sensor, as points lie farther apart there"
+        0.02, ge=0, tunable=True, doc="and this times their distance from the sensor, as points lie farther apart there"
     )
-    core_points: int = Param(5, ge=1, live=True, doc="points within reach that make a core point, its own included")
-    min_points: int = Param(30, ge=1, live=True, doc="fewest points of a cluster")
-    max_points: int = Param(1_000_000, ge=1, live=True, doc="most points of a cluster")
+    core_points: int = Param(5, ge=1, tunable=True, doc="points within reach that make a core point, its own included")
+    min_points: int = Param(30, ge=1, tunable=True, doc="fewest points of a cluster")
+    max_points: int = Param(1_000_000, ge=1, tunable=True, doc="most points of a cluster")
     board: float = Param(
-        0.25, gt=0, live=True, doc="least length of a board of furniture; infinite keeps furniture whole", unit="m"
+        0.25, gt=0, tunable=True, doc="least length of a board of furniture; infinite keeps furniture whole", unit="m"
     )
     state: Counts
 

@@ -18,7 +18,7 @@ class ImageDecoder(Operator):
     compressed: In[CompressedImage] = In(doc="the encoded file")
     image: Out[Image] = Out(doc="its pixels, of the same stamp and frame")
 
-    max_pixels: int = Param(64_000_000, ge=1, live=True, doc="a file that decodes to more pixels is refused")
+    max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
 
     def process(self, compressed: CompressedImage) -> Image:
         """Raises ValueError where the bytes are not a whole image."""
@@ -42,7 +42,7 @@ class DepthDecoder(Operator):
     compressed: In[CompressedDepth] = In(doc="the encoded file and what its numbers mean")
     depth: Out[DepthImage] = Out(doc="metres, 0 for no return, of the same stamp and frame")
 
-    max_pixels: int = Param(64_000_000, ge=1, live=True, doc="a file that decodes to more pixels is refused")
+    max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
 
     def process(self, compressed: CompressedDepth) -> DepthImage:
         """Raises ValueError where the bytes are not a whole image."""

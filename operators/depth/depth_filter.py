@@ -33,16 +33,16 @@ class DepthFilter(Operator):
     max_range: float = Param(100.0, gt=0, doc="farther depths are no returns", unit="m")
     window: Literal[3, 5, 7] = Param(5, doc="side of the window that medians are taken in", unit="px")
     flying_ratio: float = Param(
-        0.04, ge=0, lt=1, live=True, doc="a flying pixel is this share of its depth off either surface; 0 finds none"
+        0.04, ge=0, lt=1, tunable=True, doc="a flying pixel is this share of its depth off either surface; 0 finds none"
     )
     outlier_deviations: float = Param(
-        4.0, ge=0, live=True, doc="an outlier is so many deviations off the local median; 0 finds none"
+        4.0, ge=0, tunable=True, doc="an outlier is so many deviations off the local median; 0 finds none"
     )
-    outlier_ratio: float = Param(0.03, gt=0, lt=1, live=True, doc="and at least this share of its depth")
-    support: int = Param(2, ge=1, le=8, live=True, doc="with so many agreeing neighbours of eight, a pixel is none")
+    outlier_ratio: float = Param(0.03, gt=0, lt=1, tunable=True, doc="and at least this share of its depth")
+    support: int = Param(2, ge=1, le=8, tunable=True, doc="with so many agreeing neighbours of eight, a pixel is none")
     smoothing: Literal["none", "median", "bilateral"] = Param("none", doc="what is done with the pixels that are left")
     smoothing_sigma: float = Param(
-        0.005, gt=0, live=True, doc="of the bilateral filter, in inverse depth: a few times the noise", unit="1/m"
+        0.005, gt=0, tunable=True, doc="of the bilateral filter, in inverse depth: a few times the noise", unit="1/m"
     )
     state: Counts
 

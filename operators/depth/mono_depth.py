@@ -59,11 +59,13 @@ class MonoDepth(Operator):
     align: Literal["scale_and_shift", "scale"] = Param(
         "scale_and_shift", doc="what is fitted to the given depths: the model's own constant is unknown, or is 0"
     )
-    tolerance: float = Param(0.25, gt=0, lt=1, live=True, doc="a given depth agrees when off by less than this share")
-    least_given: int = Param(20, ge=2, live=True, doc="fewer given depths give no scale")
-    least_agreeing: float = Param(0.5, gt=0, le=1, live=True, doc="nor does a smaller share of them that agree")
+    tolerance: float = Param(
+        0.25, gt=0, lt=1, tunable=True, doc="a given depth agrees when off by less than this share"
+    )
+    least_given: int = Param(20, ge=2, tunable=True, doc="fewer given depths give no scale")
+    least_agreeing: float = Param(0.5, gt=0, le=1, tunable=True, doc="nor does a smaller share of them that agree")
     most_given: int = Param(2000, ge=10, doc="of more depths, so many are drawn")
-    max_range: float = Param(20.0, gt=0, live=True, doc="farther depths are no returns", unit="m")
+    max_range: float = Param(20.0, gt=0, tunable=True, doc="farther depths are no returns", unit="m")
     state: Counts
 
     def setup(self) -> None:

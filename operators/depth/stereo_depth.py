@@ -49,10 +49,10 @@ class StereoDepth(Operator):
     offset: float = Param(
         0.0, doc="constant error of the disparities, as an imperfect rectification leaves it; subtracted", unit="px"
     )
-    min_range: float = Param(0.0, ge=0, live=True, doc="nearer depths are no returns", unit="m")
-    max_range: float = Param(100.0, gt=0, live=True, doc="farther depths are no returns", unit="m")
+    min_range: float = Param(0.0, ge=0, tunable=True, doc="nearer depths are no returns", unit="m")
+    max_range: float = Param(100.0, gt=0, tunable=True, doc="farther depths are no returns", unit="m")
     least_share: float = Param(
-        0.05, ge=0, le=1, live=True, doc="of the pixels measured; below, `status` warns of a blind pair"
+        0.05, ge=0, le=1, tunable=True, doc="of the pixels measured; below, `status` warns of a blind pair"
     )
 
     _calibration: tuple[CameraInfo, CameraInfo] | None = None

@@ -36,7 +36,7 @@ class BoxSegmenter(Operator):
     model: str = Param("efficient_sam_ti", min_length=1, doc="a name of `dataflow models list`, or an ONNX file")
     provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
     input_size: tuple[int, int] = Param((640, 640), doc="(width, height) where the model leaves it open", unit="px")
-    most: int = Param(32, ge=1, live=True, doc="only the surest so many get masks; the others' are empty")
+    most: int = Param(32, ge=1, tunable=True, doc="only the surest so many get masks; the others' are empty")
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError, or ModelError for one of other inputs or outputs."""

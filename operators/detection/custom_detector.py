@@ -29,9 +29,9 @@ class CustomDetector(Operator):
     weights: str | None = Param(
         None, doc="network file written by `dataflow train detector`; none means the shipped one"
     )
-    score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes below are dropped")
-    nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which a box of a class joins a stronger")
-    max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
+    score_threshold: float = Param(0.3, ge=0, le=1, tunable=True, doc="boxes below are dropped")
+    nms_iou: float = Param(0.5, ge=0, le=1, tunable=True, doc="overlap above which a box of a class joins a stronger")
+    max_detections: int = Param(100, ge=1, tunable=True, doc="keep the best so many")
 
     @classmethod
     def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:

@@ -47,12 +47,16 @@ class OnnxDetector(Operator):
         "takes the registry's, those of the model's metadata, or the 80 of COCO",
     )
     score_threshold: float | None = Param(
-        None, ge=0, le=1, live=True, doc="boxes below are dropped; none takes the registry's for the model, or 0.3"
+        None, ge=0, le=1, tunable=True, doc="boxes below are dropped; none takes the registry's for the model, or 0.3"
     )
     nms_iou: float | None = Param(
-        None, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped; none: the family's"
+        None,
+        ge=0,
+        le=1,
+        tunable=True,
+        doc="overlap above which the weaker box of a class is dropped; none: the family's",
     )
-    max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
+    max_detections: int = Param(100, ge=1, tunable=True, doc="keep the best so many")
     fit: Literal["default", "stretch", "letterbox", "corner"] = Param(
         "default", doc="how the image fills the input; by default as the decoder's family was trained"
     )

@@ -23,7 +23,7 @@ class ScoreFilter(Operator):
     sure: Out[Detections2D] = Out(doc="those of at least `min_score` and the `classes`, in order; a message for each")
 
     stateless = True
-    min_score: float = Param(0.4, ge=0, le=1, live=True, doc="detections below are left out")
+    min_score: float = Param(0.4, ge=0, le=1, tunable=True, doc="detections below are left out")
 
     classes: tuple[str, ...] = Param((), doc="only these classes, by name; none means all")
 

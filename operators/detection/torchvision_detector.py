@@ -27,11 +27,11 @@ class _Detection(Operator, abstract=True):
     device: str = Param("cpu", doc="cpu, cuda, cuda:1 or mps")
     half: bool = Param(False, doc="compute in half precision; on a GPU alone")
     classes: tuple[str, ...] = Param((), doc="only these classes, by name; none means all")
-    score_threshold: float = Param(0.5, ge=0, le=1, live=True, doc="boxes below are dropped")
+    score_threshold: float = Param(0.5, ge=0, le=1, tunable=True, doc="boxes below are dropped")
     nms_iou: float | None = Param(
         None, ge=0, le=1, doc="overlap above which the weaker box of a class is dropped; none means the model's own"
     )
-    max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many of an image")
+    max_detections: int = Param(100, ge=1, tunable=True, doc="keep the best so many of an image")
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError, or ModelError for missing weights, devices or classes."""

@@ -34,7 +34,7 @@ class SelfFilter(Operator):
 
     body: tuple[BodyPart, ...] = Param(doc="parts of the robot")
     base_frame: str = Param("base_link", min_length=1, doc="frame of the parts that name none")
-    padding: float = Param(0.03, ge=0, live=True, doc="parts are so much larger on every side", unit="m")
+    padding: float = Param(0.03, ge=0, tunable=True, doc="parts are so much larger on every side", unit="m")
     state: Counts
 
     def setup(self) -> None:
@@ -70,7 +70,7 @@ class DepthSelfFilter(Operator):
 
     body: tuple[BodyPart, ...] = Param(doc="parts of the robot")
     base_frame: str = Param("base_link", min_length=1, doc="frame of the parts that name none")
-    padding: float = Param(0.03, ge=0, live=True, doc="parts are so much larger on every side", unit="m")
+    padding: float = Param(0.03, ge=0, tunable=True, doc="parts are so much larger on every side", unit="m")
     state: Counts
 
     def setup(self) -> None:

@@ -27,11 +27,11 @@ class ImageAdapter(Operator):
     adapted: Out[Image] = Out(doc="the same view, brighter and with less noise where it needs that")
     status: Out[Diagnostics] = Out(doc="with every image: its noise and brightness, and what was done; counts")
 
-    adapt: bool = Param(True, live=True, doc="off passes every image as it is")
-    usual_noise: float = Param(3.0, ge=0, le=50, live=True, doc="grey levels of noise that are left as they are")
-    brightness: float = Param(80.0, ge=1, le=200, live=True, doc="mean grey level to which darker images are raised")
-    most_gain: float = Param(5.0, ge=1, le=20, live=True, doc="the exposure is lengthened so many times at most")
-    most_noise: float = Param(8.0, gt=0, le=50, live=True, doc="nor so far that noise exceeds so many grey levels")
+    adapt: bool = Param(True, tunable=True, doc="off passes every image as it is")
+    usual_noise: float = Param(3.0, ge=0, le=50, tunable=True, doc="grey levels of noise that are left as they are")
+    brightness: float = Param(80.0, ge=1, le=200, tunable=True, doc="mean grey level to which darker images are raised")
+    most_gain: float = Param(5.0, ge=1, le=20, tunable=True, doc="the exposure is lengthened so many times at most")
+    most_noise: float = Param(8.0, gt=0, le=50, tunable=True, doc="nor so far that noise exceeds so many grey levels")
     state: Counts
 
     def process(self, image: Image) -> Mapping[str, Any]:

@@ -62,7 +62,7 @@ class OccupancyMapper(Operator):
     hit: float = Param(1.0, gt=0, doc="log-odds that a point adds to its cube")
     miss: float = Param(0.35, gt=0, doc="log-odds that a ray takes from the cubes that it passes")
     bound: float = Param(3.5, gt=0, le=20, doc="most that is remembered, in log-odds: less forgets movers faster")
-    period: int = Param(5, ge=1, live=True, doc="the map comes with every so many clouds")
+    period: int = Param(5, ge=1, tunable=True, doc="the map comes with every so many clouds")
     most_cubes: int = Param(100_000_000, ge=1, doc="the largest map; a larger one ends the run")
     state: State
 

@@ -67,10 +67,13 @@ class TsdfMap(Operator):
     near: float = Param(0.3, ge=0, doc="nearer depths are left out", unit="m")
     far: float = Param(4.0, gt=0, doc="farther depths are left out", unit="m")
     min_weight: float = Param(
-        0.05, ge=0, live=True, doc="a voxel that weighs less has no surface; an image at 1 m adds 1, at 2 m a quarter"
+        0.05,
+        ge=0,
+        tunable=True,
+        doc="a voxel that weighs less has no surface; an image at 1 m adds 1, at 2 m a quarter",
     )
     most_weight: float = Param(20.0, gt=0, doc="most that a voxel remembers: less follows changes faster")
-    period: int = Param(50, ge=1, live=True, doc="mesh and cloud come with every so many images")
+    period: int = Param(50, ge=1, tunable=True, doc="mesh and cloud come with every so many images")
     most_blocks: int = Param(200_000, ge=1, doc="blocks of 512 voxels; a larger map ends the run")
     state: State
 

@@ -63,8 +63,8 @@ class ColorDepthCheck(Operator):
     corrected: Out[Transforms] = Out(doc="with `calibrate`: the extrinsics, as given at first, then as corrected")
 
     calibrate: bool = Param(False, doc="correct the transform between the cameras")
-    period: Duration = Param("400ms", ge=0, live=True, doc="time between the pairs that are looked at")
-    angle: float = Param(1.2, gt=0, live=True, doc="smallest angle that is warned of", unit="°")
+    period: Duration = Param("400ms", ge=0, tunable=True, doc="time between the pairs that are looked at")
+    angle: float = Param(1.2, gt=0, tunable=True, doc="smallest angle that is warned of", unit="°")
 
     state: State
 

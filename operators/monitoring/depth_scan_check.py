@@ -46,10 +46,10 @@ class DepthScanCheck(Operator, tolerance="60ms"):
     )
     status: Out[Diagnostics] = Out(doc="with every scan; a warning while they do not fit")
 
-    angle: float = Param(1.0, gt=0, live=True, doc="largest angle between the two", unit="°")
-    shift: float = Param(0.05, gt=0, live=True, doc="largest shift", unit="m")
-    scale: float = Param(0.02, gt=0, live=True, doc="largest share by which depths may be too long or short")
-    pairs: int = Param(5, ge=1, live=True, doc="pairs that must have been seen before it warns")
+    angle: float = Param(1.0, gt=0, tunable=True, doc="largest angle between the two", unit="°")
+    shift: float = Param(0.05, gt=0, tunable=True, doc="largest shift", unit="m")
+    scale: float = Param(0.02, gt=0, tunable=True, doc="largest share by which depths may be too long or short")
+    pairs: int = Param(5, ge=1, tunable=True, doc="pairs that must have been seen before it warns")
 
     state: State
 

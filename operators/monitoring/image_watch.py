@@ -23,7 +23,7 @@ class ImageWatch(Watching, Operator):
     status: Out[Diagnostics] = Out(doc="with every image; a warning for one that is held back")
 
     dark: float = Param(
-        6.0, ge=0, le=255, live=True, doc="an image of which no more than a hundredth is brighter is black"
+        6.0, ge=0, le=255, tunable=True, doc="an image of which no more than a hundredth is brighter is black"
     )
 
     def process(self, image: Image) -> Mapping[str, Message]:
@@ -40,7 +40,7 @@ class DepthWatch(Watching, Operator):
     checked: Out[DepthImage] = Out(doc="the same image, if it shows something new")
     status: Out[Diagnostics] = Out(doc="with every image; a warning for one that is held back")
 
-    least: float = Param(0.01, ge=0, le=1, live=True, doc="least share of pixels with a return")
+    least: float = Param(0.01, ge=0, le=1, tunable=True, doc="least share of pixels with a return")
 
     def process(self, depth: DepthImage) -> Mapping[str, Message]:
         empty = float(((depth.data > 0) & (depth.data < float("inf"))).mean()) < self.least

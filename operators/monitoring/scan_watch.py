@@ -23,7 +23,7 @@ class ScanWatch(Watching, Operator):
     checked: Out[PointCloud] = Out(doc="the same scan, if it shows something new")
     status: Out[Diagnostics] = Out(doc="with every scan; a warning for one that is held back")
 
-    least: int = Param(20, ge=0, live=True, doc="fewest points that are finite")
+    least: int = Param(20, ge=0, tunable=True, doc="fewest points that are finite")
 
     def process(self, cloud: PointCloud) -> Mapping[str, Message]:
         few = int(np.isfinite(cloud.points).all(axis=1).sum()) < self.least

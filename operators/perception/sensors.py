@@ -21,7 +21,7 @@ from dataflow.operator import Out, Source
 class HandedSensors(Source):
     """Stands for the sensors of a `PerceptionSystem`, which is handed their measurements; it has none itself."""
 
-    live = True
+    real_time = True
 
     image: Out[Image] = Out(doc="colour or grey image")
     depth: Out[DepthImage] = Out(doc="depth, metres, of the image's stamp")

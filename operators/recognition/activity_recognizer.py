@@ -74,8 +74,8 @@ class ActivityRecognizer(Operator):
 
     weights: str | None = Param(None, doc="network file of `dataflow train activity`; none means the shipped one")
     labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives the roles of classes")
-    least: float = Param(0.35, ge=0, lt=1, live=True, doc="probability below which an activity is unknown")
-    posture: float = Param(1.0, ge=0, live=True, doc="how much postures count beside the network; 0 for not at all")
+    least: float = Param(0.35, ge=0, lt=1, tunable=True, doc="probability below which an activity is unknown")
+    posture: float = Param(1.0, ge=0, tunable=True, doc="how much postures count beside the network; 0 for not at all")
     memory: float = Param(1.5, ge=0, doc="time out of sight after which an activity is unknown", unit="s")
     state: State
 

@@ -26,7 +26,7 @@ class ImageClassifier(Operator):
 
     weights: str = Param(doc="network file of `dataflow train classifier`")
     per: Per = Param("image", doc="what a row is about: the image, or each detected object")
-    threshold: float = Param(0.0, ge=0, le=1, live=True, doc="rows whose best probability is less are left out")
+    threshold: float = Param(0.0, ge=0, le=1, tunable=True, doc="rows whose best probability is less are left out")
 
     def setup(self) -> None:
         """Loads the network. Raises FileNotFoundError or NetworkFileError."""

@@ -44,10 +44,12 @@ class LearnedDetector(Operator):
         doc="files of `dataflow learn object`, made with these weights, or saved maps that hold them"
     )
     weights: str | None = Param(None, doc="network file of `dataflow train detector`; none means the shipped one")
-    score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes of known classes below are dropped")
-    learned_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="and those of learned ones")
-    nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped")
-    max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
+    score_threshold: float = Param(0.3, ge=0, le=1, tunable=True, doc="boxes of known classes below are dropped")
+    learned_threshold: float = Param(0.3, ge=0, le=1, tunable=True, doc="and those of learned ones")
+    nms_iou: float = Param(
+        0.5, ge=0, le=1, tunable=True, doc="overlap above which the weaker box of a class is dropped"
+    )
+    max_detections: int = Param(100, ge=1, tunable=True, doc="keep the best so many")
 
     @classmethod
     def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:

@@ -57,10 +57,10 @@ class OnnxSegmenter(Operator):
     bgr: bool = Param(False, doc="the network sees blue first")
     fit: FitMode = Param("stretch", doc="how the image fills the input")
     input_size: tuple[int, int] = Param((512, 512), doc="(width, height) where the model leaves it open", unit="px")
-    confidence_threshold: float = Param(0.0, ge=0, le=1, live=True, doc="pixels below become void")
+    confidence_threshold: float = Param(0.0, ge=0, le=1, tunable=True, doc="pixels below become void")
     class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")
-    with_confidence: bool = Param(False, live=True, doc="also give the confidence of every pixel")
-    paint: bool = Param(False, live=True, doc="also give the image painted")
+    with_confidence: bool = Param(False, tunable=True, doc="also give the confidence of every pixel")
+    paint: bool = Param(False, tunable=True, doc="also give the image painted")
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError, or ModelError where parameters do not fit it."""

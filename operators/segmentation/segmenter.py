@@ -33,9 +33,9 @@ class Segmenter(Operator):
     segmentation: Out[SegmentationMap] = Out(doc="class of every pixel of the image")
 
     weights: str | None = Param(None, doc="network file of `dataflow train segmenter`; none means the shipped one")
-    confidence_threshold: float = Param(0.0, ge=0, le=1, live=True, doc="pixels below become void (255)")
+    confidence_threshold: float = Param(0.0, ge=0, le=1, tunable=True, doc="pixels below become void (255)")
     class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")
-    with_confidence: bool = Param(False, live=True, doc="also give the confidence of every pixel")
+    with_confidence: bool = Param(False, tunable=True, doc="also give the confidence of every pixel")
 
     @classmethod
     def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:

@@ -32,9 +32,9 @@ class _Segmentation(Operator, abstract=True):
     device: str = Param("cpu", doc="cpu, cuda, cuda:1 or mps")
     half: bool = Param(False, doc="compute in half precision; on a GPU alone")
     side: int = Param(520, ge=0, doc="shorter side of what the network sees; 0 leaves the image as it is", unit="px")
-    confidence_threshold: float = Param(0.0, ge=0, le=1, live=True, doc="pixels below become void (255)")
+    confidence_threshold: float = Param(0.0, ge=0, le=1, tunable=True, doc="pixels below become void (255)")
     class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")
-    with_confidence: bool = Param(False, live=True, doc="also give the confidence of every pixel")
+    with_confidence: bool = Param(False, tunable=True, doc="also give the confidence of every pixel")
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError, or ModelError for missing weights, devices or classes."""

@@ -62,7 +62,7 @@ class LidarSlam(LidarOdometry):
     max_violation: float = Param(
         0.04, ge=0, lt=0.5, doc="most of a scan that hangs in what the other saw to be free; twice that where expected"
     )
-    period: int = Param(10, ge=1, live=True, doc="keyframes from map to map")
+    period: int = Param(10, ge=1, tunable=True, doc="keyframes from map to map")
 
     def setup(self) -> None:
         """Raises FileNotFoundError or ValueError for a saved map that is none."""

@@ -83,7 +83,7 @@ class VisualSlam(Operator):
     min_overlap: float = Param(0.2, gt=0, le=1, doc="least share of the depth image that both views see")
     min_agreement: float = Param(0.8, gt=0, le=1, doc="least share of that which lies on the same surfaces")
     voxel: float = Param(0.05, gt=0.005, doc="side of the voxels that the map's points are thinned to", unit="m")
-    period: int = Param(10, ge=1, live=True, doc="keyframes from map to map")
+    period: int = Param(10, ge=1, tunable=True, doc="keyframes from map to map")
 
     _slam: RgbdSlam | None = None
     _calibration: Calibration | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -11,18 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Transforms
+from dataflow.messages.depth_units import FIFTHS, INVALID, MILLIMETRES, DepthSpan
 from dataflow.messages.geometry import normalize
 from dataflow.operator import Out, Param, Source, SourceError
 from operators.sources.rgbd_layouts import (
     Dataset,
     Frame,
     Intrinsics,
+    Place,
     detect_layout,
     list_7scenes,
     list_tum,
 )
 
 Size = tuple[int, int]
+
+_PROBED = 12
+"""Depth images, evenly spread over the folder, that show its unit."""
+_IDENTITY: Place = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class RgbdFolder(Source):
@@ -31,6 +38,10 @@ class RgbdFolder(Source):
     Image and depth of a frame carry one stamp: the colour image's in TUM, first_stamp + N / rate for frame N of
     7-Scenes, exact in nanoseconds and the same for any start, stop and stride. Ground truth is the depth camera's pose
     and absent at frames that have none. Every frame's files must be there when the graph starts.
+
+    Without `depth_scale`, a unit is the layout's, unless depth images from all over the folder show that it is the
+    other common one: a depth camera sees little that is nearer than 0.3 m or farther than 10 m. That is logged as a
+    warning, and so is doubt.
     """
 
     image: Out[Image] = Out(doc="colour")
@@ -49,6 +60,18 @@ class RgbdFolder(Source):
     start: int = Param(0, ge=0, doc="first frame read, counted in the folder")
     stop: int | None = Param(None, ge=1, doc="frame to stop before; none reads to the end")
     stride: int = Param(1, ge=1, doc="read every stride-th frame")
+    depth_scale: float | None = Param(
+        None,
+        gt=0,
+        doc="units of the depth images: how many a metre has (1000: millimetres); none takes the layout's (7-Scenes: "
+        "1000, TUM: 5000) or the other of these, whichever the values show",
+        unit="1/m",
+    )
+    registered: bool | None = Param(
+        None,
+        doc="depth lies on the pixels of the colour image, as if one camera took both; none is as in the layout "
+        "(7-Scenes: false, TUM: true)",
+    )
     max_depth: float = Param(6.0, gt=0, doc="larger depths are taken as no return", unit="m")
     image_intrinsics: tuple[float, float, float, float] | None = Param(
         None,
@@ -59,13 +82,13 @@ class RgbdFolder(Source):
     depth_intrinsics: tuple[float, float, float, float] | None = Param(
         None, doc="fx, fy, cx, cy of the depth camera instead of the folder's camera-intrinsics.txt", unit="px"
     )
-    T_depth_image: tuple[float, float, float, float, float, float, float] | None = Param(
+    T_depth_image: Place | None = Param(
         None,
         doc="x, y, z, qx, qy, qz, qw of the colour camera in the depth camera's frame instead of the layout's "
         "(7-Scenes: 2.5 cm to the right, as a Kinect v1 is built; TUM: none, for its depth is registered)",
         unit="m",
     )
-    T_base_depth: tuple[float, float, float, float, float, float, float] | None = Param(
+    T_base_depth: Place | None = Param(
         None,
         doc="x, y, z, qx, qy, qz, qw of the depth camera on what carries it, z up; none leaves the base out",
         unit="m",
@@ -95,18 +118,20 @@ class RgbdFolder(Source):
             self.use_file(folder / "camera-intrinsics.txt")
         self._image_size = _size(read_color(self._frames[0]))
         self._depth_size = _size(read_depth(self._frames[0]))
+        self._place = self._placed()
+        self._image_camera, self._depth_camera = self._cameras()
+        self._scale = self._dataset.depth_scale if self.depth_scale is None else self.depth_scale
+        if self.depth_scale is None:
+            self._scale = self._probed(self._scale)
 
     def static_outputs(self) -> Mapping[str, Message]:
-        stamp, data = self._frames[0].stamp, self._dataset
-        T_depth_image = data.T_depth_image if self.T_depth_image is None else self.T_depth_image
-        places = {(self.depth_frame, self.image_frame): _transform("T_depth_image", T_depth_image)}
+        stamp = self._frames[0].stamp
+        places = {(self.depth_frame, self.image_frame): _transform("T_depth_image", self._place)}
         if self.T_base_depth is not None:
             places = {(self.base_frame, self.depth_frame): _transform("T_base_depth", self.T_base_depth), **places}
-        image = _camera(self.image_intrinsics, data.image_intrinsics)
-        depth = _camera(self.depth_intrinsics, data.depth_intrinsics)
         return {
-            "image_info": _info(stamp, self.image_frame, self._image_size, image),
-            "depth_info": _info(stamp, self.depth_frame, self._depth_size, depth),
+            "image_info": _info(stamp, self.image_frame, self._image_size, self._image_camera),
+            "depth_info": _info(stamp, self.depth_frame, self._depth_size, self._depth_camera),
             "extrinsics": Transforms(
                 stamp=stamp,
                 frames=tuple(frame for frame, _ in places),
@@ -122,7 +147,7 @@ class RgbdFolder(Source):
             color, raw = read_color(frame), read_depth(frame)
             self._check_size(frame, frame.image, _size(color), self._image_size)
             self._check_size(frame, frame.depth, _size(raw), self._depth_size)
-            depth = depth_in_metres(raw, self._dataset.depth_scale, self._dataset.invalid, self.max_depth)
+            depth = depth_in_metres(raw, self._scale, self.max_depth)
             messages: dict[str, Message] = {
                 "image": Image(stamp=frame.stamp, frame=self.image_frame, data=color),
                 "depth": DepthImage(stamp=frame.stamp, frame=self.depth_frame, data=depth),
@@ -143,11 +168,69 @@ class RgbdFolder(Source):
             return list_tum(folder)
         return list_7scenes(folder, self.rate, self.first_stamp)
 
+    @property
+    def _registered(self) -> bool:
+        return self._dataset.registered if self.registered is None else self.registered
+
+    def _placed(self) -> Place:
+        """T_depth_image."""
+        if self.registered and self.T_depth_image is not None:
+            raise SourceError("registered: true and T_depth_image exclude each other: registered depth has its place")
+        if self.T_depth_image is not None:
+            return self.T_depth_image
+        if self._registered:
+            return _IDENTITY
+        if self._dataset.T_depth_image is None:
+            raise SourceError("registered: false needs T_depth_image, the place of the colour camera at the depth one")
+        return self._dataset.T_depth_image
+
+    def _cameras(self) -> tuple[Intrinsics, Intrinsics]:
+        """Those of colour and of depth, which are one where depth is registered."""
+        data = self._dataset
+        if not self._registered or (self.image_intrinsics and self.depth_intrinsics):
+            image = _camera(self.image_intrinsics, data.image_intrinsics)
+            return image, _camera(self.depth_intrinsics, data.depth_intrinsics)
+        if self._image_size != self._depth_size:
+            raise SourceError(
+                f"{self.path}: depth is registered to colour, but its images have {_pixels(self._depth_size)} pixels "
+                f"and those of colour {_pixels(self._image_size)}: give registered: false and T_depth_image, or the "
+                "image_intrinsics and depth_intrinsics of these sizes"
+            )
+        camera = _camera(self.image_intrinsics or self.depth_intrinsics, data.depth_intrinsics)
+        return camera, camera
+
+    def _probed(self, own: float) -> float:
+        """The units a metre that depth images from all over the folder show; `own` are the layout's."""
+        frames = self._dataset.frames
+        read = (_depth_pixels(frame) for frame in frames[:: max(1, len(frames) // _PROBED)])
+        probed = [pixels[::4, ::4].ravel() for pixels in read if pixels is not None and pixels.dtype == np.uint16]
+        if not probed:
+            return own
+        span = DepthSpan.of(np.concatenate(probed), own)
+        if span is None:
+            return own
+        other = MILLIMETRES if own == FIFTHS else FIFTHS
+        verdict, there = span.judged(own / other), span.times(own / other)
+        if verdict == "other":
+            self.log.warning(
+                f"depth images are read as {other:g} units a metre, where their layout has {own:g}: depth is then "
+                f"{there}, not {span}; depth_scale: {own:g} reads them as the layout has it"
+            )
+            return other
+        if verdict == "neither":
+            self.log.warning(f"depth is {span}, with {own:g} units a metre; depth_scale sets another unit")
+        if verdict == "either":
+            self.log.log(
+                logging.INFO if span.seen else logging.WARNING,
+                f"depth images are read as {own:g} units a metre, as their layout has it: depth is then {span}; "
+                f"depth_scale: {other:g} would make it {there}",
+            )
+        return own
+
     def _check_size(self, frame: Frame, file: Path, found: Size, expected: Size) -> None:
         if found != expected:
             raise SourceError(
-                f"frame {frame.name}: {file} has {found[0]}x{found[1]} pixels, "
-                f"but the first frame {expected[0]}x{expected[1]}"
+                f"frame {frame.name}: {file} has {_pixels(found)} pixels, but the first frame {_pixels(expected)}"
             )
 
 
@@ -161,7 +244,7 @@ def read_color(frame: Frame) -> NDArray[np.uint8]:
 
 def read_depth(frame: Frame) -> NDArray[np.uint16]:
     """(H, W) in the dataset's own units. Raises SourceError."""
-    pixels = cv2.imread(str(frame.depth), cv2.IMREAD_UNCHANGED)
+    pixels = _depth_pixels(frame)
     if pixels is None:
         raise SourceError(f"frame {frame.name}: {_why(frame.depth)} as a depth image")
     if pixels.dtype != np.uint16 or pixels.ndim != 2:
@@ -171,13 +254,15 @@ def read_depth(frame: Frame) -> NDArray[np.uint16]:
     return np.asarray(pixels, np.uint16)
 
 
-def depth_in_metres(
-    raw: NDArray[np.uint16], scale: float, invalid: tuple[int, ...], max_depth: float
-) -> NDArray[np.float32]:
+def _depth_pixels(frame: Frame) -> NDArray[np.generic] | None:
+    return cv2.imread(str(frame.depth), cv2.IMREAD_UNCHANGED)
+
+
+def depth_in_metres(raw: NDArray[np.uint16], scale: float, max_depth: float) -> NDArray[np.float32]:
     """Metres (H, W) float32 of raw values, `scale` units a metre; 0 for invalid ones and those beyond `max_depth`."""
     metres = (np.arange(65536) / scale).astype(np.float32)
     metres[metres > np.float32(max_depth)] = 0
-    metres[list(invalid)] = 0
+    metres[list(INVALID)] = 0
     return metres[raw]
 
 
@@ -191,6 +276,10 @@ def _transform(name: str, numbers: Sequence[float]) -> tuple[NDArray[np.float64]
 
 def _why(file: Path) -> str:
     return f"cannot decode {file} ({file.stat().st_size} bytes)" if file.is_file() else f"no file {file} to read"
+
+
+def _pixels(size: Size) -> str:
+    return f"{size[0]}x{size[1]}"
 
 
 def _size(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> Size:

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.depth_units import FIFTHS, MILLIMETRES
 from dataflow.messages.geometry import transform_matrix
 from dataflow.operator import SourceError
 from operators.association import mutually_nearest
@@ -19,6 +20,7 @@ from operators.sources.pacing import frame_stamp
 
 Matrix = NDArray[np.float64]
 LayoutName = Literal["7scenes", "tum"]
+Place = tuple[float, float, float, float, float, float, float]
 
 _TUM_GAP = 20_000_000  # ns: images farther apart than this are no pair, as in the dataset's own associate.py
 _FRAME = re.compile(r"frame-(\d+)\.(?:color\.(?:jpg|png)|depth\.png|pose\.txt)")
@@ -59,17 +61,21 @@ class Frame:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Dataset:
-    """A listed folder. One unit of a depth image is `1 / depth_scale` metres; the values in `invalid` are no return.
+    """A listed folder, as its layout has it. One unit of a depth image is `1 / depth_scale` metres.
 
-    `T_depth_image` is x, y, z (m), qx, qy, qz, qw of the colour camera in the depth camera's frame.
+    `T_depth_image` is x, y, z (m), qx, qy, qz, qw of the colour camera in the depth camera's frame; None: depth is
+    registered to colour, so that one camera took both.
     """
 
     frames: Sequence[Frame]
     depth_scale: float
-    invalid: tuple[int, ...]
     image_intrinsics: Intrinsics
     depth_intrinsics: Intrinsics
-    T_depth_image: tuple[float, float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    T_depth_image: Place | None
+
+    @property
+    def registered(self) -> bool:
+        return self.T_depth_image is None
 
 
 def detect_layout(folder: Path) -> LayoutName:
@@ -114,7 +120,7 @@ def list_7scenes(folder: Path, rate: float, first_stamp: int) -> Dataset:
         frames.append(Frame(numbers[number], stamp, folder / image, folder / f"{stem}.depth.png", pose))
     depth = _intrinsics_file(folder) or Intrinsics(585.0, 585.0, 320.0, 240.0)
     color = Intrinsics(525.0, 525.0, depth.cx, depth.cy)
-    return Dataset(frames, 1000.0, (0, 65535), color, depth, (0.025, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    return Dataset(frames, MILLIMETRES, color, depth, (0.025, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
 
 
 def list_tum(folder: Path) -> Dataset:
@@ -147,7 +153,7 @@ def list_tum(folder: Path) -> Dataset:
         pose = _tum_pose(folder, *truth[poses[i]]) if i in poses else None
         frames.append(Frame(image, stamp, folder / image, folder / depths[j][1][0], pose))
     K = _intrinsics_file(folder) or Intrinsics(525.0, 525.0, 319.5, 239.5)
-    return Dataset(frames, 5000.0, (0,), K, K)
+    return Dataset(frames, FIFTHS, K, K, None)
 
 
 def nearest_rotation(M: Matrix) -> Matrix:

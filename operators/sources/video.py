@@ -123,7 +123,7 @@ class Webcam(_Video):
     policy begins anew.
     """
 
-    live = True
+    real_time = True
 
     input: str = Param("0", min_length=1, doc="number, device file or address of the camera")
     width: int | None = Param(None, ge=1, unit="px", doc="width to ask for; the camera may give another")

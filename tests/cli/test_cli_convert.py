@@ -75,7 +75,7 @@ def test_every_format_is_written_from_the_command_line(
     assert target.exists()
     assert told["files"]
     assert all(Path(file).exists() for file in told["files"])
-    assert set(told["source"]) == {"notes", "missing", "repaired", "unread", "lost", "static"}
+    assert set(told["source"]) == {"notes", "missing", "repaired", "unread", "lost", "static", "doubted"}
 
 
 OPTIONS = {
@@ -88,7 +88,7 @@ OPTIONS = {
     "--clock": ("OUT", "--to", "csv", "--clock", "log"),
     "--action": ("OUT", "--to", "lerobot", "--action", "/pose"),
     "--task": ("OUT", "--to", "lerobot", "--task", "look"),
-    "--depth": ("OUT", "--to", "csv", "--depth", "/depth"),
+    "--depth": ("OUT", "--to", "csv", "--depth", "/depth=5000"),
     "--lossy": ("OUT", "--to", "kitti-raw", "--lossy"),
     "--strict": ("OUT", "--to", "csv", "--strict"),
     "--overwrite": ("OUT.mcap", "--to", "mcap", "--overwrite"),
@@ -282,3 +282,22 @@ def test_every_option_of_commands_that_look_at_material_is_run(
     command = group.get_command(Context(group), name)  # type: ignore[attr-defined]
     offered = {option for p in command.params for option in p.opts if option.startswith("--") and option != "--help"}
     assert offered == {word for words in TRIED[name] for word in words if word.startswith("--")}
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--to", "mcap", "--depth", "/depth=mm"), "expected units a metre, such as 1000"),
+        (("--to", "ros2", "--depth", "/depth"), "--depth has no effect on ros2"),
+    ],
+)
+def test_a_unit_of_depth_that_cannot_be_used_is_refused(dataflow, drive: Path, tmp_path: Path, words, told) -> None:
+    assert told in dataflow("convert", drive, tmp_path / "o.mcap", *words, code=2).stderr
+
+
+def test_depth_of_a_recording_is_in_metres(dataflow, drive: Path, tmp_path: Path) -> None:
+    dataflow("convert", drive, tmp_path / "own.mcap", "--to", "mcap")
+
+    said = dataflow("convert", tmp_path / "own.mcap", tmp_path / "o", "--to", "csv", "--depth", "depth", code=2).stderr
+
+    assert "its depth is in metres" in said

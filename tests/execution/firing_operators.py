@@ -186,7 +186,7 @@ class Dice(Operator):
 
     x: In[FeatureVector]
     y: Out[FeatureVector]
-    gain: float = Param(1.0, doc="factor", live=True)
+    gain: float = Param(1.0, doc="factor", tunable=True)
     shared: bool = Param(False, doc="also draws from the global generators")
 
     def setup(self) -> None:

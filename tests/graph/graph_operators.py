@@ -49,7 +49,7 @@ class Camera(Source):
 class Device(Camera):
     """A camera that does not wait."""
 
-    live = True
+    real_time = True
 
 
 class CloudBuilder(Operator):

@@ -82,7 +82,7 @@ def test_description_holds_ports_parameters_bounds_units_and_docs() -> None:
         "default": 30.0,
         "bounds": "> 0",
         "unit": "Hz",
-        "live": False,
+        "tunable": False,
         "doc": "pictures a second",
     }
     assert [(o["name"], o["types"], o["static"]) for o in camera["outputs"]] == [

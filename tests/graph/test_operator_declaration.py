@@ -20,11 +20,18 @@ class Good(Operator, merge=True, every="100ms"):
     pose: Sampled[Pose] = Sampled(required=False, before="50ms")
     clouds: Batch[PointCloud | Pose] = Batch(max=3)
     found: Out[Pose] = Out(lag="1s")
-    gain: float = Param(0.5, ge=0, doc="gain", live=True)
+    gain: float = Param(0.5, ge=0, doc="gain", tunable=True)
 
     def process(self, image, pose, clouds, context):
         return None
 """
+
+
+def test_names_of_the_past_are_refused_with_those_of_today() -> None:
+    with pytest.raises(TypeError, match="tunable=True"):
+        exec("class X(Operator):\n    gain: float = Param(0.5, doc='gain', live=True)", dict(NAMES))
+    with pytest.raises(OperatorDefinitionError, match=r"X\.live was renamed: .* is real_time"):
+        exec("class X(Source):\n    live = True\n    image: Out[Image]", dict(NAMES))
 
 
 def test_a_declaration_is_read_whole() -> None:

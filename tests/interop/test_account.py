@@ -173,10 +173,32 @@ def test_16_bit_images_are_8_bits_or_depth_where_that_is_asked_for(tmp_path: Pat
     bag = write_ros2(tmp_path / "bag", [("/d", s, image(s, "mono16", deep.tobytes(), 6, 4, 12)) for s in STAMPS])
 
     converted(bag, tmp_path / "lossy.mcap", wishes=Wishes(lossy=True))
-    converted(bag, tmp_path / "depth.mcap", wishes=Wishes(depth=("/d",)))
+    converted(bag, tmp_path / "depth.mcap", wishes=Wishes(depth={"/d": 1000}))
 
     assert type(read(tmp_path / "lossy.mcap", "d")[0]) is Image
     assert read(tmp_path / "depth.mcap", "d")[0].data[0, 0] == np.float32(1.234)
+
+
+@pytest.mark.parametrize("encoding", ["mono16", "16UC1"])
+def test_depth_is_of_the_units_that_are_given_and_doubtful_ones_are_named(tmp_path: Path, encoding: str) -> None:
+    deep = np.full((16, 16), 15_000, np.uint16)
+    bag = write_ros2(tmp_path / "bag", [("/d", s, image(s, encoding, deep.tobytes(), 16, 16, 32)) for s in STAMPS])
+
+    as_they_are = converted(bag, tmp_path / "mm.mcap", wishes=Wishes(depth={"/d": 1000}))
+    given = converted(bag, tmp_path / "units.mcap", wishes=Wishes(depth={"/d": 5000}))
+
+    assert "with 5000 units a metre it is 3 to 3 m" in as_they_are.account.doubted["/d"]
+    assert not given.account.doubted
+    assert read(tmp_path / "units.mcap", "d")[0].data[0, 0] == 3.0
+
+
+def test_depth_in_metres_has_no_units(tmp_path: Path) -> None:
+    deep = np.full((4, 6), 1.23456, np.float32)
+    bag = write_ros2(tmp_path / "bag", [("/d", s, image(s, "32FC1", deep.tobytes(), 6, 4, 24)) for s in STAMPS])
+
+    account = converted(bag, tmp_path / "d.mcap", wishes=Wishes(depth={"/d": 5000})).account
+
+    assert "not of 16-bit units" in account.unread["/d"].reason
 
 
 def test_static_transforms_that_change_are_told(tmp_path: Path) -> None:
@@ -231,7 +253,7 @@ def test_a_depth_topic_that_is_none_is_refused_with_what_it_is(tmp_path: Path) -
     opened = open_bag(bag)
 
     with pytest.raises(BagError, match="read as Imu, which cannot be depth"):
-        readable(opened, bag, wishes=Wishes(depth=("/imu",)))
+        readable(opened, bag, wishes=Wishes(depth={"/imu": 1000}))
     opened.close()
 
 

@@ -23,7 +23,7 @@ def value(stamp: int, number: float) -> FeatureVector:
 class Count(Source):
     """Counts, and raises at `fails_at` in each of its first `failures` lives."""
 
-    live = True
+    real_time = True
     count: Out[FeatureVector]
     number: int = Param(10, ge=0, doc="how many")
     fails_at: int = Param(-1, doc="where")
@@ -45,7 +45,7 @@ class Count(Source):
 class Blocks(Source):
     """Waits for `let_go` after its first step, as a driver waits for an image, and notes the order of its ends."""
 
-    live = True
+    real_time = True
     count: Out[FeatureVector]
     waiting = threading.Event()
     let_go = threading.Event()

@@ -115,7 +115,7 @@ class Smooth(Operator, every="70ms"):
 
     x: In[FeatureVector]
     mean: Out[FeatureVector]
-    weight: float = Param(0.25, ge=0, le=1, live=True, doc="of what comes")
+    weight: float = Param(0.25, ge=0, le=1, tunable=True, doc="of what comes")
 
     def setup(self) -> None:
         self.state, self.calls = 0.0, 0

@@ -18,7 +18,7 @@ from dataflow.operator import In, Operator, Out, Param, Sampled, Source
 class Device(Source):
     """Counts at the rate of the clock, like a sensor; stamps are wall time."""
 
-    live = True
+    real_time = True
     count: Out[FeatureVector]
     period: float = Param(0.01, gt=0, doc="seconds")
     steps: int = Param(100, ge=1, doc="how many")

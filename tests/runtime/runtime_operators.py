@@ -239,7 +239,7 @@ class Tuned(Operator):
 
     x: In[FeatureVector]
     y: Out[FeatureVector]
-    factor: float = Param(1.0, ge=0, le=10, live=True, doc="weight of what comes")
+    factor: float = Param(1.0, ge=0, le=10, tunable=True, doc="weight of what comes")
 
     def setup(self) -> None:
         self.total = 0.0

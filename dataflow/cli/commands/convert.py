@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -70,6 +71,15 @@ SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
 _MCAP = ("mcap", "foxglove", "ros2")
 """Formats that have places for attachments and metadata records."""
 
+Depth = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--depth",
+        metavar="TOPIC[=UNITS]",
+        help="16-bit images of this topic are depth of so many units a metre: 1000 unless given.",
+    ),
+]
+
 
 def convert(
     recording: AnyRecording,
@@ -92,10 +102,7 @@ def convert(
         str | None, typer.Option("--action", metavar="STREAM", help="Of lerobot: the stream that is the action.")
     ] = None,
     task: Annotated[str, typer.Option("--task", metavar="TEXT", help="Of lerobot: what is done.")] = "",
-    depth: Annotated[
-        list[str] | None,
-        typer.Option("--depth", metavar="TOPIC", help="16-bit grey images of this topic are depth, in millimetres."),
-    ] = None,
+    depth: Depth = None,
     lossy: Annotated[
         bool, typer.Option("--lossy", metavar=FLAG, help="Write values with fewer bits where the format has fewer.")
     ] = False,
@@ -150,6 +157,7 @@ def convert(
                 raise fail(f"the format of {output} is not known: give one with --to: {', '.join(get_args(Format))}")
             to = "rrd"
         _check_output(output, to, overwrite)
+        scales = _depth_scales(depth or (), to)
         if to == "rrd":
             from dataflow.cli.support.drawing import draw_recording, drawn_as_json, report
             from dataflow.view import Save
@@ -166,7 +174,7 @@ def convert(
             return
         from dataflow.interop.playing import Wishes
 
-        wishes = Wishes(tuple(depth or ()), lossy=lossy, strict=strict)
+        wishes = Wishes(scales, lossy=lossy, strict=strict)
         if not to.startswith("lerobot") and (action is not None or task):
             raise fail("--action and --task are of --to lerobot and lerobot-v3")
         with (
@@ -229,6 +237,24 @@ def _check_output(output: Path, to: str, overwrite: bool) -> None:
         raise fail(f"{output} exists; {to} is written to a new or empty folder")
     elif output.exists():
         output.rmdir()
+
+
+def _depth_scales(words: Iterable[str], to: Format) -> dict[str, float]:
+    """Topic → units a metre."""
+    from dataflow.messages.depth_units import MILLIMETRES
+
+    if words and to in ("rrd", "ros2"):
+        raise fail(f"--depth has no effect on {to}: convert to mcap with it, and that to {to}")
+    scales = {}
+    for word in words:
+        topic, given, units = word.partition("=")
+        try:
+            scales[topic] = float(units) if given else MILLIMETRES
+        except ValueError:
+            scales[topic] = 0.0
+        if not 1 <= scales[topic] < math.inf:
+            raise fail(f"--depth {word}: expected units a metre, such as 1000 where they are millimetres")
+    return scales
 
 
 @contextmanager

@@ -135,17 +135,17 @@ def list_(
         resolved = _graph(found)
         operators, _, values = _asked(None, graph, wait, timeout)
     rows = [
-        {"parameter": f"{op}.{name}", "value": p.value, "live": p.live, **_declared(resolved, op, name)}
+        {"parameter": f"{op}.{name}", "value": p.value, "tunable": p.tunable, **_declared(resolved, op, name)}
         for op, parameters in values.items()
         for name, p in parameters.items()
-        if p.live or every
+        if p.tunable or every
     ]
     if json:
         print_json(rows)
     elif rows:
         shown = table("parameter", "value", *(("changes while running",) if every else ()), "bounds", "meaning")
         for row in rows:
-            cells = [row["parameter"], _text(row["value"]), *((("yes" if row["live"] else ""),) if every else ())]
+            cells = [row["parameter"], _text(row["value"]), *((("yes" if row["tunable"] else ""),) if every else ())]
             shown.add_row(*(Text(cell) for cell in (*cells, row["bounds"], row["doc"])))
         out.print(shown)
     else:
@@ -182,7 +182,7 @@ def dump(
         operators, _, values = _asked(None, graph, wait, timeout)
     lines: list[str] = []
     for operator, parameters in values.items():
-        shown = {name: p.value for name, p in parameters.items() if p.live or every}
+        shown = {name: p.value for name, p in parameters.items() if p.tunable or every}
         if shown:
             lines.append(f"{json_module.dumps(operator, ensure_ascii=False)}:")
             lines += [f"  {n}: {json_module.dumps(jsonable(v), ensure_ascii=False)}" for n, v in shown.items()]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from dataflow.interop.account import Account
-from dataflow.interop.bag import Bag, Stored, Topic
+from dataflow.interop.bag import Bag, BagError, Stored, Topic
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign, open_bag
 from dataflow.interop.playing import PLAIN, Wishes, readable
@@ -45,6 +45,8 @@ class Material:
                 namespace = ""
                 self.account = self._source.account
             else:
+                if wishes.depth:
+                    raise BagError(f"{self.path} is a recording: its depth is in metres, and no topic of it is made so")
                 self._source = Recording(self.path)
                 namespace = self._source.metadata.get(RECORDING, {}).get("namespace", "")
                 self.account = Account(list(self.bag.notes))

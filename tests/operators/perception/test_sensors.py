@@ -16,7 +16,7 @@ def test_it_stands_for_a_device_whose_calibrations_are_static() -> None:
     streams = load_text(GRAPH).streams
 
     assert node.source
-    assert HandedSensors.live
+    assert HandedSensors.real_time
     static = {port for port, name in node.outputs.items() if streams[name].static}
     assert static == {"image_info", "depth_info", "extrinsics"}
     assert {port: streams[name].types for port, name in node.outputs.items() if port not in static} == {

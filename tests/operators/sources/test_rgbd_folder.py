@@ -230,3 +230,116 @@ def test_a_truth_of_another_clock_is_named_with_both_times(tmp_path: Path) -> No
 
     with pytest.raises(SourceError, match=r"groundtruth\.txt: none of its 1 poses .* 1700000000\.000 to"):
         read(tmp_path)
+
+
+def ramp(near: float, far: float, scale: float) -> np.ndarray:
+    """A depth image that goes evenly from near to far, metres, with some of no return."""
+    raw = np.linspace(near, far, 48).reshape(6, 8) * scale
+    raw[0, :2], raw[1, 0] = 0, 65535
+    return np.rint(raw).astype(np.uint16)
+
+
+def depth_of(folder: Path, **params: object) -> float:
+    """The depth (m) of the last pixel of the last frame."""
+    return float(read(folder, max_depth=50, **params)[1][-1]["depth"].data[-1, -1])  # type: ignore[attr-defined]
+
+
+def fill(folder: Path, raw: np.ndarray) -> Path:
+    """Replaces the depth images of a folder of either layout."""
+    for file in folder.rglob("*.png"):
+        if "color" not in file.name and file.parent.name != "rgb":
+            cv2.imwrite(str(file), raw)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("write", "unit", "guessed"),
+    [(write_tum, 1000, True), (write_tum, 5000, False), (write_7scenes, 5000, True), (write_7scenes, 1000, False)],
+)
+def test_the_values_show_the_unit_of_depth(tmp_path: Path, write, unit, guessed, caplog) -> None:  # type: ignore[no-untyped-def]
+    caplog.set_level("INFO")
+    folder = fill(write(tmp_path), ramp(0.8, 4.0, unit))
+
+    assert depth_of(folder) == pytest.approx(4.0, abs=1e-3)
+    assert depth_of(folder, start=1, stop=2) == pytest.approx(4.0, abs=1e-3)
+    assert [("depth_scale" in r.message, r.levelname) for r in caplog.records] == [(True, "WARNING")] * 2 * guessed
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "level"),
+    [
+        (0.4, 1.9, "INFO"),  # a table top; in millimetres a room
+        (0.1, 1.6, "WARNING"),  # near a wall; in millimetres a room
+        (12.0, 13.0, "WARNING"),  # far in either unit
+    ],
+)
+def test_doubt_about_the_unit_leaves_the_layouts_and_is_said_once(  # type: ignore[no-untyped-def]
+    tmp_path: Path, near: float, far: float, level: str, caplog
+) -> None:
+    caplog.set_level("INFO")
+    folder = fill(write_tum(tmp_path), ramp(near, far, 5000))
+
+    depth_of(folder)
+
+    assert [r.levelname for r in caplog.records] == [level]
+    assert "5000 units a metre" in caplog.records[0].message
+
+
+def test_a_given_unit_is_taken_without_a_word(tmp_path: Path, caplog) -> None:  # type: ignore[no-untyped-def]
+    caplog.set_level("INFO")
+    folder = fill(write_tum(tmp_path), ramp(0.8, 4.0, 1000))
+
+    assert depth_of(folder, depth_scale=4000) == pytest.approx(1.0, abs=1e-3)
+    assert not caplog.records
+
+
+def test_a_damaged_image_beyond_what_is_read_does_not_count(tmp_path: Path) -> None:
+    fill(write_7scenes(tmp_path), ramp(0.8, 4.0, 1000))
+    (tmp_path / "frame-000002.depth.png").write_bytes(b"junk")
+
+    assert depth_of(tmp_path, stop=2) == pytest.approx(4.0)
+
+
+def test_registered_depth_is_of_the_colour_camera(tmp_path: Path) -> None:
+    statics = read(write_7scenes(tmp_path), registered=True)[0].static_outputs()
+
+    assert statics["image_info"].K.tolist() == statics["depth_info"].K.tolist()  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(statics["extrinsics"].matrix("camera_color_optical"), np.eye(4))  # type: ignore[attr-defined]
+
+
+def test_registration_that_contradicts_is_refused(tmp_path: Path) -> None:
+    place = (0.05, 0, 0, 0, 0, 0, 1)
+    with pytest.raises(SourceError, match="registered: false needs T_depth_image"):
+        read(write_tum(tmp_path / "tum"), registered=False)
+    source, _ = read(tmp_path / "tum", registered=False, T_depth_image=place)
+    assert source.static_outputs()["extrinsics"].matrix("camera_color_optical")[0, 3] == 0.05  # type: ignore[attr-defined]
+    with pytest.raises(SourceError, match="exclude each other"):
+        read(tmp_path / "tum", registered=True, T_depth_image=place)
+    fill(tmp_path / "tum", DEPTH[:4])
+    with pytest.raises(SourceError, match=r"registered to colour, but its images have 8x4 pixels and those of .* 8x6"):
+        read(tmp_path / "tum")
+    read(tmp_path / "tum", image_intrinsics=(5, 5, 4, 3), depth_intrinsics=(5, 5, 4, 2))
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("folder", ["rgbd_7scenes", "scenes/fr1_rpy", "scenes/cup_table"])
+def test_real_folders_have_their_layouts_unit(data_dir: Path, folder: str, caplog) -> None:  # type: ignore[no-untyped-def]
+    source = RgbdFolder(path=str(data_dir / folder))
+    source.setup()
+
+    assert not caplog.records
+
+
+@pytest.mark.data
+def test_real_millimetres_in_the_layout_of_tum_are_read_as_such(data_dir: Path, tmp_path: Path, caplog) -> None:  # type: ignore[no-untyped-def]
+    lists: dict[str, list[str]] = {"rgb": [], "depth": []}
+    for k in range(0, 250, 25):
+        for name, file in (("rgb", f"frame-{k:06d}.color.jpg"), ("depth", f"frame-{k:06d}.depth.png")):
+            lists[name].append(f"{k / 30:.6f} {data_dir / 'rgbd_7scenes' / file}")
+    for name, lines in lists.items():
+        (tmp_path / f"{name}.txt").write_text("\n".join(lines))
+
+    depth = read(tmp_path)[1][0]["depth"]
+
+    assert 1.0 < np.median(depth.data[depth.data > 0]) < 3.0  # type: ignore[attr-defined]
+    assert "depth_scale" in caplog.text

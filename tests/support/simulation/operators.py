@@ -67,7 +67,7 @@ class Counter(Source):
 class Device(Counter):
     """As `Counter`, but with the stamps of the clock: it cannot wait."""
 
-    live = True
+    real_time = True
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         begun = Effort.now()
@@ -360,7 +360,7 @@ class Placed(Operator):
     x: In[FeatureVector]
     constant: Sampled[FeatureVector]
     y: Out[FeatureVector]
-    gain: float = Param(1.0, doc="factor", live=True)
+    gain: float = Param(1.0, doc="factor", tunable=True)
     size: int = Param(3000, ge=1, doc="numbers in each message")
 
     def process(self, x: FeatureVector, constant: FeatureVector) -> FeatureVector:

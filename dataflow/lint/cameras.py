@@ -1,0 +1,42 @@
+"""Checks that calibrations are those of the images beside them: of their size, with the axis within the image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from dataflow.lint.finding import Finding
+from dataflow.lint.material import Material
+from dataflow.messages import CameraInfo, DepthImage, Image, Image16
+
+_TYPES = {cls.SCHEMA for cls in (CameraInfo, DepthImage, Image, Image16)}
+
+
+def check_cameras(material: Material) -> Iterator[Finding]:
+    """Looks at the first message of each raw image and calibration; one frame is taken for one camera.
+
+    Images of several sizes in one frame are right where each size has a calibration.
+    """
+    images: dict[str, tuple[str, int, int]] = {}
+    infos: dict[str, dict[str, CameraInfo]] = {}
+    for name, facts in material.streams.items():
+        if not (facts.readable and facts.count and facts.type in _TYPES):
+            continue
+        message = next(iter(material.messages(name)), None)
+        if isinstance(message, CameraInfo):
+            infos.setdefault(message.frame, {})[name] = message
+        elif isinstance(message, DepthImage | Image | Image16):
+            images[name] = (message.frame, message.data.shape[1], message.data.shape[0])
+    for name, (frame, width, height) in images.items():
+        known = infos.get(frame, {})
+        if known and (width, height) not in {(info.width, info.height) for info in known.values()}:
+            sizes = ", ".join(f"{stream} of {info.width}x{info.height}" for stream, info in known.items())
+            text = f"its images have {width}x{height} pixels, the calibration of frame {frame!r} others: {sizes}"
+            yield Finding("calibration", name, "warning", text)
+    for of_frame in infos.values():
+        for name, info in of_frame.items():
+            if not (0 < info.cx < info.width and 0 < info.cy < info.height):
+                text = (
+                    f"its principal point ({info.cx:.0f}, {info.cy:.0f}) lies outside its {info.width}x{info.height} "
+                    "pixels: is it the calibration of another resolution?"
+                )
+                yield Finding("calibration", name, "warning", text)

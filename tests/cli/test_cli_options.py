@@ -1,0 +1,166 @@
+"""Every option that `--help` names is accepted and used once, on a tiny recording; what another test tries is said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer import Context
+from typer.main import get_command
+
+from dataflow.cli.main import app
+from dataflow.cli.registry import BUILT_IN
+
+TRIED: tuple[str, ...] = (
+    "demo --to OUT.rrd --seconds 1 --quiet --json",
+    "run GRAPH --one-process --record OUT.mcap --overwrite --compression lz4 --readable group --record-failure end"
+    " --split-every 1h --split-size 1GB --keep-disk 3GB --set count=4 --path HERE --log-level info --paranoid"
+    " --timeout 60 --quiet --json",
+    "run GRAPH --set count=4 --place left=a --rate 1000 --verbose --view OUT.rrd --open --overwrite",
+    "run GRAPH --set count=4 --process-each --live --chaos CHAOS --chaos-seed 3 --quiet",
+    "replay RECORDING --one-process --record OUT.mcap --overwrite --compression none --readable all --quiet --json"
+    " --record-failure end --split-every 1h --split-size 1GB --keep-disk 3GB --path HERE --paranoid --timeout 60",
+    "replay RECORDING --graph GRAPH --set count=30 --process-each --rate 1000 --start 0 --end 10ms --quiet",
+    "replay RECORDING --place left=a --verbose --view OUT.rrd --open --overwrite",
+    "replay RECORDING --one-process --network --loop 2",
+    "replay RECORDING --complete OUT.mcap",
+    "verify RECORDING --one-process --only sum --start 0 --paranoid --path HERE --junit OUT.xml --tolerance 1e-6"
+    " --quiet --json",
+    "verify RECORDING --graph GRAPH --set count=30 --process-each --jobs 2",
+    "verify RECORDING --baseline OUT.json --accept",
+    "check GRAPH --path HERE --set count=4 --json",
+    "show GRAPH --path HERE --set count=4 --json",
+    "show GRAPH --mermaid",
+    "operators --path HERE --json",
+    "messages --path HERE --json",
+    "graphs --json",
+    "info RECORDING --digests --metadata --json",
+    "diff RECORDING RECORDING --stream mean --tolerance 0.1 --json",
+    "cut RECORDING --from 0 --to 1ms --out OUT.mcap --overwrite --compression lz4 --bare --quiet --json",
+    "cut RECORDING --out OUT.mcap --from 0 --duration 1ms",
+    "filter RECORDING --stream left/* --without fast --out OUT.mcap --overwrite --compression lz4 --quiet --json",
+    "split RECORDING --every 10ms --out OUT --overwrite --compression lz4 --quiet --json",
+    "split RECORDING --out OUT --size 1MB",
+    "merge RECORDING OTHER --prefix OTHER=other/ --out OUT.mcap --overwrite --compression lz4 --quiet --json",
+    "recover RECORDING --out OUT.mcap --overwrite --compression lz4 --quiet --json",
+    "latency RECORDING --path HERE --json",
+    "lint RECORDING --write-contract OUT.yaml --overwrite --quick --json",
+    "lint RECORDING --contract CONTRACT",
+    "view RECORDING --to OUT.rrd --overwrite --stream left/* --without fast --start 0 --end 1 --clock auto",
+    "logs RECORDING --last 3 --level info --operator sum --json",
+    "list --json",
+    "new operator Near --kind timer --to OUT --json",
+    "new graph near --to OUT --json",
+    "new project near --to OUT --json",
+)
+"""Commands as they are typed."""
+
+UNANSWERED: tuple[str, ...] = (
+    "echo sum/total --graph none --wait 0 --count 1 --once --field value --full --json",
+    "hz --graph none --wait 0 --seconds 1 --window 5 --json",
+    "top --graph none --wait 0 --every 1 --once --json",
+    "logs --graph none --wait 0 --follow",
+    "pub in/x {} --graph none --wait 0 --count 1 --rate 1 --timeout 1 --json",
+    "pub in/x {} --graph none --stamp 1",
+    "record --graph none --wait 0 --seconds 1 --out OUT.mcap --overwrite --compression lz4 --readable all --quiet"
+    " --split-every 1h --split-size 1GB --json",
+    "playback pause --graph none --wait 0 --json",
+    "trigger --graph none --wait 0 --json",
+    "view --graph none --wait 0 --every 2 --to OUT.rrd",
+    "foxglove --graph none --wait 0 --port 0 --host 127.0.0.1",
+    "param set sum.x 1 --graph none --wait 0 --timeout 1 --json",
+    "param get sum.x --graph none --wait 0 --timeout 1 --json",
+    "param list --all --graph none --wait 0 --timeout 1 --json",
+    "param dump --all --graph none --wait 0 --timeout 1 --out OUT.yaml --overwrite",
+    "param load VALUES --graph none --wait 0 --timeout 1",
+)
+"""Commands for a running graph, where none runs: `test_cli_live.py`, `test_param_top.py` and others have one."""
+
+ELSEWHERE: dict[str, tuple[str, str]] = {
+    "convert": ("*", "tests/cli/test_cli_convert.py has a table"),
+    "doctor": ("--json", "it measures the machine for seconds: tests/doctor"),
+    "completion": ("--install", "it writes into the home folder: test_cli_completion.py"),
+    "run": ("--step", "it needs a terminal's keys: tests of playback"),
+    "replay": ("--step --map --clock --strict", "a terminal, bags: test_cli_bags.py"),
+    "view": ("--import", "another file of Rerun: tests of the view"),
+    "foxglove": ("--start --end --clock --speed --stream", "a server that goes on until Ctrl-C: tests/foxglove"),
+    "verify": ("--from", "the state before a moment: tests/verification"),
+}
+"""By command, options that are not tried here, and why."""
+
+
+def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Every built-in command with the words that call it."""
+    if not hasattr(group, "list_commands"):
+        yield " ".join(words), group
+        return
+    for name in group.list_commands(Context(group)):
+        found = group.get_command(Context(group), name)
+        if found is not None and (words or name in {each.called for each in BUILT_IN}):
+            yield from commands(found, (*words, name))
+
+
+@pytest.fixture(scope="module")
+def places(small: Path, recorded: tuple[Path, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    folder = tmp_path_factory.mktemp("places")
+    (folder / "chaos.yaml").write_text("faults:\n  - {at: 10s, kind: freeze, operator: smooth, for: 1s}\n")
+    (folder / "contract.yaml").write_text("streams: {}\n")
+    (folder / "values.yaml").write_text("sum: {x: 1}\n")
+    (folder / "other.mcap").write_bytes(recorded[0].read_bytes())
+    return {
+        "OTHER": str(folder / "other.mcap"),
+        "VALUES": str(folder / "values.yaml"),
+        "GRAPH": str(small),
+        "RECORDING": str(recorded[0]),
+        "HERE": str(Path(__file__).parent),
+        "CHAOS": str(folder / "chaos.yaml"),
+        "CONTRACT": str(folder / "contract.yaml"),
+    }
+
+
+def typed(line: str, places: dict[str, str], tmp_path: Path) -> list[str]:
+    found = []
+    for word in line.split():
+        first, given, rest = word.partition("=")
+        found.append((str(tmp_path / word) if word.startswith("OUT") else places.get(first, first)) + given + rest)
+    return found
+
+
+@pytest.mark.parametrize("line", TRIED, ids=lambda line: " ".join(line.split()[:3]))
+def test_a_command_takes_its_options(dataflow, places: dict[str, str], tmp_path: Path, line: str) -> None:
+    if ".rrd" in line:
+        pytest.importorskip("rerun")
+
+    dataflow(*typed(line, places, tmp_path))
+
+    assert all(list(tmp_path.glob("OUT*")) for word in line.split() if word.startswith("OUT"))
+
+
+@pytest.mark.parametrize("line", UNANSWERED, ids=lambda line: " ".join(line.split()[:2]))
+def test_a_command_for_a_running_graph_says_that_none_runs(
+    dataflow, places: dict[str, str], tmp_path: Path, line: str
+) -> None:
+    said = dataflow(*typed(line, places, tmp_path), code=2).stderr
+
+    assert "Usage" not in said
+    assert "none" in said or "no graph" in said
+
+
+def test_every_option_of_every_command_is_tried() -> None:
+    untried = {}
+    for called, command in commands(get_command(app)):
+        words = {w for line in (*TRIED, *UNANSWERED) if f"{line} ".startswith(f"{called} ") for w in line.split()}
+        elsewhere = ELSEWHERE.get(called, ("", ""))[0].split()
+        offered = [set(p.opts) for p in command.params if not p.hidden and p.opts[0].startswith("-")]
+        left = [" or ".join(opts) for opts in offered if not opts & {*words, *elsewhere, "--help"}]
+        if left and elsewhere != ["*"]:
+            untried[called] = left
+        gone = (
+            {*elsewhere, *(w for w in words if w.startswith("--"))}
+            - {"*"}
+            - {o for p in command.params for o in p.opts}
+        )
+        assert not gone, f"{called} has no {gone}"
+    assert not untried
