@@ -135,7 +135,11 @@ def plain(value: Any, place: str = "state") -> Any:
         case Mapping():
             return [[plain(key, place), plain(item, f"{place}[{key!r}]")] for key, item in value.items()]
         case set() | frozenset():
-            return sorted(plain(item, place) for item in value)
+            items = [plain(item, place) for item in value]
+            try:
+                return sorted(items)
+            except TypeError:
+                raise StateError(f"{place} is a set of values that have no order; use a dict or a list") from None
         case list() | tuple():
             return [plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
         case _:

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -132,11 +134,16 @@ def passes(checkout: Path, tests: str) -> bool:
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", "--timeout", "120", tests]
     environment = os.environ | {"PYTHONPATH": str(checkout)}
     environment.setdefault("PERCEPTION_DATA", str(REPOSITORY.parent / "shared" / "data"))
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    ended = subprocess.Popen(command, cwd=checkout, env=environment, start_new_session=True, **quiet)
     try:
-        ended = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, timeout=LIMIT)
+        return ended.wait(LIMIT) == 0
     except subprocess.TimeoutExpired:
         return False
-    return ended.returncode == 0
+    finally:
+        with contextlib.suppress(ProcessLookupError):  # none is left of its group
+            os.killpg(ended.pid, signal.SIGKILL)
+        ended.wait()
 
 
 def main(arguments: list[str] | None = None) -> int:

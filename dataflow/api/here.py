@@ -28,7 +28,8 @@ def _answer(call: Call) -> Any:
     shared, letter = os.memfd_create("board"), os.memfd_create("answer")
     try:
         with closing(Board(shared, call.operators)) as board:
-            write_letter(letter, {"value": function(call.request, board)})
+            write_letter(letter, call.request)  # a worker gets plain values, too
+            write_letter(letter, {"value": function(read_letter(letter), board)})
         return read_letter(letter)["value"]
     except Exception as error:
         text = getattr(error, "traceback", None) or "".join(traceback.format_exception(error))

@@ -27,28 +27,30 @@ _SCHEMAS = {
 """Schemas whose messages may be packets of video."""
 
 
-def with_key_frames(origins: Sequence[Origin], start: int, streams: Collection[str] | None = None) -> int:
-    """Returns the latest stamp (ns) up to `start` from which the video of a recording can be decoded by `start`.
+def key_frames(
+    origins: Sequence[Origin], starts: Sequence[int], streams: Collection[str] | None = None
+) -> list[dict[str, int]]:
+    """Returns for each of `starts` (stamps in ns, increasing), by stream of video, that of its last key frame up to it.
 
-    `origins`: the files of the recording, the earlier first; `streams`: those that count, None: all. Where a stream has
-    packets and no key frame before, it does not count.
+    `origins`: the files of the recording, the earlier first; `streams`: those that count, None: all. A stream that has
+    no key frame before a start is left out there.
     """
-    found: dict[str, int] = {}
-    for origin in reversed(origins):
+    found: list[dict[str, int]] = [{} for _ in starts]
+    for origin in origins:
         for channel in origin.of_kind(Kind.STREAM).values():
-            if channel.topic in found or (streams is not None and channel.topic not in streams):
-                continue
-            key = _key_before(origin, channel, start)
-            if key is not None:
-                found[channel.topic] = key
-    return min([start, *found.values()])
+            if streams is None or channel.topic in streams:
+                for known, key in zip(found, _keys_before(origin, channel, starts), strict=True):
+                    if key is not None:
+                        known[channel.topic] = max(key, known.get(channel.topic, key))
+    return found
 
 
-def _key_before(origin: Origin, channel: Channel, start: int) -> int | None:
-    """The stamp of the last key frame of a channel up to `start`; None where it has none, or no video."""
+def _keys_before(origin: Origin, channel: Channel, starts: Sequence[int]) -> list[int | None]:
+    """The stamps of the last key frame of a channel up to each start; None where it has none, or no video."""
+    nothing: list[int | None] = [None for _ in starts]
     schema = origin.file.schemas.get(channel.schema_id)
     if schema is None or schema.name not in _SCHEMAS:
-        return None
+        return nothing
     entries = origin.entries(channel.id)
     text = SchemaText(schema.name, schema.encoding, schema.data)
     topic = Topic(
@@ -57,16 +59,24 @@ def _key_before(origin: Origin, channel: Channel, start: int) -> int | None:
     try:
         reader = reader_of(topic)
     except RecordingError:
-        return None
-    before = np.flatnonzero(entries.times <= start)
-    for place in before[np.argsort(entries.times[before], kind="stable")][::-1][:FARTHEST].tolist():
-        time, chunk, offset = (int(column[place]) for column in entries.columns)
-        packet = _packet(reader, bytes(origin.file.read(channel.id, chunk, offset, time).data), time)
-        if packet is None:
-            return None
-        if is_key(packet.format, packet.data.tobytes()):
-            return time
-    return None
+        return nothing
+    order = np.argsort(entries.times, kind="stable")
+    ends = np.searchsorted(entries.times[order], np.asarray(starts, np.int64), "right").tolist()
+    keys: list[int | None] = []
+    looked, last = 0, -1
+    """The packets before `looked` need no second look: the last key frame among them is `last`, by rank."""
+    for end in ends:
+        for rank in range(end - 1, max(looked, end - FARTHEST) - 1, -1):
+            time, chunk, offset = (int(column[order[rank]]) for column in entries.columns)
+            packet = _packet(reader, bytes(origin.file.read(channel.id, chunk, offset, time).data), time)
+            if packet is None:
+                return nothing
+            if is_key(packet.format, packet.data.tobytes()):
+                last = rank
+                break
+        looked = end
+        keys.append(int(entries.times[order[last]]) if last >= max(0, end - FARTHEST) else None)
+    return keys
 
 
 def _packet(reader: TopicReader, data: bytes, time: int) -> CompressedVideo | None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from dataflow.editing.key_frames import with_key_frames
+from dataflow.editing.key_frames import key_frames
 from dataflow.editing.report import Edited, Watch, unwatched
-from dataflow.editing.spans import SpanRecords, Stamps, records_of_span
+from dataflow.editing.spans import Span, SpanRecords, Stamps, records_of_span
 from dataflow.graph import GraphError
 from dataflow.graph.model import Graph, Node, OperatorImportError
 from dataflow.interop.bag import is_latched
@@ -31,18 +31,23 @@ class Part:
     """Names what is to be taken over: the span (ns, inclusive; None: not cut there), and streams (None: all).
 
     A file that is written of it begins with the key frames of its video, which may be earlier. `bare`: exactly the
-    messages of the span, without firing records.
+    messages of the span, without firing records. `spans`: those of streams of video that are chosen already.
     """
 
     start: int | None = None
     end: int | None = None
     streams: Collection[str] | None = None
     bare: bool = False
+    spans: Mapping[str, Span] = field(default_factory=dict)
 
     @property
     def cuts(self) -> bool:
         """Tells whether it leaves out anything before or after the span."""
         return self.start is not None or self.end is not None
+
+    def span(self, stream: str) -> Span:
+        """Returns the span of a stream."""
+        return self.spans.get(stream, (self.start, self.end))
 
 
 def write_part(
@@ -81,9 +86,10 @@ def write_part(
 
 def decodable(origins: Sequence[Origin], part: Part, done: Edited) -> Part:
     """Returns the part from the key frames on with which the video in it can be decoded; notes that in `done`."""
-    if part.start is None or part.bare:
+    if part.start is None or part.bare or part.spans:
         return part
-    start = with_key_frames(origins, part.start, part.streams)
+    [keys] = key_frames(origins, [part.start], part.streams)
+    start = min([part.start, *keys.values()])
     if start < part.start:
         done.notes.append(f"it begins {(part.start - start) * 1e-9:.3f} s earlier, with a key frame of its video")
     return replace(part, start=start)
@@ -180,7 +186,7 @@ def _firings(origin: Origin, part: Part, done: Edited) -> SpanRecords | None:
         stored = {origin.stream(c) for c in origin.of_kind(Kind.STREAM).values()}
         if part.streams is not None:
             stored &= set(part.streams)
-        found = records_of_span(records, outputs_of(graph), stored, part.start, part.end)
+        found = records_of_span(records, outputs_of(graph), stored, part.start, part.end, part.span)
         done.unknown = tuple(n for n in found.unknown if n not in graph.nodes or keeps_state(graph.nodes[n]))
         return found
 
@@ -199,10 +205,11 @@ def masks_of(origin: Origin, part: Part, needed: Stamps) -> dict[int, Mask]:
             continue
         mask = np.ones(len(times), bool)
         if not origin.is_static(channel):
-            if part.start is not None and not latched(origin, channel.topic):
-                mask &= times >= part.start
-            if part.end is not None:
-                mask &= times <= part.end
+            start, end = part.span(stream)
+            if start is not None and not latched(origin, channel.topic):
+                mask &= times >= start
+            if end is not None:
+                mask &= times <= end
             extra = needed.get(stream, {}).get(origin.incarnation(channel), ())
             if extra and origin.kind(channel) in (Kind.STREAM, Kind.COMPANION):
                 mask |= np.isin(times, np.fromiter(extra, np.int64, len(extra)))
@@ -225,8 +232,10 @@ def _describe(origin: Origin, kept: Mapping[int, Mask], part: Part, done: Edited
             continue
         times = origin.entries(channel.id).times[kept[channel.id]]
         if len(times):
-            low, high = int(times.min()), int(times.max())
-            outside = (times < (part.start or low)) | (times > (high if part.end is None else part.end))
+            start, end = part.span(channel.topic)
+            outside = (times < (times.min() if start is None else start)) | (
+                times > (times.max() if end is None else end)
+            )
             done.beyond += int(outside.sum())
             inside = times[~outside]
             if len(inside):
@@ -244,10 +253,10 @@ def _metadata(origin: Origin, kept: Mapping[int, Mask], part: Part) -> list[tupl
     digests = metadata.pop(DIGESTS, {})
     metadata[DIGESTS] = {s: d for s, d in digests.items() if after.get(s) == before.get(s)}
     ends = {s: json.loads(text) for s, text in metadata.get(ENDS, {}).items() if s in after}
-    if part.end is not None:
-        for end in ends.values():
-            if end["final"] is not None:
-                end["final"] = min(end["final"], part.end)
+    for stream, end in ends.items():
+        _, last = part.span(stream)
+        if end["final"] is not None and last is not None:
+            end["final"] = min(end["final"], last)
     if ends:
         metadata[ENDS] = {stream: json.dumps(end) for stream, end in ends.items()}
     if part.cuts:

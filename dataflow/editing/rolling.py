@@ -43,7 +43,7 @@ def keep_span(
         origins = [stack.enter_context(Origin(file)) for file in files]
         part = decodable(origins, part, done)
         stored = {origin.stream(c) for origin in origins for c in origin.of_kind(Kind.STREAM).values()}
-        chosen = records_of_span(records, outputs_of(graph), stored, part.start, part.end)
+        chosen = records_of_span(records, outputs_of(graph), stored, part.start, part.end, part.span)
         told = _told(records, outputs_of(graph))
         kept = once(origins, [_until(origin, masks_of(origin, part, chosen.needed), told) for origin in origins])
         written = {name: dict(values) for origin in origins for name, values in origin.metadata.items()}

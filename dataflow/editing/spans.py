@@ -6,7 +6,7 @@ holds, besides the span, what its firings took before it. An operator without a 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +19,10 @@ from dataflow.sync import messages_of
 Place = tuple[int, int]
 Stamps = Mapping[str, Mapping[int, Collection[int]]]
 """Stream → incarnation → stamps."""
+Span = tuple[int | None, int | None]
+"""The first and the last stamp (ns; None: not cut there)."""
+Within = Callable[[str, int], bool]
+"""Returns whether a stamp of a stream lies within the span."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +74,19 @@ def records_of_span(
     stored: Collection[str],
     start: int | None,
     end: int | None,
+    span: Callable[[str], Span],
 ) -> SpanRecords:
     """Chooses the records of the span from `start` to `end` (ns, inclusive; None: not cut there).
 
     `log`: the records of each operator; `outputs`: its streams in the order of its ports; `stored`: the streams that
     the recording holds. Other streams are made again, so their producers are repeated from where it is needed.
+    `span`: that from which the messages of a stream are taken over.
     """
+
+    def within(stream: str, stamp: int) -> bool:
+        low, high = span(stream)
+        return (low is None or stamp >= low) and (high is None or stamp <= high)
+
     operators = {name: _operator(records, tuple(outputs.get(name, ())), end) for name, records in log.items()}
     makers = {stream: name for name, streams in outputs.items() for stream in streams}
     if start is not None:
@@ -93,11 +104,11 @@ def records_of_span(
                 if made.held.stamp - 1 < bounds[maker]:
                     bounds[maker] = made.held.stamp - 1
                     moved.append(maker)
-    needed = _needed(operators, makers, start, end)
+    needed = _needed(operators, makers, within)
     records: dict[str, list[FiringRecord]] = {}
     unknown: list[str] = []
     for name, operator in operators.items():
-        held = _held(operator, stored, needed, start, end)
+        held = _held(operator, stored, needed, within)
         records[name] = _with_cut(operator, held)
         if operator.left_out and not any(map(_takes_up, records[name])):
             unknown.append(name)
@@ -151,13 +162,13 @@ def _taken(records: Iterable[FiringRecord]) -> Iterable[tuple[str, Place]]:
 
 
 def _needed(
-    operators: Mapping[str, _Operator], makers: Mapping[str, str], start: int | None, end: int | None
+    operators: Mapping[str, _Operator], makers: Mapping[str, str], within: Within
 ) -> dict[str, dict[int, set[int]]]:
     """The stamps of messages outside of the span that kept calls took or made."""
     needed: dict[str, dict[int, set[int]]] = {}
 
     def note(held: Held) -> None:
-        if not _within(held.stamp, start, end):
+        if not within(held.stream, held.stamp):
             needed.setdefault(held.stream, {}).setdefault(held.incarnation, set()).add(held.stamp)
 
     for operator in operators.values():
@@ -172,9 +183,7 @@ def _needed(
     return needed
 
 
-def _held(
-    operator: _Operator, stored: Collection[str], needed: Stamps, start: int | None, end: int | None
-) -> list[Held]:
+def _held(operator: _Operator, stored: Collection[str], needed: Stamps, within: Within) -> list[Held]:
     """Messages that the part holds and whose records are not kept."""
     found = []
     for stream in operator.streams:
@@ -187,7 +196,7 @@ def _held(
                 continue
             if made.index >= 0 and operator.records[made.index].kind == "setup":
                 continue  # static: the first one is kept
-            if _within(held.stamp, start, end) or held.stamp in extra.get(held.incarnation, ()):
+            if within(held.stream, held.stamp) or held.stamp in extra.get(held.incarnation, ()):
                 found.append(held)
     return sorted(found, key=lambda held: (held.stream, held.place))
 
@@ -234,7 +243,3 @@ def _taken_up(operator: _Operator) -> Taken:
 
 def _takes_up(record: FiringRecord) -> bool:
     return is_known(record) or (taken_by(record) is not None and "state" in record.detail)
-
-
-def _within(stamp: int, start: int | None, end: int | None) -> bool:
-    return (start is None or stamp >= start) and (end is None or stamp <= end)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from dataflow.editing.key_frames import with_key_frames
+from dataflow.editing.key_frames import key_frames
 from dataflow.editing.part import Part, write_part
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.recording.errors import RecordingError
@@ -33,23 +33,37 @@ def split(
     `every`: event time of a part (ns); `size`: bytes in the file that a part takes of this one, what a part holds
     besides for its firings aside. Raises `RecordingError`.
     """
-    spans = _from_key_frames(origin, by_time(origin, every) if every is not None else by_size(origin, size or 1))
-    if len(spans) > MOST_PARTS:
-        raise RecordingError(f"{origin.path} would become {len(spans):,} parts; at most {MOST_PARTS:,} are written")
-    width = max(3, len(str(len(spans) - 1)))
-    names = [folder / f"{origin.path.stem}_{k:0{width}}.mcap" for k in range(len(spans))]
+    parts = _parts(origin, by_time(origin, every) if every is not None else by_size(origin, size or 1))
+    if len(parts) > MOST_PARTS:
+        raise RecordingError(f"{origin.path} would become {len(parts):,} parts; at most {MOST_PARTS:,} are written")
+    width = max(3, len(str(len(parts) - 1)))
+    names = [folder / f"{origin.path.stem}_{k:0{width}}.mcap" for k in range(len(parts))]
     if not overwrite and (there := [name for name in names if name.exists()]):
         raise RecordingError(f"{there[0]} exists already; choose another folder or ask to overwrite it")
     folder.mkdir(parents=True, exist_ok=True)
-    for k, (name, (start, end)) in enumerate(zip(names, spans, strict=True)):
-        part = Part(start if k else None, end if k < len(spans) - 1 else None)
+    for name, part in zip(names, parts, strict=True):
         yield write_part(origin, part, name, compression=compression, overwrite=overwrite, watch=watch)
 
 
-def _from_key_frames(origin: Origin, spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Returns spans that begin with the key frames of the video, where there is some; fewer where these are rare."""
-    starts = sorted({spans[0][0], *(with_key_frames([origin], start) for start, _ in spans[1:])})
-    return [*((a, b - 1) for a, b in pairwise(starts)), (starts[-1], spans[-1][1])]
+def _parts(origin: Origin, spans: list[tuple[int, int]]) -> list[Part]:
+    """Returns parts that begin with the earliest of the last key frames of all video before the spans, where there is
+    some, and each stream of video with its own; fewer where key frames are rare."""
+    starts = [start for start, _ in spans[1:]]
+    begins: dict[int, Mapping[str, int]] = {}
+    for start, keys in zip(starts, key_frames([origin], starts), strict=True):
+        begin = min([start, *keys.values()])
+        if begin > spans[0][0]:
+            begins.setdefault(begin, keys)
+    bounds: list[tuple[int | None, Mapping[str, int]]] = [(None, {}), *begins.items(), (None, {})]
+    parts = []
+    for (first, firsts), (end, ends) in pairwise(bounds):
+        own = {stream: (firsts.get(stream, first), _before(ends.get(stream, end))) for stream in {**firsts, **ends}}
+        parts.append(Part(first, _before(end), spans=own))
+    return parts
+
+
+def _before(stamp: int | None) -> int | None:
+    return None if stamp is None else stamp - 1
 
 
 def by_time(origin: Origin, every: int) -> list[tuple[int, int]]:

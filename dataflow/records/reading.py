@@ -58,7 +58,7 @@ class FiringLog:
         self._kept, self._origin, self._recording, self._start = kept, origin, recording, start
         self.begins: Mapping[str, int] = begins or {}
         self._outlines = dict(outlines or {})
-        stored = {} if recording is None else {n for n, count in recording.firing_batches().items() if count}
+        stored = [] if recording is None else [n for n, count in recording.firing_batches().items() if count]
         self.operators: Collection[str] = dict.fromkeys([*(name for name in kept if kept[name]), *stored])
         """The operators that left records."""
 

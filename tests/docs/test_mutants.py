@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
-from mutants import drawn, mutants_of
+from mutants import drawn, mutants_of, passes
 
 SOURCE = '''
 def share(a: int | None, b: float = 0.5) -> float:
@@ -42,3 +43,23 @@ def test_a_seed_draws_equal_faults(tmp_path: Path) -> None:
 
     assert drawn(tmp_path, 4, 1) == drawn(tmp_path, 4, 1) != drawn(tmp_path, 4, 2)
     assert len(drawn(tmp_path / "a.py", 60, 1)) == 10
+
+
+LEAVING = """
+import subprocess, sys
+def test_leaves_a_process():
+    left = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"])
+    open("left", "w").write(str(left.pid))
+"""
+
+
+def test_no_process_of_the_tests_is_left(tmp_path: Path) -> None:
+    (tmp_path / "test_leaving.py").write_text(LEAVING)
+
+    assert passes(tmp_path, "test_leaving.py")
+
+    left = Path("/proc") / (tmp_path / "left").read_text()
+    end = time.monotonic() + 10
+    while left.exists() and " Z " not in (left / "stat").read_text() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert not left.exists() or " Z " in (left / "stat").read_text()

@@ -157,7 +157,7 @@ def test_every_message_that_a_kept_firing_takes_is_kept_or_accounted_for(
             taken.append(record("op", len(taken), "snapshot", stamp, detail={"state": b"x"}))
     end = start + length
 
-    part = records_of_span({"cam": made, "op": taken}, {"cam": ("s",)}, {"s"}, start, end)
+    part = records_of_span({"cam": made, "op": taken}, {"cam": ("s",)}, {"s"}, start, end, lambda _: (start, end))
 
     stored = {e.seq for r in made for e in r.outputs if e and start <= e.stamp <= end}
     extra = {e.seq for r in made for e in r.outputs if e and e.stamp in part.needed.get("s", {}).get(0, ())}

@@ -38,14 +38,14 @@ def brute_force(pattern: str, key: str) -> bool:
     return parts(pattern.split("/"), key.split("/"))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=400, deadline=None)
 @given(PATTERNS, st.lists(KEYS, unique=True, max_size=6))
 def test_matching_is_by_definition_of_the_wildcards(pattern: str, keys: list[str]) -> None:
     assert key_fault(pattern) is None
     assert matching(canonical(pattern), keys) == sorted(key for key in keys if brute_force(pattern, key))
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=800, deadline=None)
 @given(ANY_PATTERNS, ANY_PATTERNS)
 def test_two_expressions_meet_and_are_spelled_as_zenoh_says(one: str, other: str) -> None:
     theirs = [zenoh.KeyExpr.autocanonize(key) for key in (one, other)]

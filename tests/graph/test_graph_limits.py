@@ -69,6 +69,22 @@ def test_a_graph_that_would_grow_is_refused_at_its_line(
     assert said in problem.message
 
 
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        (tens("xxxxxxxxxx", '"{1}"', ""), 9, "more than 4,000,000 characters"),
+        (tens("[1, 1, 1, 1, 1, 1, 1, 1, 1, 1]", "[{1}]"), 8, "the graph has more than 300,000 values"),
+        (HEAD + "params: {b: [" + "0," * 100_000 + "]}\n", 4, "the file has more than 100,000 values"),
+    ],
+    ids=["text of texts", "list of lists", "values"],
+)
+def test_a_graph_that_would_grow_is_refused_at_the_limits_as_they_are(text: str, line: int, said: str) -> None:
+    problem = the_problem(text)
+
+    assert problem.line == line
+    assert said in problem.message
+
+
 def test_nested_graphs_are_limited_in_number_not_only_in_depth() -> None:
     files = {
         f"n{i}.yaml": f"graph: n{i}\noperators:\n" + "".join(f"  a{k}: {{use: n{i + 1}.yaml}}\n" for k in range(10))

@@ -46,6 +46,11 @@ def test_reading_operators_one_by_one_or_in_one_pass_gives_the_same_batches() ->
             assert list(log.batches("tally", first, end)) == passed["tally"][first:end]
 
 
+def test_operators_have_one_order_in_every_process() -> None:
+    with Recording(KEPT) as recording:
+        assert list(FiringLog.read(recording).operators) == sorted(recording.firing_batches())
+
+
 def test_batches_in_memory_come_before_those_of_the_recording() -> None:
     with Recording(KEPT) as recording:
         stored = list(FiringLog.read(recording).batches("tally"))

@@ -36,7 +36,8 @@ PLAN = {
 }
 
 
-@pytest.mark.parametrize(("placement", "seed"), [("one_process", 1), ("process_each", 2)])
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("placement", ["one_process", "process_each"])
 def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
     placement: str, seed: int, tmp_path: Path
 ) -> None:

@@ -94,14 +94,14 @@ def path(tmp_path: Path) -> Path:
 
 
 SMOOTH = f"smooth: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, live: {{{AGAIN}}}}}"
-FALLBACK = "{}: {{use: faulty_operators:Fallback, inputs: {{x: left/fast, other: smooth/mean}}, live: {{{}}}}}"
+FALLBACK = "{}: {{use: faulty_operators:Fallback, inputs: {{x: left/fast, other: smooth/mean}}{}}}"
 
 
 def test_a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on(path: Path) -> None:
     graph = robot(
         SMOOTH,
-        FALLBACK.format("other", "size: 1000"),
-        FALLBACK.format("without", "size: 1000, on_stale: drop"),
+        FALLBACK.format("other", ""),
+        FALLBACK.format("without", ", live: {size: 1000, on_stale: drop}"),
         count=250,
     )
 

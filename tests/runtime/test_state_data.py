@@ -186,6 +186,15 @@ def test_a_value_that_no_snapshot_can_hold_is_named_with_its_place() -> None:
         plain(state)
 
 
+def test_a_set_of_values_without_an_order_is_named_with_its_place() -> None:
+    @dataclass
+    class Holder:
+        seen: set[object]
+
+    with pytest.raises(StateError, match=r"state\.seen is a set of values that have no order; use a dict or a list"):
+        plain(Holder({1, "a"}))
+
+
 def test_a_state_whose_fields_have_no_defaults_is_named() -> None:
     @dataclass
     class Needs:

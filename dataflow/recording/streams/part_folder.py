@@ -193,9 +193,10 @@ class _JoinedIndex:
     def in_file_order(
         self, channels: Collection[int], start: int | None = None, end: int | None = None
     ) -> Iterator[Mapping[int, Entries]]:
+        reached = {(channel, k): after for channel in channels for k, _, after, _ in self._parts_of(channel)}
         for number, (index, owns) in enumerate(self._parts):
             here = {owns[channel]: channel for channel in channels if channel in owns}
-            after = {channel: a for channel in here.values() for k, _, a, _ in self._parts_of(channel) if k == number}
+            after = {channel: reached.get((channel, number)) for channel in here.values()}
             for part in index.in_file_order(list(here), start, end):
                 yield {here[own]: self._moved(number, found, after.get(here[own])) for own, found in part.items()}
 

@@ -18,11 +18,12 @@ class ClipSource(Source):
 
     format: str = Param("h264", doc="h264 or h265")
     lost: list[int] = Param([], doc="numbers of packets that are left out")
+    later: int = Param(0, doc="frames by which all are later")
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         for number, message in enumerate(messages(self.format)):
             if number not in self.lost:
-                yield {"video": message}
+                yield {"video": message.replace(stamp=message.stamp + self.later * PERIOD)}
 
 
 def messages(format_: str) -> list[CompressedVideo]:

@@ -121,6 +121,52 @@ def test_a_part_begins_with_a_key_frame_and_gives_the_same_images(recorded: Path
     assert images(tmp_path / "again.mcap", "another") == expected
 
 
+TWO = """
+graph: two
+namespace: test
+operators:
+  one: {use: clip_source:ClipSource}
+  other: {use: clip_source:ClipSource, params: {later: 5}}
+  decoder: {use: operators.codec:VideoDecoder, inputs: {video: other/video}}
+record: {snapshots: 80ms}
+"""
+"""Key frames lie at 0, 8 and 16 frames after the first second in `one`, at 5, 13 and 21 in `other`."""
+CAMERAS = ("test/one/video", "test/other/video")
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Path:
+    (tmp_path / "two.yaml").write_text(TWO)
+    run(load_graph(tmp_path / "two.yaml"), placement="one_process", record=tmp_path / "two.mcap")
+    return tmp_path / "two.mcap"
+
+
+def packets(path: Path, stream: str) -> list[int]:
+    """The numbers of the packets, counted in frames from the first second on."""
+    with Recording(path) as recording:
+        return [(m.message.stamp - 10**9) // PERIOD for m in recording.messages([stream])]
+
+
+def test_each_camera_of_a_split_part_begins_with_its_key_frame(two: Path, tmp_path: Path) -> None:
+    with Origin(two) as origin:  # without firing records no part holds what firings took
+        write_part(origin, Part(bare=True), tmp_path / "bare.mcap")
+    with Origin(tmp_path / "bare.mcap") as origin:
+        parts = [Path(part.path) for part in split(origin, tmp_path / "bare", every=14 * PERIOD)]
+    assert [packets(part, CAMERAS[0]) for part in parts] == [[*range(8)], [*range(8, 16)], [*range(16, 24)]]
+    assert [packets(part, CAMERAS[1]) for part in parts] == [[*range(5, 13)], [*range(13, 21)], [*range(21, 29)]]
+
+
+def test_split_parts_of_two_cameras_verify_and_are_the_whole(two: Path, tmp_path: Path) -> None:
+    with Origin(two) as origin:
+        parts = [Path(part.path) for part in split(origin, tmp_path / "parts", every=14 * PERIOD)]
+    for part in parts:
+        assert {v.verdict for v in verify(part).operators} == {"identical"}
+    assert verify(tmp_path / "parts").identical
+    for camera in CAMERAS:
+        assert packets(tmp_path / "parts", camera) == packets(two, camera)
+    assert images(tmp_path / "parts") == images(two)
+
+
 def test_split_parts_begin_with_key_frames_and_are_the_whole(recorded: Path, tmp_path: Path) -> None:
     with Origin(recorded) as origin:
         parts = list(split(origin, tmp_path, every=10 * PERIOD))
