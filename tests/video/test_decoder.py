@@ -84,11 +84,48 @@ def test_a_loss_of_all_numbers_shows_in_the_stamps(count: int) -> None:
     for k in range(10):
         decoder.decode(packets[k], k * PERIOD + k % 2 * 1_000_000)
     assert decoder.decode(packets[10 + count], (10 + count) * PERIOD) is None
-    assert decoder.lost.startswith("frame" if count == 17 else "a pause as long as that of 16 pictures")
+    assert decoder.lost.startswith("frame" if count in (15, 17) else "a pause as long as that of 10 pictures")
     decoder.decode(packets[0], 0)
-    for k in range(1, 10):  # a pause in which nothing is lost
-        frame = decoder.decode(packets[k], k * PERIOD + (k > 5) * 9 * PERIOD)
+    for k in range(1, 14):  # a pause in which nothing is lost, and no key frame can be: ten pictures have followed it
+        frame = decoder.decode(packets[k], k * PERIOD + (k > 9) * 9 * PERIOD)
         assert np.array_equal(frame, expected[k])
+    decoder.close()
+
+
+@pytest.mark.parametrize(
+    ("format_", "options", "group", "lost"),
+    [
+        ("h264", "", 50, range(50, 51)),  # the number is that of the last picture
+        ("h264", "", 34, range(34, 35)),
+        ("h264", "", 18, range(18, 19)),
+        ("h264", "", 17, range(17, 18)),  # and here the one that follows it
+        ("h264", "", 33, range(33, 34)),
+        ("h264", "", 8, range(5, 13)),  # a whole group, so that every number fits
+        ("h264", "", 24, range(3, 27)),
+        ("h265", "open-gop=0", 8, range(5, 13)),
+        ("h265", "open-gop=0", 24, range(3, 27)),
+    ],
+)
+def test_a_lost_key_frame_shows_in_the_stamps(format_: str, options: str, group: int, lost: range) -> None:
+    packets = clip(format_, count=2 * group + 2, group=group, options=options)
+    expected = decoded(format_, packets)
+    decoder = PacketDecoder(format_)
+    for k, packet in enumerate(packets):
+        if k not in lost:
+            frame = decoder.decode(packet, k * PERIOD + k % 2 * PERIOD // 10)
+            assert (frame is None) == (lost.stop <= k < 2 * group), decoder.lost
+            assert frame is None or np.array_equal(frame, expected[k])
+    decoder.close()
+
+
+@FORMATS
+@pytest.mark.parametrize("twice", [0, 3, 7, 8])
+def test_a_packet_that_comes_twice_gives_its_frame_twice(format_: str, twice: int) -> None:
+    packets = clip(format_)
+    decoder = PacketDecoder(format_)
+    for k, (packet, frame) in enumerate(zip(packets, decoded(format_, packets), strict=True)):
+        for _ in range(1 + (k == twice)):
+            assert np.array_equal(decoder.decode(packet, k * PERIOD), frame)
     decoder.close()
 
 
