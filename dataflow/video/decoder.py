@@ -78,29 +78,29 @@ class PacketDecoder:
         """Returns the pixels (H, W, 3) of a packet, RGB; None where it cannot be decoded.
 
         `stamp`: its time (ns), by which losses show that the numbers of pictures hide; None: not known. Raises
-        `VideoError` for a stream that is not decoded at all (B-frames), TimeoutError where OpenCV hangs.
+        `VideoError` for a stream whose first key frame announces what is not decoded (B-frames, larger pictures); later
+        on it is damage. TimeoutError where OpenCV hangs.
         """
         if self._group and data == self._group[-1]:
             return self._newest
+        begun = bool(self._sets)
         try:
             picture = self._headers.read(data)
-        except PacketError as error:
+            if picture.pixels > self.max_pixels:
+                raise VideoError(f"its pictures have {picture.pixels} pixels, more than max_pixels={self.max_pixels}")
+        except VideoError as error:
+            if not begun and not isinstance(error, PacketError):
+                raise
+            self._headers = _HEADERS[self.format]()
+            self._headers.learn(self._sets)  # and not those that came with the damage
             return self._lose(str(error))
-        if picture.pixels > self.max_pixels:
-            raise VideoError(f"its pictures have {picture.pixels} pixels, more than max_pixels={self.max_pixels}")
         new_sets = self._take_sets(picture)
         if picture.missing:
             return self._lose(picture.missing)
-        if picture.key:
-            self._pace = Pace()
-            self._pace.hides(stamp, picture.since)
-            return self._begin(data if picture.whole else self._sets + data, new_sets)
-        if self._capture is None:
-            return self._lose(self.lost)
-        if self._pace.hides(stamp, picture.since):
-            return self._lose(f"a pause as long as that of {picture.since} pictures: a key frame may be lost in it")
-        self._keep(data)
-        return self._only(self._capture.feed(data))
+        try:
+            return self._follow(data, picture, new_sets, stamp)
+        except VideoError as error:  # of OpenCV
+            return self._lose(str(error))
 
     def state(self) -> Mapping[str, Any] | None:
         """Returns a value from which `take_up` goes on alike; None where that were too many bytes."""
@@ -135,6 +135,18 @@ class PacketDecoder:
             return False
         self._sets = picture.sets if picture.whole else self._sets + picture.sets
         return True
+
+    def _follow(self, data: bytes, picture: Picture, new_sets: bool, stamp: int | None) -> NDArray[np.uint8] | None:
+        if picture.key:
+            self._pace = Pace()
+            self._pace.hides(stamp, picture.since)
+            return self._begin(data if picture.whole else self._sets + data, new_sets)
+        if self._capture is None:
+            return self._lose(self.lost)
+        if self._pace.hides(stamp, picture.since):
+            return self._lose(f"a pause as long as that of {picture.since} pictures: a key frame may be lost in it")
+        self._keep(data)
+        return self._only(self._capture.feed(data))
 
     def _begin(self, packet: bytes, new_sets: bool) -> NDArray[np.uint8] | None:
         """Decodes a key frame, by a new decoder where pictures may have another form."""
