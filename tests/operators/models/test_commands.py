@@ -86,6 +86,31 @@ def test_check_names_the_file_that_differs(one: Served, cache: Path) -> None:
     assert run("check", "net")[:2] == (1, "net: missing\n")
 
 
+def test_get_replaces_a_damaged_file(one: Served, cache: Path) -> None:
+    assert run("get", "net")[0] == 0
+    (cache / "net.onnx").write_bytes(CONTENT[:-1])
+    code, _, err = run("get", "net")
+    assert code == 0
+    assert f"{cache / 'net.onnx'} is not the file of net: its sha256 is " in " ".join(err.split())
+    assert (cache / "net.onnx").read_bytes() == CONTENT
+    one.code = 503
+    (cache / "net.onnx").write_bytes(CONTENT[:-1])
+    assert run("get", "net")[0] == 1
+
+
+def test_get_of_a_damaged_file_that_is_exported_names_what_to_do(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = model_of(CONTENT, export="make it").model_dump(exclude_none=True)
+    (tmp_path / "own.yaml").write_text(json.dumps({"models": {row.pop("name"): row}}))
+    monkeypatch.setenv(registry.REGISTRIES, str(tmp_path / "own.yaml"))
+    cache.mkdir()
+    (cache / "net.onnx").write_bytes(CONTENT[:-1])
+    code, _, err = run("get", "net")
+    assert code == 1
+    assert "Delete it, then get it anew: export it: make it" in " ".join(err.split())
+
+
 def test_a_model_that_is_exported_is_taken_from_a_file(cache: Path, tmp_path: Path) -> None:
     code, _, err = run("get", "rf_detr_nano")
     assert code == 1
