@@ -180,10 +180,7 @@ def _fetched(model: Model, console: Console) -> Path:
 
 def _place(model: Model) -> Path | None:
     """Returns the model's file where it is on this machine."""
-    try:
-        file = hub_file(model) if model.source.torchvision is not None else model.file
-    except (ModelError, ImportError):
-        return None
+    file = hub_file(model) if model.source.torchvision is not None else model.file
     return file if file.is_file() else None
 
 

