@@ -84,8 +84,8 @@ class Model(_Row):
 
     - `operator`: the import path of the operator that runs it; `params`: its parameters where others are not given.
     - `classes`: a list of names, the name of one (`coco`), or None for networks without.
-    - `sha256` of the file; None where it is exported by oneself. `bytes`: its size, where that is known. `exports`:
-      sha256 of other exports of the same network, which the row's parameters fit, too.
+    - `sha256` of the file; None where the user exports it. `bytes`: its size, where that is known. `exports`: sha256 of
+      other files of the same network, exported otherwise, which the row describes as well.
     - `published`: the authors' figure; `measured`: the one found here, with its command, or `not measured`.
     """
 

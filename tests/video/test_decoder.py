@@ -1,4 +1,4 @@
-"""Decoding packet by packet: the pixels of a second implementation, and no frame where packets are lost."""
+"""Decoding packet by packet: the pixels of FFmpeg called directly, and no frame where packets are lost."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WAYS = [
 
 
 @pytest.mark.parametrize(("format_", "options", "pixels"), WAYS)
-def test_each_packet_gives_the_pixels_of_a_second_implementation(format_: str, options: str, pixels: str) -> None:
+def test_each_packet_gives_the_pixels_of_ffmpeg_called_directly(format_: str, options: str, pixels: str) -> None:
     packets = clip(format_, options=options, pixels=pixels)
     expected = decoded(format_, packets)
     decoder = PacketDecoder(format_)
