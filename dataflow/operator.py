@@ -48,6 +48,7 @@ from dataflow.ports import (
 from dataflow.state import KEPT, Counts, Remembered, StateOf, fresh_state, plain, reset_state, state_hints, take_over
 
 __all__ = [
+    "FINDING",
     "KEPT",
     "Batch",
     "Context",
@@ -74,6 +75,9 @@ __all__ = [
     "outputs_of",
     "validate_parameters",
 ]
+
+FINDING = "finding"
+"""Key of a summary's text that stands among the first lines at a run's end: something is wrong with what was given."""
 
 
 class Operator:

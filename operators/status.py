@@ -8,9 +8,6 @@ import numpy as np
 
 from dataflow.messages import Diagnostics, Level
 
-FINDING = "finding"
-"""Name of a summary's text that stands among the first lines at a run's end: something is wrong with what was given."""
-
 Row = tuple[str, str, Level, Mapping[str, object]]
 """Name, text, level and figures of one entry."""
 

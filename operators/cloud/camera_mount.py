@@ -12,15 +12,11 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Counts, Duration, In, Operator, Out, Param, Sampled
-from operators.cloud.held import accelerated, held
-from operators.cloud.vertical import Vertical, find_vertical
+from operators.cloud.vertical import Vertical, accelerated, find_vertical, held
 from operators.geometry.extrinsics import transform_between, with_transform
 from operators.status import counted_status
 
 Array = NDArray[np.float64]
-
-_RIVAL = 0.1  # likelihood of another direction, from which a view does not decide
-_SURE = np.radians(4.0)  # standard deviation from which it does not either
 
 
 @dataclass
@@ -46,7 +42,7 @@ class CameraMount(Operator):
     with it; after `patience` the best one so far does, with a warning. The base is level where the camera's odometry
     began. Extrinsics that hold the base are passed on as they are.
 
-    Method: directions of surfaces as in Coughlan and Yuille, "Manhattan world", 1999, with a vertical alone.
+    Method: directions of surfaces as in Coughlan and Yuille, "Manhattan world", 1999.
     """
 
     cloud: In[PointCloud] = In(doc="points of a depth camera in its optical frame: x right, y down, z ahead")
@@ -72,7 +68,7 @@ class CameraMount(Operator):
         imu: Imu | None = None,
         motion: Odometry | None = None,
     ) -> dict[str, Any] | None:
-        """Raises ValueError where the extrinsics do not relate the accelerometer to the cloud."""
+        """Raises ValueError where no extrinsics relate the accelerometer to the cloud."""
         if self.state.done:
             return self._again(cloud, extrinsics)
         if extrinsics is not None and self.base_frame in (*extrinsics.frames, *extrinsics.child_frames):
@@ -84,22 +80,31 @@ class CameraMount(Operator):
             }
         self.state.counts["views"] += 1
         self.state.first = cloud.stamp if self.state.first is None else self.state.first
-        expected, information = held()
-        if imu is not None:
-            R = transform_between(extrinsics, imu.frame, cloud.frame)[:3, :3]
-            expected, information = accelerated(R @ imu.linear_acceleration)
+        expected, information = self._expected(cloud, extrinsics, imu)
         found = find_vertical(cloud.points, expected, information)
         if found is not None and motion is not None:
-            found = found.before(motion.matrix())
-        if found is not None and (self.state.best is None or _doubt(found) < _doubt(self.state.best)):
+            found = found.before(motion.matrix()) if np.isfinite(motion.matrix()).all() else None
+        if found is not None and (self.state.best is None or found.doubt < self.state.best.doubt):
             self.state.best = found
         patient = cloud.stamp - self.state.first < self.patience
-        if patient and (found is None or _doubt(found) > 1):
+        if patient and (found is None or found.doubt > 1):
             return None
         if self.state.best is None:
             self.state.best = Vertical(expected, np.asarray(np.linalg.inv(information), np.float64), 1.0, None)
         self.state.done = True
         return self._decided(cloud, extrinsics, self.state.best)
+
+    def _expected(self, cloud: PointCloud, extrinsics: Transforms | None, imu: Imu | None) -> tuple[Array, Array]:
+        """Returns where up is likely in the cloud's frame, with its information, before anything is seen."""
+        if imu is None:
+            return held()
+        if extrinsics is None and imu.frame != cloud.frame:
+            raise ValueError(f"imu is in frame {imu.frame!r} and cloud in {cloud.frame!r}: extrinsics must relate them")
+        if not np.isfinite(imu.linear_acceleration).all():
+            self.state.counts["accelerations_not_finite"] += 1
+            return held()
+        R = transform_between(extrinsics, imu.frame, cloud.frame)[:3, :3]
+        return accelerated(R @ imu.linear_acceleration)
 
     def _again(self, cloud: PointCloud, extrinsics: Transforms | None) -> dict[str, Any] | None:
         """Returns the completed extrinsics where those between the sensors have changed since."""
@@ -117,7 +122,7 @@ class CameraMount(Operator):
         down, roll = np.degrees(np.arcsin(-found.up[2])), np.degrees(np.arctan2(found.up[0], -found.up[1]))
         self.state.figures = {"looks down (°)": round(float(down), 1), "roll (°)": round(float(roll), 1)}
         self.state.figures |= {"sigma (°)": round(float(np.degrees(found.sigma)), 1), "height (m)": round(T[2, 3], 3)}
-        guess = _doubt(found) > 1
+        guess = found.doubt > 1
         ground = "no ground in sight" if found.height is None else f"{found.height:.2f} m above the ground"
         text = f"the camera looks {down:.0f}° down, turned by {roll:.0f}°, {ground}"
         text = f"few surfaces show where up is; taken so: {text}" if guess else text
@@ -134,11 +139,6 @@ class CameraMount(Operator):
 
 def _digest(extrinsics: Transforms | None) -> bytes:
     return b"" if extrinsics is None else extrinsics.digest()
-
-
-def _doubt(found: Vertical) -> float:
-    """Returns how much is lacking to a decision: up to 1 nothing is."""
-    return float(max(found.rival / _RIVAL, found.sigma / _SURE))
 
 
 def _on_base(found: Vertical) -> Array:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.messages import Transforms
 from dataflow.messages.geometry import invert, matrix_to_quaternion
 from operators.geometry.frame_tree import FrameTree, TransformError, told_by
 from operators.geometry.se3 import Matrix
+
+Array = NDArray[np.float64]
 
 
 def transform_between(extrinsics: Transforms | None, source: str, target: str) -> Matrix:
@@ -52,16 +56,41 @@ def _found(extrinsics: Transforms, source: str, target: str) -> Matrix:
 def with_transform(
     extrinsics: Transforms | None, stamp: int, frame: str, child_frame: str, T_frame_child: Matrix
 ) -> Transforms:
-    """Returns the extrinsics with one transform, in the place of that between the same two frames if they hold it."""
-    pairs = [] if extrinsics is None else list(zip(extrinsics.frames, extrinsics.child_frames, strict=True))
-    kept = [k for k, pair in enumerate(pairs) if set(pair) != {frame, child_frame}]
-    places, turns = [T_frame_child[:3, 3]], [matrix_to_quaternion(T_frame_child)]
+    """Returns the extrinsics, as the tree that they are, with `child_frame` at `T_frame_child` (4, 4) in `frame`.
+
+    Only the child is placed anew, with all that hangs below it. Where it is above `frame`, that one is placed instead;
+    where `frame` is new, all that the child belongs to is placed in it. Raises ValueError where the extrinsics hold
+    both frames and do not relate them.
+    """
+    rows: dict[str, tuple[str, Array, Array]] = {}
     if extrinsics is not None:
-        places, turns = [*extrinsics.translations[kept], *places], [*extrinsics.rotations[kept], *turns]
+        placed = zip(extrinsics.frames, extrinsics.translations, extrinsics.rotations, strict=True)
+        rows = dict(zip(extrinsics.child_frames, placed, strict=True))
+    above = list(_above(rows, child_frame))
+    if child_frame in _above(rows, frame):
+        frame, child_frame, T_frame_child = child_frame, frame, invert(T_frame_child)
+    if child_frame in rows:
+        known = frame in rows or any(parent == frame for parent, _, _ in rows.values())
+        other = rows[child_frame][0] if known else above[-1]
+        if known:
+            frame, T_frame_child = other, transform_between(extrinsics, frame, other) @ T_frame_child
+        else:
+            T_frame_child = T_frame_child @ transform_between(extrinsics, other, child_frame)
+            child_frame = other
+    rows[child_frame] = (frame, T_frame_child[:3, 3], matrix_to_quaternion(T_frame_child))
     return Transforms(
         stamp=stamp,
-        frames=(*(pairs[k][0] for k in kept), frame),
-        child_frames=(*(pairs[k][1] for k in kept), child_frame),
-        translations=np.array(places),
-        rotations=np.array(turns),
+        frames=tuple(parent for parent, _, _ in rows.values()),
+        child_frames=tuple(rows),
+        translations=np.array([position for _, position, _ in rows.values()]),
+        rotations=np.array([quaternion for _, _, quaternion in rows.values()]),
     )
+
+
+def _above(rows: Mapping[str, tuple[str, Array, Array]], frame: str) -> Iterator[str]:
+    """Yields the parent of a frame, that one's parent, and so on."""
+    for _ in range(len(rows)):
+        if frame not in rows:
+            return
+        frame = rows[frame][0]
+        yield frame

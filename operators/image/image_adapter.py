@@ -48,9 +48,5 @@ class ImageAdapter(Operator):
         adapted = image if pixels is image.data else image.replace(data=pixels)
         return {"adapted": adapted, "status": self._status(image.stamp, text)}
 
-    def summary(self) -> Mapping[str, int]:
-        """Counts images, those made brighter, and those of which noise was removed."""
-        return dict(self.state.counts)
-
     def _status(self, stamp: int, text: str) -> Diagnostics:
         return counted_status("image_adapter", stamp, text, Level.OK, self.state.counts)

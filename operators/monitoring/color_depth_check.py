@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Message, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
-from dataflow.operator import Counts, Duration, In, Operator, Out, Param, Sampled
+from dataflow.operator import FINDING, Counts, Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between, with_transform
 from operators.monitoring.edge_alignment import Array, Correction, EdgeAlignment, Shift, rims
-from operators.status import FINDING, counted_status
+from operators.status import counted_status
 
 _SHARE = 0.5  # of what is found, by which each correction changes the extrinsics
-_TRUSTED, _LEAST = 6, 2  # pairs after which a correction is made, and working pixels from which one is
+_TRUSTED, _LEAST = 12, 2  # pairs after which a correction is made, and working pixels from which one is
 _OFTEN, _PAIRS = 0.2, 3  # share of the pairs, and fewest of them, that must not fit for a finding
 
 
@@ -41,9 +42,10 @@ class ColorDepthCheck(Operator):
 
     A camera that is turned against its extrinsic paints things with what is beside them, and nothing fails: boxes are
     lifted from the wrong points. The check adds up images, since a single one has edges that are none of the depth's.
-    Near edges and far ones show whether a camera is displaced or turned, and what would put that right: the summary at
-    the end has it as a finding. With `calibrate` the extrinsics that it gives have half of that put right, again and
-    again while edges do not fit.
+    Near edges and far ones show whether a camera is displaced or turned, and what would put that right, where one of
+    the two fits plainly better: the summary at the end has it as a finding. With `calibrate` it gives extrinsics that
+    have half of it put right, again and again while edges do not fit; the finding is then what was changed in all.
+    Where near and far are about equally far, as in a small room, a displacement may pass for a turn: both fit there.
 
     Method: edges of depth on edges of the image, added up over images, as in Levinson and Thrun, "Automatic online
     calibration of cameras and lasers", 2013.
@@ -58,7 +60,7 @@ class ColorDepthCheck(Operator):
     )
     status: Out[Diagnostics] = Out(doc="with every pair that is looked at; a warning while they do not fit")
 
-    corrected: Out[Transforms] = Out(doc="the extrinsics: as given at first, then as corrected if `calibrate`")
+    corrected: Out[Transforms] = Out(doc="with `calibrate`: the extrinsics, as given at first, then as corrected")
 
     calibrate: bool = Param(False, doc="correct the transform between the cameras")
     period: Duration = Param("400ms", ge=0, live=True, doc="time between the pairs that are looked at")
@@ -74,7 +76,8 @@ class ColorDepthCheck(Operator):
         depth_info: CameraInfo,
         extrinsics: Transforms | None = None,
     ) -> dict[str, Message] | None:
-        """Raises ValueError where an image does not fit its calibration, or no transform relates the cameras."""
+        """Raises ValueError where an image does not fit its calibration, or no transform relates the cameras, and where
+        one frame for both leaves nothing to calibrate."""
         if depth.stamp < self.state.next:
             return None
         self.state.next = depth.stamp + self.period
@@ -84,33 +87,42 @@ class ColorDepthCheck(Operator):
         points = rims(depth.data, depth_info.K)
         self.state.alignment.add(image.data, image_info.K, points @ T[:3, :3].T + T[:3, 3])
         self.state.counts["pairs"] += 1
-        out: dict[str, Message] = {"status": self._status(depth.stamp, image_info)}
+        status = self._status(depth.stamp, image_info)
+        if not self.calibrate:
+            return {"status": status}
+        if image.frame == depth.frame:
+            raise ValueError(f"image and depth are both in frame {image.frame!r}: calibrate needs one for each camera")
+        if not self._improved(image_info.K) and self.state.given:
+            return {"status": status}
+        self.state.given = True
+        T_depth_image = invert(self.state.change @ transform_between(extrinsics, depth.frame, image.frame))
+        corrected = with_transform(extrinsics, depth.stamp, depth.frame, image.frame, T_depth_image)
+        return {"status": status, "corrected": corrected}
+
+    def _improved(self, K: Array) -> bool:
+        """Changes how the points are moved, where enough pairs since the last change show that edges do not fit."""
         self.state.since += 1
-        found = None
-        if (
-            self.calibrate
-            and self.state.since >= _TRUSTED
-            and any(shift.off(_LEAST) for shift in self.state.alignment.shifts())
-        ):
-            found = self.state.alignment.correction(image_info.K)
-        if found is not None:
-            self.state.change = found.matrix(_SHARE) @ self.state.change
-            self.state.alignment, self.state.since = EdgeAlignment(), 0
-            self.state.counts["corrections"] += 1
-        if found is not None or not self.state.given:
-            self.state.given = True
-            T_depth_image = invert(self.state.change @ transform_between(extrinsics, depth.frame, image.frame))
-            out["corrected"] = with_transform(extrinsics, depth.stamp, depth.frame, image.frame, T_depth_image)
-        return out
+        if self.state.since < _TRUSTED or not any(shift.off(_LEAST) for shift in self.state.alignment.shifts()):
+            return False
+        found = self.state.alignment.correction(K)
+        if found is None or not found.sure:
+            return False
+        self.state.change = found.matrix(_SHARE) @ self.state.change
+        self.state.alignment, self.state.since = EdgeAlignment(), 0
+        self.state.counts["corrections"] += 1
+        return True
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew."""
         self.state.next = 0
 
     def summary(self) -> Mapping[str, int | str]:
-        """Returns the counts; and the finding, where a good part of the pairs did not fit."""
+        """Returns the counts; and the finding, where a good part of the pairs did not fit or the extrinsics changed."""
         often = self.state.counts["off"] >= max(_PAIRS, _OFTEN * self.state.counts["pairs"])
-        return {**self.state.counts, **({FINDING: self.state.finding} if often else {})}
+        finding = self.state.finding if often else ""
+        if self.state.counts["corrections"]:
+            finding = f"edges of colour and depth did not fit; {_moved(invert(self.state.change))}"
+        return {**self.state.counts, **({FINDING: finding} if finding else {})}
 
     def _status(self, stamp: int, info: CameraInfo) -> Diagnostics:
         focal = float(info.K[0, 0])
@@ -140,9 +152,21 @@ def _text(shift: Shift, focal: float) -> str:
 
 
 def _remedy(found: Correction) -> str:
-    """Returns what would put it right, as changes of the colour camera in the depth camera's frame."""
-    if any(found.displacement):
-        right, down = (-100 * each for each in found.displacement)
+    """Returns what puts it right, along the colour camera's axes; nothing where near and far edges leave it open."""
+    if not found.sure:
+        return ""
+    right, down = (-100 * each for each in found.displacement)
+    if right or down:
         return f"; it fits with the colour camera {right:+.1f} cm to the right and {down:+.1f} cm down"
     right, down = (-float(np.degrees(each)) for each in found.turn)
     return f"; it fits with the colour camera turned by {right:+.1f}° to the right and {down:+.1f}° down"
+
+
+def _moved(T: Array) -> str:
+    """Returns how far a colour camera is away from where it was taken to be, T (4, 4) along the axes that it had."""
+    right, down = 100 * T[:2, 3]
+    up, aside = np.degrees(cv2.Rodrigues(T[:3, :3])[0][:2, 0])
+    return (
+        f"the colour camera was put {right:+.1f} cm to the right and {down:+.1f} cm down, "
+        f"and turned by {aside:+.1f}° to the right and {-up:+.1f}° down"
+    )

@@ -15,6 +15,9 @@ Surface = NDArray[np.float32]
 
 _JUMP = 0.08  # share of the depth by which neighbours on an edge differ
 _STEEPEST = 100.0  # grey levels: steeper edges count no more than such
+_MARGIN = 0.05  # share by which the better explanation fits better, from which it is stated
+_LAYERS = 3
+_BLUR = 1.0  # working pixels
 _HALVES = ("left half", "right half")
 
 
@@ -43,11 +46,17 @@ class Correction:
     """Puts the edges of the depth onto those of the image: a displacement, m, or a turn, rad, of the points.
 
     Both are of points in the image camera's frame: x to the right and y down of `displacement`, and by `turn` the same
-    ways as seen from the camera. One of them is zero: the one that explains near and far edges less well.
+    ways as seen from the camera. One of them is zero: the one that explains near and far edges less well, by `margin`,
+    a share of how well the other does. `sure` is whether that tells a camera that is turned from a displaced one.
     """
 
     displacement: tuple[float, float]
     turn: tuple[float, float]
+    margin: float
+
+    @property
+    def sure(self) -> bool:
+        return self.margin >= _MARGIN
 
     def matrix(self, share: float = 1.0) -> Array:
         """Returns the transform (4, 4) of the points, or a share of it."""
@@ -74,9 +83,11 @@ class EdgeAlignment(Remembered):
     def __init__(self, reach: int = 16, keep: float = 0.9) -> None:
         self._reach, self._keep = reach, keep
         side = 2 * reach + 1
-        self._sums = np.zeros((2, 2, side, side), np.float64)  # near and far edges, in the left half and the right
-        self._edges = np.zeros((2, 2))
-        self._nearness = np.zeros((2, 2))  # sums of 1 / distance, and of edges, of near ones and far ones
+        self._sums = np.zeros(
+            (_LAYERS, 2, side, side), np.float64
+        )  # near edges to far ones, in the left half and the right
+        self._edges = np.zeros((_LAYERS, 2))
+        self._nearness = np.zeros((_LAYERS, 2))  # sums of 1 / distance, and of edges, of near ones to far ones
 
     def add(self, image: NDArray[np.uint8], K: Array, rims: Array) -> None:
         """Takes an image (H, W[, 3]) with its K, and points (N, 3) of the same time on rims, in its camera's frame."""
@@ -90,8 +101,7 @@ class EdgeAlignment(Remembered):
         self._sums *= self._keep
         self._edges *= self._keep
         self._nearness *= self._keep
-        far = rims[:, 2] > np.median(rims[:, 2]) if len(rims) else np.zeros(0, np.bool_)
-        for layer, own in enumerate((rims[~far], rims[far])):
+        for layer, own in enumerate(np.array_split(rims[np.argsort(rims[:, 2], kind="stable")], _LAYERS)):
             drawn = _drawn(own, K, half.shape)
             ahead = own[own[:, 2] > 0.1, 2]
             self._nearness[layer] += float((1 / ahead).sum()), len(ahead)
@@ -114,19 +124,22 @@ class EdgeAlignment(Remembered):
         if not (self._nearness[:, 1] > 0).all():
             return None
         nearness = self._nearness[:, 0] / self._nearness[:, 1]
+        layers = [cv2.GaussianBlur(layer, (0, 0), _BLUR) for layer in layers]  # else values in between were lower ones
         shifts = np.arange(-self._reach, self._reach + 0.25, 0.5)  # of the near ones, working pixels
         x, y = (each.ravel() for each in np.meshgrid(shifts, shifts))
         turned, displaced = (
             np.sum([_sampled(a, x * far, y * far, self._reach) for a, far in zip(layers, scales, strict=True)], axis=0)
-            for scales in ((1.0, 1.0), (1.0, float(nearness[1] / nearness[0])))
+            for scales in (np.ones(_LAYERS), nearness / nearness[0])
         )
         focal = K[0, 0] / 2
+        worse, better = sorted((float(turned.max()), float(displaced.max())))
+        margin = 1 - worse / better
         if turned.max() >= displaced.max():
             best = int(np.argmax(turned))
-            return Correction((0.0, 0.0), (float(x[best] / focal), float(y[best] / focal)))
+            return Correction((0.0, 0.0), (float(x[best] / focal), float(y[best] / focal)), margin)
         best = int(np.argmax(displaced))
         metres = 1 / (focal * nearness[0])
-        return Correction((float(x[best] * metres), float(y[best] * metres)), (0.0, 0.0))
+        return Correction((float(x[best] * metres), float(y[best] * metres)), (0.0, 0.0), margin)
 
 
 def rims(depth: NDArray[np.float32], K: Array) -> Array:

@@ -92,10 +92,6 @@ class PostureRecognizer(Operator):
             ids=np.array([id for id, _ in found], np.int64),
         )
 
-    def summary(self) -> Mapping[str, float | int]:
-        """Counts graphs, persons judged, and graphs whose cloud or clusters are of another time."""
-        return dict(self.state.counts)
-
 
 def _silhouettes(
     nodes: SceneGraph,

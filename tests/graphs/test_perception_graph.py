@@ -33,8 +33,12 @@ def run(*words: object) -> str:
 def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path: Path) -> None:
     file, graph = tmp_path / "room.mcap", REPOSITORY / "graphs" / "perception.yaml"
     demo = REPOSITORY / "recordings" / "demo.mcap"
-    run("replay", demo, "--graph", graph, "--end", 1.2, "--one-process", "--record", file, "--json", "-q")
+    found = ("--set", "perception.mount=true", "--set", "perception.calibrate=true")
+    run("replay", demo, "--graph", graph, "--end", 1.2, *found, "--one-process", "--record", file, "--json", "-q")
 
+    recorded = dataflow.open(file)
+    corrected, mounted = (recorded[f"robot1/perception/{each}"] for each in ("calibration/corrected", "mount/status"))
+    assert len(corrected) == len(mounted) == 1
     assert json.loads(run("verify", file, "--one-process", "--json", "-q"))["identical"] is True
     shown = json.loads(CliRunner().invoke(scene, [str(file), "--json"]).stdout)
     assert {n["name"] for n in shown["nodes"]} >= {"room", "self", "floor"}

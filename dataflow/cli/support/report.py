@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dataflow.cli.support.output import count, plural, seconds, size, table
+from dataflow.operator import FINDING
 from dataflow.records.figures import figures
 from dataflow.supervision.core.report import RunReport
 from dataflow.sync import MISSES, TICK
@@ -23,8 +24,6 @@ _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""
 
 
-FINDING = "finding"
-"""Key of a summary that holds what is wrong with an operator's inputs, as a text."""
 SCORES = ("rmse", "precision", "recall", "f1", "iou", "accuracy", "error")
 """Parts of the names of figures that say how good something is."""
 MOST_SCORES, MOST_LOSSES, MOST_KEPT = 3, 4, 5

@@ -11,6 +11,7 @@ from dataflow.messages import Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.testing import play
 from operators.cloud import CameraMount
+from operators.geometry.extrinsics import transform_between
 
 NOTHING = np.zeros((0, 3))
 
@@ -68,6 +69,107 @@ def test_imu_of_a_frame_that_is_not_related_is_an_error() -> None:
     known = Transforms.from_matrix(np.eye(4), stamp=0, frame="depth", child_frame="color")
     with pytest.raises(Exception, match="no transform between 'imu' and 'depth'"):
         play(CameraMount(), {"cloud": [cloud(room(0, 0))], "imu": [sample], "extrinsics": [known]})
+
+
+def at_rest(down: float, roll: float, frame: str = "depth") -> Imu:
+    """Returns what an accelerometer of that frame measures in a camera that looks down and is rolled, degrees."""
+    force = turned(down, roll) @ [0, -9.81, 0]
+    return Imu(stamp=0, frame=frame, angular_velocity=np.zeros(3), linear_acceleration=force)
+
+
+def test_imu_without_extrinsics_must_be_of_the_same_frame() -> None:
+    with pytest.raises(ValueError, match="imu is in frame 'imu' and cloud in 'depth': extrinsics must relate them"):
+        CameraMount().process(cloud(room(0, 0)), None, at_rest(0, 0, "imu"))
+    assert CameraMount().process(cloud(room(0, 0)), None, at_rest(0, 0)) is not None
+
+
+def test_an_accelerometer_decides_where_surfaces_do_not() -> None:
+    wall = room(40, 0, floor=False)
+    told, unsure = CameraMount(), CameraMount()
+    assert unsure.process(cloud(NOTHING)) is None
+    made = told.process(cloud(wall), None, at_rest(40, 0))
+    assert made is not None
+    assert "looks 40° down" in made["status"].messages[0]
+    assert made["base_extrinsics"].matrix("depth")[:3, :3] @ turned(40, 0) @ [0, -1, 0] == pytest.approx(
+        [0, 0, 1], abs=0.02
+    )
+
+
+def test_an_acceleration_that_is_not_finite_is_counted_and_not_used() -> None:
+    broken = at_rest(0, 0).replace(linear_acceleration=np.full(3, np.nan))
+    with_it, without = CameraMount(), CameraMount()
+    made, expected = with_it.process(cloud(room(28, 5)), None, broken), without.process(cloud(room(28, 5)))
+    assert made is not None
+    assert expected is not None
+    assert made["base_extrinsics"].digest() == expected["base_extrinsics"].digest()
+    assert with_it.summary()["accelerations_not_finite"] == 1
+
+
+def test_a_view_of_a_lost_odometry_does_not_decide() -> None:
+    lost = Odometry.from_matrix(np.eye(4), stamp=0, frame="odom", child_frame="depth")
+    lost = lost.replace(position=np.full(3, np.nan))
+    mount = CameraMount()
+    assert mount.process(cloud(room(28, 0)), None, None, lost) is None
+    assert mount.process(cloud(room(28, 0), 1)) is not None
+
+
+def test_extrinsics_that_change_later_are_completed_again_with_the_same_mount() -> None:
+    first = Transforms.from_matrix(np.eye(4), stamp=0, frame="depth", child_frame="color")
+    moved = np.eye(4)
+    moved[0, 3] = 0.025
+    then = Transforms.from_matrix(moved, stamp=5, frame="depth", child_frame="color")
+    mount = CameraMount()
+    made = mount.process(cloud(room(28, 0)), first)
+    assert mount.process(cloud(room(10, 0), 1), first) is None
+    again = mount.process(cloud(room(10, 0), 9), then)
+    assert made is not None
+    assert again is not None
+    assert set(again) == {"base_extrinsics"}
+    assert again["base_extrinsics"].stamp == 9
+    assert again["base_extrinsics"].matrix("color")[:3, 3] == pytest.approx([0.025, 0, 0])
+    np.testing.assert_array_equal(again["base_extrinsics"].matrix("depth"), made["base_extrinsics"].matrix("depth"))
+
+
+def test_a_given_base_is_passed_on_when_it_changes() -> None:
+    given = Transforms.from_matrix(np.eye(4), stamp=0, frame="base_link", child_frame="depth")
+    moved = np.eye(4)
+    moved[2, 3] = 0.1
+    then = Transforms.from_matrix(moved, stamp=0, frame="base_link", child_frame="depth")
+    mount = CameraMount()
+    assert mount.process(cloud(room(0, 0)), given) is not None
+    again = mount.process(cloud(room(0, 0), 3), then)
+    assert again is not None
+    assert again["base_extrinsics"].digest() == then.replace(stamp=3).digest()
+
+
+@pytest.mark.parametrize("pair", [("depth", "color"), ("color", "depth")])
+def test_the_base_holds_all_cameras_whichever_is_the_parent(pair: tuple[str, str]) -> None:
+    T = np.eye(4)
+    T[0, 3] = 0.05
+    known = Transforms.from_matrix(T, stamp=0, frame=pair[0], child_frame=pair[1])
+    made = CameraMount().process(cloud(room(28, 5)), known)
+    alone = CameraMount().process(cloud(room(28, 5)))
+    assert made is not None
+    assert alone is not None
+    expected = alone["base_extrinsics"].matrix("depth")
+    np.testing.assert_allclose(
+        transform_between(made["base_extrinsics"], "depth", "base_link"), expected, rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(transform_between(made["base_extrinsics"], pair[1], pair[0]), T, rtol=0, atol=1e-9)
+
+
+def test_a_restored_mount_remembers_its_best_view() -> None:
+    whole, first, later = (CameraMount(patience="2s") for _ in range(3))
+    doubtful = room(28, 5, floor=False)[:6000]  # a single wall
+    for each in (whole, first):
+        assert each.process(cloud(doubtful)) is None
+        assert each.state.best is not None
+    assert pack_state(first.snapshot() or {}) == pack_state(whole.snapshot() or {})
+    later.restore(unpack_state(pack_state(first.snapshot() or {})))
+    a, b = (each.process(cloud(NOTHING, 2_000_000_000)) for each in (whole, later))
+    assert a is not None
+    assert b is not None
+    assert {name: m.digest() for name, m in a.items()} == {name: m.digest() for name, m in b.items()}
 
 
 def test_equal_views_give_equal_mounts() -> None:

@@ -11,7 +11,7 @@ from dataflow.messages import CameraInfo, Image, Transforms
 from dataflow.messages.geometry import invert, split_matrix, transform_points
 from operators.geometry import se3
 from operators.geometry.calibration import check_calibration
-from operators.geometry.extrinsics import transform_between
+from operators.geometry.extrinsics import transform_between, with_transform
 
 T_depth_color = se3.exp(np.array([0.02, -0.01, 0.03, 0.05, -0.02, 0.1]))
 
@@ -37,6 +37,56 @@ def test_frames_may_be_related_over_others() -> None:
         rotations=np.array([q for _, q in poses]),
     )
     np.testing.assert_allclose(transform_between(chain, "lidar", "camera"), T_depth_color, atol=1e-9)
+
+
+def tree(*pairs: tuple[str, str]) -> Transforms:
+    """Returns a transform of each (parent, child), all different."""
+    Ts = [se3.exp(np.array([0.1, 0.02, -0.05, 0.3, 0.1, -0.2]) * (k + 1)) for k in range(len(pairs))]
+    return Transforms(
+        stamp=0,
+        frames=tuple(parent for parent, _ in pairs),
+        child_frames=tuple(child for _, child in pairs),
+        translations=np.array([T[:3, 3] for T in Ts]),
+        rotations=np.array([split_matrix(T)[1] for T in Ts]),
+    )
+
+
+@pytest.mark.parametrize(
+    ("pairs", "frame", "child", "kept"),
+    [
+        ([], "depth", "color", []),
+        ([("depth", "color")], "depth", "color", []),
+        ([("color", "depth")], "depth", "color", []),
+        ([("base", "depth"), ("base", "color")], "depth", "color", [("base", "depth")]),
+        ([("base", "depth"), ("depth", "color")], "depth", "color", [("base", "depth")]),
+        ([("base", "color"), ("color", "depth")], "depth", "color", [("base", "color")]),
+        ([("base", "color"), ("color", "m"), ("m", "depth")], "depth", "color", [("base", "color"), ("color", "m")]),
+        ([("base", "m"), ("m", "color"), ("base", "depth")], "depth", "color", [("base", "m"), ("base", "depth")]),
+        ([("depth", "color")], "base", "depth", [("depth", "color")]),
+        ([("color", "depth")], "base", "depth", [("color", "depth")]),
+        ([("rig", "color"), ("rig", "depth")], "base", "depth", [("rig", "color"), ("rig", "depth")]),
+    ],
+)
+def test_a_transform_is_put_into_a_tree_that_stays_one(
+    pairs: list[tuple[str, str]], frame: str, child: str, kept: list[tuple[str, str]]
+) -> None:
+    given = tree(*pairs) if pairs else None
+    T = se3.exp(np.array([0.4, -0.3, 0.2, 1.0, 2.0, 3.0]))
+    made = with_transform(given, 7, frame, child, T)
+    assert made.stamp == 7
+    np.testing.assert_allclose(transform_between(made, child, frame), T, atol=1e-12)
+    for parent, below in kept:
+        expected = transform_between(given, below, parent)
+        np.testing.assert_allclose(transform_between(made, below, parent), expected, atol=1e-12)
+    everyone = {each for pair in pairs for each in pair} | {frame, child}
+    assert made.count == len(everyone) - 1
+    for each in everyone:
+        transform_between(made, each, frame)  # related to all
+
+
+def test_frames_of_two_trees_have_no_place_for_a_transform() -> None:
+    with pytest.raises(ValueError, match="no transform between 'depth' and 'rig'"):
+        with_transform(tree(("base", "depth"), ("rig", "color")), 0, "depth", "color", np.eye(4))
 
 
 @given(st.integers(0, 100))

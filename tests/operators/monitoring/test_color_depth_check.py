@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Image, Transforms
 from dataflow.messages.diagnostics import Level
+from operators.geometry.extrinsics import transform_between
 from operators.monitoring import ColorDepthCheck
 from operators.monitoring.edge_alignment import EdgeAlignment, rims
 from tests.operators.monitoring.rooms import K, extrinsics, info, views
@@ -145,10 +146,17 @@ def test_near_and_far_edges_tell_a_displaced_camera_from_a_turned_one(
     assert found.turn == pytest.approx((turn, 0), abs=0.005)
 
 
-def test_a_displaced_camera_is_found() -> None:
-    text, given = finding(ColorDepthCheck(period="200ms"), displaced(0.08))
-    assert "it fits with the colour camera" in text
-    assert len(given) == 1  # nothing is corrected
+def test_a_displaced_camera_is_found_with_what_puts_it_right() -> None:
+    text, given = finding(ColorDepthCheck(period="200ms"), displaced(-0.08))
+    told = re.search(r"it fits with the colour camera (\S+) cm to the right and (\S+) cm down", text)
+    assert told is not None, text
+    assert [float(each) for each in told.groups()] == pytest.approx([8, 0], abs=2)
+    assert given == []
+
+
+def test_no_remedy_is_stated_where_a_turn_fits_about_as_well() -> None:
+    text, _ = finding(ColorDepthCheck(period="200ms"), displaced(0.05))
+    assert text.endswith("a camera is turned or displaced against its extrinsic")
 
 
 def test_a_turned_camera_is_found_with_the_turn_that_puts_it_right() -> None:
@@ -163,10 +171,43 @@ def test_cameras_that_fit_have_no_finding() -> None:
 
 
 def test_calibration_brings_the_camera_nearer_step_by_step() -> None:
-    known = displaced(0.08)
-    right = extrinsics().matrix("color")
-    _, given = finding(ColorDepthCheck(period="200ms", calibrate=True), known)
-    away = [float(np.linalg.norm(each.matrix("color")[:3, 3] - right[:3, 3])) for each in given]
+    known = displaced(0.12)
+    text, given = finding(ColorDepthCheck(period="200ms", calibrate=True), known)
+    away = [float(np.linalg.norm(transform_between(each, "color", "depth")[:3, 3])) for each in given]
     assert len(away) >= 2
-    assert away[0] == pytest.approx(0.08)
-    assert away[-1] < 0.055
+    assert away[0] == pytest.approx(0.12)
+    assert away[-1] < 0.07
+    told = re.search(r"was put (\S+) cm to the right", text)
+    assert told is not None, text
+    assert float(told[1]) == pytest.approx(100 * (away[-1] - away[0]), abs=0.2)
+
+
+def test_what_was_corrected_is_found_though_all_fits_since() -> None:
+    check = ColorDepthCheck(period="200ms", calibrate=True)
+    text, given = finding(check, extrinsics(color=("y", -3.0)))
+    assert len(given) == 2
+    told = re.search(r"turned by (\S+)° to the right", text)
+    assert told is not None, text
+    assert float(told[1]) == pytest.approx(1.5, abs=0.4)  # half of it
+
+
+def test_the_tree_of_the_extrinsics_stays_one_when_a_camera_is_moved() -> None:
+    chain = displaced(0.12)
+    star = chain.replace(
+        frames=("base", "base", "base"),
+        translations=np.array([transform_between(chain, child, "base")[:3, 3] for child in chain.child_frames]),
+        rotations=np.array([chain.rotations[0], chain.rotations[0], chain.rotations[2]]),
+    )
+    last = [finding(ColorDepthCheck(period="200ms", calibrate=True), known)[1][-1] for known in (chain, star)]
+    for child in ("depth", "color", "lidar"):
+        a, b = (transform_between(each, child, "base") for each in last)
+        assert a == pytest.approx(b, abs=1e-9)
+
+
+def test_one_frame_for_both_cameras_leaves_nothing_to_calibrate() -> None:
+    image, depth = (stream[0] for stream in pairs())
+    both = depth.replace(frame="color")
+    given = (image, both, info("color"), info("color"), extrinsics())
+    assert set(ColorDepthCheck().process(*given) or {}) == {"status"}
+    with pytest.raises(ValueError, match="both in frame 'color'"):
+        ColorDepthCheck(calibrate=True).process(*given)

@@ -109,6 +109,14 @@ def test_things_stand_on_surfaces_by_their_height_and_extent() -> None:
     assert [s for s, p, o in found if p == "on" and o == -11] == [2]
 
 
+@pytest.mark.parametrize(("below", "lies"), [(0.02, True), (0.05, False)])
+def test_what_is_flat_lies_on_a_plane_that_is_a_little_off(below: float, lies: bool) -> None:
+    top = 0.75
+    magazine: Thing = (8, "book", (2, 0.1, top - below), (0.2, 0.3, 0.01))
+    found = relations(built([[TABLE, TOP, magazine]])["graph"][0])
+    assert {o for s, p, o in found if s == 8 and p == "on"} == ({1, -11} if lies else set())
+
+
 def test_a_table_top_without_a_table_carries_what_stands_on_it() -> None:
     found = relations(built([[MUG, TOP]])["graph"][0])
     assert found[2, "on", -11] > 0.6
