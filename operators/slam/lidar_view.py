@@ -16,7 +16,7 @@ from operators.geometry.se3 import Matrix
 from operators.odometry.lidar.fit import Fit, Prior, fit
 from operators.odometry.lidar.map import PlaneMap, thinned
 from operators.odometry.lidar.scan import SPARSER, Scan
-from operators.odometry.lidar.search import TURNS, around, places
+from operators.odometry.lidar.search import ANY_TURN, around, places
 from operators.slam.keyframe_graph import Node
 from operators.slam.scan_context import Context, describe
 
@@ -102,7 +102,7 @@ class LidarEyes:
         return found.reason or self._checked(self._fitted(other, planes, found.T), found)
 
     def _searched(self, one: LidarView, other: LidarView, planes: PlaneMap) -> Registered:
-        poses, scores = around(other.points.astype(np.float64), planes, np.eye(4), _SEARCH, TURNS, 2 * self.noise)
+        poses, scores = around(other.points.astype(np.float64), planes, np.eye(4), _SEARCH, ANY_TURN, 2 * self.noise)
         starts = places(poses, scores, _STARTS)
         if not starts:
             return failure("nothing of the scan lies on surfaces that were seen there")

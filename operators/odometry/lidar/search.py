@@ -13,8 +13,9 @@ from operators.odometry.lidar.map import PlaneMap
 
 Array = NDArray[np.float64]
 
-STEP = 0.5  # metres between poses
-TURNS = 24  # headings, where none is known
+STEP, WIDE_STEP = 0.5, 1.0  # metres between poses, and those of a search that reaches far
+WIDE = 5.0  # metres from which a search reaches far
+ANY_TURN = np.arange(24) * (np.pi / 12)  # headings, where none is known
 _SEARCHED = 120  # points that are looked at
 _WIDTH = 6.0  # standard deviations of the kernel
 _WORTH = 0.7  # share of the best pose's score from which another is worth a look
@@ -22,15 +23,15 @@ _APART = (0.9, 0.4)  # metres and radians between two places
 
 
 def around(
-    points: Array, planes: PlaneMap, T: Matrix, reach: float, turns: int, noise: float
+    points: Array, planes: PlaneMap, T: Matrix, reach: float, turns: Array, noise: float
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Returns the poses (K, 4, 4) up to `reach` metres to each side of a guess, in `turns` headings, best first.
+    """Returns the poses (K, 4, 4) up to `reach` metres to each side of a guess, turned by `turns` (N,), best first.
 
     With them come their scores (K,): points (of about 120) that lie on planes, a little less far from the guess.
     """
-    steps = np.arange(-int(reach / STEP), int(reach / STEP) + 1) * STEP
-    headings = np.arange(turns) * (2 * np.pi / turns)
-    x, y, turn = (grid.ravel() for grid in np.meshgrid(steps, steps, headings, indexing="ij"))
+    step = STEP if reach < WIDE else WIDE_STEP
+    steps = np.arange(-int(reach / step), int(reach / step) + 1) * step
+    x, y, turn = (grid.ravel() for grid in np.meshgrid(steps, steps, turns, indexing="ij"))
     poses = np.tile(np.eye(4), (len(x), 1, 1))
     poses[:, 0, 0] = poses[:, 1, 1] = np.cos(turn)
     poses[:, 1, 0] = np.sin(turn)

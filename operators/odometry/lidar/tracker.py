@@ -18,11 +18,15 @@ from operators.odometry.lidar.fit import Fit, Prior, fit
 from operators.odometry.lidar.map import PlaneMap
 from operators.odometry.lidar.motion import LidarMotion, as_left, as_right, corrected
 from operators.odometry.lidar.scan import Scan, prepare
-from operators.odometry.lidar.search import TURNS, apart, around, places
+from operators.odometry.lidar.search import ANY_TURN, apart, around, places
 
 FEWEST = 50  # points of a scan, and half as many in planes, that a pose may rest on
 _EPOCH = (1.0, 0.35)  # metres, radians: what the sensor moves until the map's new voxels count as younger
 _REACH = 3.0  # metres to each side that a search for the pose covers
+_BASIN = 0.5  # metres: nearer to the truth a fit needs no search
+_FARTHEST = 30.0  # metres that a search for an unknown velocity covers
+_TURN, _LARGEST_TURN = np.radians(4.0), np.radians(24.0)  # steps and reach of headings beside the predicted one
+_START_TURN = np.radians(20.0)  # per second, of a sensor whose velocity is unknown
 _STARTS, _LOST_STARTS = 3, 5  # of which a pose is fitted
 _RIVAL = 0.03  # a second place whose agreement is that near to the best one's makes the pose ambiguous
 
@@ -148,15 +152,18 @@ class LidarTracker:
     def _starts(self, scan: Scan, stamp: int, lost: bool) -> list[Matrix]:
         """Returns where to look: at the predicted pose, and around it where the velocity or the place is unknown."""
         assert self._motion is not None
-        T = self._motion.predicted(stamp, self._patience)
-        if not lost and not self._motion.fresh:
-            return [T]
-        reach = _REACH
+        T, dt = self._motion.predicted(stamp, self._patience), self._motion.seconds(stamp)
+        reach, turns = _REACH, ANY_TURN
         if not lost:
-            reach = min(reach, self._config.start_speed * self._motion.seconds(stamp))
-        turns = TURNS if lost else 1
+            config, fresh = self._config, self._motion.fresh
+            reach = min(config.start_speed * dt if fresh else 0.5 * config.acceleration * dt**2, _FARTHEST)
+            turn = min(_START_TURN * dt if fresh else 0.5 * config.angular_acceleration * dt**2, _LARGEST_TURN)
+            turns = np.arange(-int(turn / _TURN), int(turn / _TURN) + 1) * _TURN
+            if reach < _BASIN:
+                return [T]
         best, scores = around(scan.points[scan.sample], self._map, T, reach, turns, self._config.noise)
-        return [T, *(places(best, scores, _LOST_STARTS) if lost else best[:_STARTS])]
+        wide = lost or reach > _REACH
+        return [T, *(places(best, scores, _LOST_STARTS) if wide else best[:_STARTS])]
 
     def _fitted(self, scan: Scan, stamp: int, starts: list[Matrix]) -> list[Fit]:
         """Returns the pose that each start leads to, that of the most agreement first."""
