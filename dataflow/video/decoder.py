@@ -30,7 +30,7 @@ def is_key(format_: str, data: bytes) -> bool:
 
 
 class Pace:
-    """The stamps of the packets since a key frame, which show losses of as many pictures as there are numbers.
+    """The stamps of the packets since a key frame, which show losses that the numbers of pictures hide.
 
     `stamps`: of the packets (ns); None where they are not known.
     """
@@ -39,27 +39,24 @@ class Pace:
         self.stamps: list[int | None] = []
         self._periods: deque[int] = deque(maxlen=_PERIODS)
 
-    def hides(self, stamp: int | None, numbers: int) -> bool:
-        """Takes a packet's stamp; returns whether a multiple of `numbers` pictures fits before it, within 5 %."""
+    def hides(self, stamp: int | None, since: int) -> bool:
+        """Takes a packet's stamp; returns whether `since` pictures may be lost before it: from half a period more, or
+        5 %."""
         last = self.stamps[-1] if self.stamps else None
         self.stamps.append(stamp)
         if stamp is None or last is None:
             return False
         period = sorted(self._periods)[len(self._periods) // 2] if self._periods else 0
         self._periods.append(stamp - last)
-        if period <= 0 or numbers < 2:
-            return False
-        lost = (stamp - last) / period - 1
-        times = round(lost / numbers)
-        return times > 0 and abs(lost - times * numbers) <= 1 + 0.05 * lost
+        return period > 0 and 0 < since <= 1.05 * ((stamp - last) / period - 1) + 0.5
 
 
 class PacketDecoder:
     """Decodes the packets of one stream in their order, one picture each.
 
     Decoding begins with a key frame. A packet that cannot be decoded, since others are lost or it is damaged, gives no
-    frame, nor do those after it until the next key frame: their pixels would be wrong. Frames depend on the packets
-    since the key frame alone.
+    frame, nor do those after it until the next key frame: their pixels would be wrong. A packet that comes twice gives
+    its frame twice. Frames depend on the packets since the key frame alone.
 
     `lost`: the reason why the last packet gave no frame; empty where it gave one.
     """
@@ -74,33 +71,36 @@ class PacketDecoder:
         self._group: list[bytes] | None = []
         """Packets since the key frame; None where they are more than are kept."""
         self._group_bytes = 0
+        self._newest: NDArray[np.uint8] | None = None
         self._pace = Pace()
 
     def decode(self, data: bytes, stamp: int | None = None) -> NDArray[np.uint8] | None:
         """Returns the pixels (H, W, 3) of a packet, RGB; None where it cannot be decoded.
 
         `stamp`: its time (ns), by which losses show that the numbers of pictures hide; None: not known. Raises
-        `VideoError` for a stream that is not decoded at all (B-frames), TimeoutError where OpenCV hangs.
+        `VideoError` for a stream whose first key frame announces what is not decoded (B-frames, larger pictures); later
+        on it is damage. TimeoutError where OpenCV hangs.
         """
+        if self._group and data == self._group[-1]:
+            return self._newest
+        begun = bool(self._sets)
         try:
             picture = self._headers.read(data)
-        except PacketError as error:
+            if picture.pixels > self.max_pixels:
+                raise VideoError(f"its pictures have {picture.pixels} pixels, more than max_pixels={self.max_pixels}")
+        except VideoError as error:
+            if not begun and not isinstance(error, PacketError):
+                raise
+            self._headers = _HEADERS[self.format]()
+            self._headers.learn(self._sets)  # and not those that came with the damage
             return self._lose(str(error))
-        if picture.pixels > self.max_pixels:
-            raise VideoError(f"its pictures have {picture.pixels} pixels, more than max_pixels={self.max_pixels}")
         new_sets = self._take_sets(picture)
         if picture.missing:
             return self._lose(picture.missing)
-        if picture.key:
-            self._pace = Pace()
-            self._pace.hides(stamp, picture.numbers)
-            return self._begin(data if picture.whole else self._sets + data, new_sets)
-        if self._capture is None:
-            return self._lose(self.lost)
-        if self._pace.hides(stamp, picture.numbers):
-            return self._lose(f"a pause as long as that of {picture.numbers} pictures, whose numbers then begin anew")
-        self._keep(data)
-        return self._only(self._capture.feed(data))
+        try:
+            return self._follow(data, picture, new_sets, stamp)
+        except VideoError as error:  # of OpenCV
+            return self._lose(str(error))
 
     def state(self) -> Mapping[str, Any] | None:
         """Returns a value from which `take_up` goes on alike; None where that were too many bytes."""
@@ -136,6 +136,18 @@ class PacketDecoder:
         self._sets = picture.sets if picture.whole else self._sets + picture.sets
         return True
 
+    def _follow(self, data: bytes, picture: Picture, new_sets: bool, stamp: int | None) -> NDArray[np.uint8] | None:
+        if picture.key:
+            self._pace = Pace()
+            self._pace.hides(stamp, picture.since)
+            return self._begin(data if picture.whole else self._sets + data, new_sets)
+        if self._capture is None:
+            return self._lose(self.lost)
+        if self._pace.hides(stamp, picture.since):
+            return self._lose(f"a pause as long as that of {picture.since} pictures: a key frame may be lost in it")
+        self._keep(data)
+        return self._only(self._capture.feed(data))
+
     def _begin(self, packet: bytes, new_sets: bool) -> NDArray[np.uint8] | None:
         """Decodes a key frame, by a new decoder where pictures may have another form."""
         self._group, self._group_bytes = [], 0
@@ -161,7 +173,8 @@ class PacketDecoder:
         if len(frames) != 1:
             return self._lose(f"the decoder gave {len(frames)} frames for one packet: it is damaged")
         self.lost = ""
-        return np.asarray(cv2.cvtColor(frames[0], cv2.COLOR_BGR2RGB), np.uint8)
+        self._newest = np.asarray(cv2.cvtColor(frames[0], cv2.COLOR_BGR2RGB), np.uint8)
+        return self._newest
 
     def _lose(self, reason: str) -> NDArray[np.uint8] | None:
         """Waits for the next key frame; the first reason stands until then."""

@@ -91,13 +91,14 @@ class H264Headers:
         if key or not missing:
             self._last = number if key or reference or self._last is None else self._last
         whole = key and {SPS, PPS} <= {u[0] & 31 for u in units(sets)}
-        return Picture(key, whole, missing, sets, sequence.pixels, 1 << sequence.frame_bits)
+        since = 0 if key else number or 1 << sequence.frame_bits
+        return Picture(key, whole, missing, sets, sequence.pixels, since)
 
     def _missing(self, number: int, sequence: _Sequence) -> str:
         if self._last is None:
             return "no key frame has come"
         following = (self._last + 1) % (1 << sequence.frame_bits)
-        if number in (self._last, following) or sequence.gaps:
+        if number == following or (sequence.gaps and number != self._last):
             return ""
         return f"frame {number} follows frame {self._last}: those between them are lost"
 

@@ -119,8 +119,9 @@ class H265Headers:
         bits.u(pictures.output_flag + 2 * sequence.planes)
         newest = max(self._held or (0,))
         missing = self._begin(kind, bits, sequence) if key else self._follow(unit, bits, sequence)
-        step = max(1, max(self._held or (0,)) - newest)
-        return Picture(key, key and has_sets, missing, sets, sequence.pixels, (1 << sequence.order_bits) // step)
+        order = max(self._held or (0,))
+        since = 0 if key else (order % (1 << sequence.order_bits) or 1 << sequence.order_bits) // max(1, order - newest)
+        return Picture(key, key and has_sets, missing, sets, sequence.pixels, since)
 
     def _begin(self, kind: int, bits: Bits, sequence: _Sequence) -> str:
         """Takes a key frame; the ones before it are not referred to any more."""

@@ -15,7 +15,8 @@ class Picture:
     - `missing`: the reason why it cannot be decoded after the packets before it; empty where it can.
     - `sets`: the parameter sets in it, in Annex B form.
     - `pixels`: of one frame.
-    - `numbers`: pictures after which their numbers begin anew, so that as many may be lost unseen.
+    - `since`: pictures from the last key frame at which numbers begin anew to it, at least; 0 for such a one. Where as
+      many are lost before it, that key frame may be among them, and the number fits all the same.
     """
 
     key: bool
@@ -23,7 +24,7 @@ class Picture:
     missing: str
     sets: bytes
     pixels: int
-    numbers: int = 0
+    since: int = 0
 
 
 class Headers(Protocol):

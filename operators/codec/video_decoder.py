@@ -20,8 +20,8 @@ class VideoDecoder(Operator):
     damaged, it gives no image, nor do those after it until the next key frame: each is counted, and marked as lost by a
     status. The images depend on the packets since the key frame alone, so they are the same from any cut there; a
     snapshot holds these packets. FFmpeg decodes with one thread (OpenCV, from memory), so that an image comes with its
-    packet. Which pixels it gives may depend on its version. A stream with B-frames is refused: its packets are not in
-    the order of their stamps.
+    packet. Which pixels it gives may depend on its version. A stream whose first parameter sets announce B-frames is
+    refused: its packets are not in the order of their stamps.
     """
 
     video: In[CompressedVideo] = In(doc="packets in the order of time, one picture each")
@@ -37,7 +37,7 @@ class VideoDecoder(Operator):
         self._counts = Counter(decoded=0, lost=0)
 
     def process(self, video: CompressedVideo) -> Mapping[str, Message]:
-        """Raises ValueError for a stream with B-frames, or with pictures that are too large."""
+        """Raises ValueError for a stream that begins with B-frames, or with pictures that are too large."""
         decoder = self._decoder_of(video.format)
         was_lost = bool(decoder.lost) or not self._counts.total()
         try:

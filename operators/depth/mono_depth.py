@@ -12,7 +12,7 @@ from dataflow.messages import DepthImage, Diagnostics, Image, RelativeDepth
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.depth.scaling import Scaling, fitted
-from operators.inference import ModelError, open_session
+from operators.inference import ModelError, Provider, open_session
 from operators.models.use import use_model
 from operators.network_input import NORMALIZATIONS, image_input, three_channels
 from operators.status import counted_status
@@ -23,17 +23,17 @@ LEAST_CONTRAST = 4.0  # standard deviation of grey levels below which an image s
 
 
 class MonoDepth(Operator):
-    """Estimates which pixels of an image are near, with an ONNX model on one CPU thread; metric where depths are given.
+    """Estimates which pixels of an image are near, with an ONNX model; metric where depths are given.
 
     One image has no scale: `relative` is inverse depth up to a factor and a constant. Where `sparse` gives metric
     depth at some pixels (a stereo pair's, a projected LiDAR's), both are fitted to it, robustly, image by image, and
     `depth` is the whole image in metres; without agreement no `depth`, and a warning in `status`. A model whose
     `answer` is metres gives `depth` by itself. An image that is black or without contrast gives neither.
 
-    The model is one of `dataflow models` by name, or a file. It takes one (1, 3, H, W) input of RGB in float32, float16
-    or uint8 and gives one value per pixel, larger for nearer, as those of Li et al., "Enforcing temporal consistency in
-    video depth estimation", 2021 (TCMonoDepth) and Yang et al., "Depth Anything V2", 2024. The fit is that of Ranftl et
-    al. (MiDaS), 2020.
+    The model is one of `dataflow models` by name, or a file; on the CPU it runs with one thread. It takes one
+    (1, 3, H, W) input of RGB in float32, float16 or uint8 and gives one value per pixel, larger for nearer, as those of
+    Li et al., "Enforcing temporal consistency in video depth estimation", 2021 (TCMonoDepth) and Yang et al., "Depth
+    Anything V2", 2024. The fit is that of Ranftl et al. (MiDaS), 2020.
     """
 
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
@@ -49,13 +49,22 @@ class MonoDepth(Operator):
     )
 
     model: str = Param(min_length=1, doc="a name of `dataflow models list`, or an ONNX file")
-    normalization: Literal["none", "unit", "imagenet"] = Param(
-        "none", doc="of pixels: as they are, as shares of 255, or those less ImageNet's mean by its deviation"
+    provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
+    normalization: Literal["none", "unit", "imagenet"] | None = Param(
+        None,
+        doc="of pixels: as they are (`none`), as shares of 255, or those less ImageNet's mean by its deviation; null "
+        "takes the registry's, or leaves them as they are",
     )
-    answer: Literal["nearness", "metres"] = Param(
-        "nearness", doc="what the model gives: larger for nearer without a scale, or depth in metres"
+    answer: Literal["nearness", "metres"] | None = Param(
+        None,
+        doc="what the model gives: larger for nearer without a scale, or depth in metres; none takes the registry's, "
+        "or nearness",
     )
-    input_size: tuple[int, int] = Param((518, 518), doc="(width, height) where the model leaves it open", unit="px")
+    input_size: tuple[int, int] | None = Param(
+        None,
+        doc="(width, height) where the model leaves it open; none takes the registry's, or 518 x 518",
+        unit="px",
+    )
     align: Literal["scale_and_shift", "scale"] = Param(
         "scale_and_shift", doc="what is fitted to the given depths: the model's own constant is unknown, or is 0"
     )
@@ -71,10 +80,10 @@ class MonoDepth(Operator):
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError where there is none, ModelError where it is of another kind."""
         used = use_model(self, self.model)
-        self._session = open_session(used.file)
-        mean, scale = NORMALIZATIONS[used.setting(self, "normalization")]
-        free = tuple(used.setting(self, "input_size"))
-        self._metric = used.setting(self, "answer") == "metres"
+        self._session = open_session(used.file, self.provider)
+        mean, scale = NORMALIZATIONS[used.setting(self, "normalization", "none")]
+        free = tuple(used.setting(self, "input_size", (518, 518)))
+        self._metric = used.setting(self, "answer", "nearness") == "metres"
         self._input = image_input(
             used.file, self._session, (free[0], free[1]), bgr=False, mean=mean, scale=scale, layouts=("nchw",)
         )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, Image, pack_masks
 from dataflow.operator import In, Operator, Out, Param
+from operators.detection.instance_masks import inside
 from operators.inference import ModelError, Provider, open_session
 from operators.models.use import use_model
 from operators.network_input import NORMALIZATIONS, image_input, three_channels
@@ -76,7 +77,7 @@ class BoxSegmenter(Operator):
             planes = np.concatenate([self._best(tensor, group) for group in groups])
             for row, plane in zip(rows.tolist(), planes, strict=True):
                 sure = cv2.resize(plane, (image.width, image.height), interpolation=cv2.INTER_LINEAR) > 0
-                masks[row] = sure & _inside(detections.boxes[row], sure.shape)
+                masks[row] = inside(sure, detections.boxes[row])
         return detections.replace(masks=pack_masks(masks))
 
     def _best(self, tensor: NDArray[Any], prompts: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -91,10 +92,3 @@ class BoxSegmenter(Operator):
             )
         best: NDArray[np.float32] = masks[0][np.arange(len(prompts)), fits[0].argmax(axis=1)]
         return best
-
-
-def _inside(box: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Returns the pixels (H, W) that a box touches."""
-    rows, columns = np.arange(shape[0]), np.arange(shape[1])
-    across = (columns + 1 > box[0]) & (columns < box[2])
-    return np.asarray(((rows + 1 > box[1]) & (rows < box[3]))[:, None] & across)

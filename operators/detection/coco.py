@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
+from operators.inference import ModelError
+from operators.models.registry import Model
+
 _NAMES = """
     person, bicycle, car, motorcycle, airplane, bus, train, truck,
     boat, traffic light, fire hydrant, stop sign, parking meter, bench, bird, cat,
@@ -28,3 +31,17 @@ COCO_NUMBERS: Final = tuple("" if k in _UNUSED else next(_USED) for k in range(9
 
 CLASS_LISTS: Final = {"coco": COCO_CLASSES, "coco91": COCO_NUMBERS, "coco90": COCO_NUMBERS[1:]}
 """Lists of class names by their names in the registry of models."""
+
+
+def names_of(model: Model | None) -> tuple[str, ...] | None:
+    """Returns the class names of a row of the registry; None where it has none, or there is no row.
+
+    Raises ModelError for the name of a list that there is not.
+    """
+    if model is None or model.classes is None:
+        return None
+    if isinstance(model.classes, list):
+        return tuple(model.classes)
+    if model.classes not in CLASS_LISTS:
+        raise ModelError(f"{model.name}: there is no list of classes {model.classes!r}; {', '.join(CLASS_LISTS)}")
+    return CLASS_LISTS[model.classes]

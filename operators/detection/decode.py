@@ -19,13 +19,14 @@ Size = tuple[int, int]
 class Candidates:
     """Boxes (N, 4) float32 as x1, y1, x2, y2 in input pixels, scores (N,) float32, classes (N,) int32.
 
-    `masks` (N, ...) holds what the network gives of the mask of each; None for one without masks.
+    `masks` (N, ...) holds what the network gives of the mask of each, or, drawn, whether the pixels of the image (N,
+    height, width) belong to it; None for one without masks.
     """
 
     boxes: NDArray[np.float32]
     scores: NDArray[np.float32]
     classes: NDArray[np.int32]
-    masks: NDArray[np.float32] | None = None
+    masks: NDArray[np.float32] | NDArray[np.bool_] | None = None
 
     def select(self, which: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Candidates:
         masks = None if self.masks is None else self.masks[which]

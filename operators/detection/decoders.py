@@ -9,10 +9,12 @@ from operators.detection.instance_masks import by_planes, by_probabilities, by_p
 from operators.detection.suppressed import (
     decode_detr,
     decode_end2end,
+    decode_rfdetr,
     decode_rtdetr,
     decode_ssd,
     decode_tensorflow,
     decode_torchvision,
+    detr_pair,
 )
 from operators.detection.yolo import (
     decode_fastestdet,
@@ -76,15 +78,15 @@ LAYOUTS: dict[DecoderName, Layout] = {
         decode_detr,
         bgr=False,
         fit="stretch",
-        classes=lambda o: int(next(a.shape[2] for a in o if a.ndim == 3 and a.shape[2] != 4)),
+        classes=lambda o: int(detr_pair(o, False)[1].shape[1]),
         nms_iou=1.0,
         draw=by_planes,
     ),
     "rfdetr": Layout(
-        decode_detr,
+        decode_rfdetr,
         bgr=False,
         fit="stretch",
-        classes=lambda o: int(next(a.shape[2] for a in o if a.ndim == 3 and a.shape[2] != 4)),
+        classes=lambda o: int(detr_pair(o, True)[1].shape[1]),
         mean=_MEAN,
         scale=_DEVIATION,
         nms_iou=1.0,

@@ -76,7 +76,7 @@ class ExportedFinder:
         found = found.select(class_wise_nms(found.boxes, found.scores, found.classes, nms_iou)[:most])
         drawn = None
         if self._masks and found.masks is not None and self._layout.draw is not None:
-            drawn = self._layout.draw(found, outputs, fit).astype(np.float32)
+            drawn = self._layout.draw(found, outputs, fit)
         return replace(found, boxes=fit.restore(found.boxes), masks=drawn)
 
     def _size_input(self) -> dict[str, NDArray[Any]]:

@@ -22,7 +22,7 @@ def by_prototypes(found: Candidates, outputs: Outputs, fit: Fit) -> Masks:
     assert found.masks is not None
     logits = (found.masks @ prototypes.reshape(len(prototypes), -1)).reshape(-1, *prototypes.shape[1:])
     boxes = fit.restore(found.boxes)
-    made = [_inside(_at_image(plane, fit) > 0, box) for plane, box in zip(logits, boxes, strict=True)]
+    made = [inside(_at_image(plane, fit) > 0, box) for plane, box in zip(logits, boxes, strict=True)]
     return np.stack(made) if made else _none(fit)
 
 
@@ -61,11 +61,11 @@ def _at_image(plane: NDArray[np.float32], fit: Fit) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(cut, fit.image, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _inside(mask: NDArray[np.bool_], box: NDArray[np.float32]) -> NDArray[np.bool_]:
+def inside(mask: NDArray[np.bool_], box: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Cuts off pixels whose upper left corners are outside a box."""
     rows, columns = np.arange(mask.shape[0]), np.arange(mask.shape[1])
-    inside = ((rows >= box[1]) & (rows < box[3]))[:, None] & ((columns >= box[0]) & (columns < box[2]))
-    return np.asarray(mask & inside)
+    within = ((rows >= box[1]) & (rows < box[3]))[:, None] & ((columns >= box[0]) & (columns < box[2]))
+    return np.asarray(mask & within)
 
 
 def _pasted(plane: NDArray[np.float32], box: NDArray[np.float32], image: tuple[int, int]) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ from operators.detection.decode import Candidates
 
 
 def detections_of(image: Image, names: tuple[str, ...], found: Candidates) -> Detections2D:
-    """Returns boxes, scores, classes, and masks (N, height, width) where there are any, all in the image's pixels."""
+    """Returns boxes, scores, classes, and drawn masks where there are any, all in the image's pixels."""
     return Detections2D(
         stamp=image.stamp,
         frame=image.frame,
@@ -19,5 +19,5 @@ def detections_of(image: Image, names: tuple[str, ...], found: Candidates) -> De
         boxes=found.boxes,
         scores=np.minimum(found.scores, np.float32(1)),
         class_ids=found.classes,
-        masks=None if found.masks is None else pack_masks(found.masks > 0),
+        masks=None if found.masks is None else pack_masks(found.masks.astype(np.bool_, copy=False)),
     )

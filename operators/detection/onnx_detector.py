@@ -8,18 +8,19 @@ from typing import Any, Literal
 
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.coco import CLASS_LISTS
+from operators.detection.coco import names_of
 from operators.detection.custom.finder import GridFinder
 from operators.detection.decoders import DecoderName
 from operators.detection.exported import ExportedFinder
 from operators.detection.messages import detections_of
+from operators.image.letterbox import FitMode
 from operators.inference import ModelError, Provider
-from operators.models.registry import Model, Registry
+from operators.models.registry import Registry
 from operators.models.use import Used, names_a_model, use_model
 from operators.network_input import read_labels, three_channels
 from operators.weights import kind_of, trained_in_simulation
 
-_SCORE, _GRID_IOU = 0.3, 0.5
+_SCORE, _GRID_IOU, _SIDE = 0.3, 0.5, 640
 
 
 class OnnxDetector(Operator):
@@ -57,11 +58,16 @@ class OnnxDetector(Operator):
         doc="overlap above which the weaker box of a class is dropped; none: the family's",
     )
     max_detections: int = Param(100, ge=1, tunable=True, doc="keep the best so many")
-    fit: Literal["default", "stretch", "letterbox", "corner"] = Param(
-        "default", doc="how the image fills the input; by default as the decoder's family was trained"
+    fit: FitMode | None = Param(
+        None, doc="how the image fills the input; none takes the registry's, or that of the decoder's family"
     )
     provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
-    input_size: int = Param(640, ge=32, doc="side of the input where the model leaves it open", unit="px")
+    input_size: int | None = Param(
+        None,
+        ge=32,
+        doc="side of the input where the model leaves it open; none takes the registry's, or 640",
+        unit="px",
+    )
     masks: bool = Param(True, doc="give instance masks where the model has them")
 
     @classmethod
@@ -75,17 +81,18 @@ class OnnxDetector(Operator):
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError or ModelError."""
         used = use_model(self, self.model)
-        row = {} if used.model is None else used.model.params
-        decoder = self.decoder or row.get("decoder") or ("grid" if kind_of(used.file) == "detector" else None)
+        grid = "grid" if kind_of(used.file) == "detector" else None
+        decoder = used.setting(self, "decoder", grid)
         if decoder is None:
             raise ModelError(
                 f"{used.file} is no file of a model that `dataflow models list` prints, so OnnxDetector.decoder must "
                 f"name its family"
             )
         self._finder: GridFinder | ExportedFinder
-        self._finder = GridFinder(used.file) if decoder == "grid" else self._exported(used, decoder)
+        self._finder = self._grid(used.file) if decoder == "grid" else self._exported(used, decoder)
         family = _GRID_IOU if isinstance(self._finder, GridFinder) else self._finder.nms_iou
-        self._score, self._iou = float(row.get("score_threshold", _SCORE)), float(row.get("nms_iou", family))
+        self._score = float(used.default("score_threshold", _SCORE))
+        self._iou = float(used.default("nms_iou", family))
         self.log.info("%s", self._described(used, decoder))
 
     def process(self, image: Image) -> Detections2D:
@@ -95,31 +102,30 @@ class OnnxDetector(Operator):
         found = self._finder.find(three_channels(image.data), score, iou, self.max_detections)
         return detections_of(image, self._finder.names, found)
 
+    def _grid(self, file: Path) -> GridFinder:
+        given = {name: getattr(self, name) for name in ("classes", "fit", "input_size", "provider")}
+        if unused := [name for name, value in given.items() if value not in (None, "cpu")]:
+            raise ModelError(
+                f"{file} was written by `dataflow train detector`: it holds its classes and its input, and runs on the "
+                f"CPU, so leave {', '.join(unused)} of OnnxDetector out"
+            )
+        return GridFinder(file)
+
     def _exported(self, used: Used, decoder: DecoderName) -> ExportedFinder:
-        if used.model is not None and not used.model.operator.endswith(f":{type(self).__name__}"):
-            raise ModelError(f"{used.model.name} is run by {used.model.operator}, not by {type(self).__name__}")
         return ExportedFinder(
             used.file,
             decoder,
-            self._names(used.model),
+            names_of(used.model) if self.classes is None else self._names(self.classes),
             provider=self.provider,
-            fit=None if self.fit == "default" else self.fit,
-            free_side=self.input_size,
+            fit=used.setting(self, "fit", None),
+            free_side=used.setting(self, "input_size", _SIDE),
             masks=self.masks,
         )
 
-    def _names(self, model: Model | None) -> tuple[str, ...] | None:
-        if self.classes is not None:
-            names = tuple(name.strip() for name in self.classes.split(","))
-            file = len(names) == 1 or Path(self.classes).is_file()
-            return read_labels(self.use_file(self.classes)).names if file else names
-        if model is None or model.classes is None:
-            return None
-        if isinstance(model.classes, list):
-            return tuple(model.classes)
-        if model.classes not in CLASS_LISTS:
-            raise ModelError(f"{model.name}: there is no list of classes {model.classes!r}; {', '.join(CLASS_LISTS)}")
-        return CLASS_LISTS[model.classes]
+    def _names(self, classes: str) -> tuple[str, ...]:
+        names = tuple(name.strip() for name in classes.split(","))
+        file = len(names) == 1 or Path(classes).is_file()
+        return read_labels(self.use_file(classes)).names if file else names
 
     def _described(self, used: Used, decoder: str) -> str:
         count = len(self._finder.names)

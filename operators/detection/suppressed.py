@@ -52,21 +52,15 @@ def decode_rtdetr(outputs: Outputs, size: Size, threshold: float) -> Candidates:
     return _kept(boxes, scores[0], labels[0], threshold)
 
 
-def decode_detr(outputs: Outputs, size: Size, threshold: float) -> Candidates:
-    """Networks of the DETR family before their post-processing: boxes (1, N, 4), logits (1, N, C), in either order.
+def decode_detr(outputs: Outputs, size: Size, threshold: float, boxes_first: bool = False) -> Candidates:
+    """Networks of the DETR family before their post-processing: logits (1, N, C), boxes (1, N, 4), in either order.
 
-    Boxes are centre and size as shares of the input; of N · C sigmoids the best N are taken, so a query may answer for
-    several classes. Mask logits (1, N, h, w) may follow. Source: `PostProcess` of RF-DETR (Roboflow, 2025; Apache-2.0),
-    that of RT-DETR in Hugging Face's transformers, both after Zhu et al., "Deformable DETR", 2020.
+    Of four classes the logits come first, or the boxes with `boxes_first`. Boxes are centre and size as shares of the
+    input; of N · C sigmoids the best N are taken, so a query may answer for several classes. Mask logits (1, N, h, w)
+    may follow. Source: `PostProcess` of RF-DETR (Roboflow, 2025; Apache-2.0), that of RT-DETR in Hugging Face's
+    transformers, both after Zhu et al., "Deformable DETR", 2020.
     """
-    flat = [o for o in outputs if o.ndim == 3 and o.shape[0] == 1]
-    placed = sorted(flat, key=lambda o: o.shape[2] != 4)  # stable: of four classes the boxes come first
-    if len(flat) != 2 or placed[0].shape[2] != 4 or placed[0].shape[1] != placed[1].shape[1]:
-        raise ValueError(
-            f"a DETR's outputs have shapes (1, N, 4) and (1, N, classes), and with masks (1, N, h, w), "
-            f"got {shapes_of(outputs)}"
-        )
-    boxes, logits = placed[0][0], placed[1][0]
+    boxes, logits = detr_pair(outputs, boxes_first)
     masks = next((o[0] for o in outputs if o.ndim == 4), None)
     scores = sigmoid(logits.astype(np.float32))
     best = np.argsort(-scores, axis=None, kind="stable")[: len(boxes)]
@@ -74,6 +68,23 @@ def decode_detr(outputs: Outputs, size: Size, threshold: float) -> Candidates:
     rows, classes = np.divmod(best, logits.shape[1])
     made = corners(*boxes[rows].T) * np.array([*size, *size], np.float32)
     return _kept(made, scores.reshape(-1)[best], classes, threshold, None if masks is None else masks[rows])
+
+
+def decode_rfdetr(outputs: Outputs, size: Size, threshold: float) -> Candidates:
+    """RF-DETR's export: as `decode_detr`, the boxes first."""
+    return decode_detr(outputs, size, threshold, boxes_first=True)
+
+
+def detr_pair(outputs: Outputs, boxes_first: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Returns boxes (N, 4) and logits (N, C) of a network of the DETR family. Raises ValueError for other outputs."""
+    flat = [o for o in outputs if o.ndim == 3 and o.shape[0] == 1]
+    placed = sorted(flat if boxes_first else flat[::-1], key=lambda o: o.shape[2] != 4)  # stable
+    if len(flat) != 2 or placed[0].shape[2] != 4 or placed[0].shape[1] != placed[1].shape[1]:
+        raise ValueError(
+            f"a DETR's outputs have shapes (1, N, 4) and (1, N, classes), and with masks (1, N, h, w), "
+            f"got {shapes_of(outputs)}"
+        )
+    return placed[0][0], placed[1][0]
 
 
 def decode_torchvision(outputs: Outputs, size: Size, threshold: float) -> Candidates:

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColu
 from rich.table import Table
 
 from operators.inference import ModelError
-from operators.models.fetch import digest_of, fetch, hub_file, take
+from operators.models.fetch import damage, digest_of, fetch, hub_file, take
 from operators.models.registry import Model, Registry
 from operators.models.use import missing
 
@@ -109,8 +109,8 @@ def get_model(
 ) -> None:
     """Bring a model's file into the cache, once, and check it. Prints its licence first.
 
-    A download that breaks off goes on where it stopped. Proxies of the environment are used. Exit code 1 where the
-    file cannot be had or is another one.
+    A download that breaks off goes on where it stopped. A file in the cache whose sha256 is another is replaced.
+    Proxies of the environment are used. Exit code 1 where the file cannot be had or is another one.
 
     Examples:
 
@@ -121,9 +121,9 @@ def get_model(
     console = Console(stderr=True, highlight=False)
     console.print(escape(f"{model.name}: licence {model.licence} ({model.home}); from {model.source}"), soft_wrap=True)
     try:
-        file = _place(model) if given is None else take(model, given)
-        if file is None:
-            file = _fetched(model, console)
+        if given is None and (found := damage(model)) is not None:
+            console.print(escape(f"{found}: it is got anew"), soft_wrap=True)
+        file = _fetched(model, console) if given is None else take(model, given)
     except (ModelError, OSError) as error:
         raise _failed(str(error), code=1) from None
     if json:
@@ -180,10 +180,7 @@ def _fetched(model: Model, console: Console) -> Path:
 
 def _place(model: Model) -> Path | None:
     """Returns the model's file where it is on this machine."""
-    try:
-        file = hub_file(model) if model.source.torchvision is not None else model.file
-    except (ModelError, ImportError):
-        return None
+    file = hub_file(model) if model.source.torchvision is not None else model.file
     return file if file.is_file() else None
 
 

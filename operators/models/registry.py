@@ -34,7 +34,7 @@ class Source(_Row):
 
     - `url`: of http, https or file. `package` and `member`: a package of `index` that carries the file, as
       `name==version` of pypi or `name@version` of npm, and the file's path in it.
-    - `torchvision`: the name of torchvision's weights (`COCO_V1`), which its hub keeps.
+    - `torchvision`: the name of torchvision's weights (`COCO_V1`), which its hub keeps as the file `member`.
     - `shipped`: a file of the project's.
     - `export`: how the file is made, where it is not distributed.
     """
@@ -49,12 +49,12 @@ class Source(_Row):
 
     @model_validator(mode="after")
     def _one(self) -> Source:
-        packaged = (self.index, self.package, self.member)
-        if any(packaged) and not all(packaged):
-            raise ValueError("index, package and member come together")
         given = [self.url, self.index, self.torchvision, self.shipped, self.export]
         if sum(each is not None for each in given) != 1:
             raise ValueError("one of url, index with package and member, torchvision, shipped, export must be given")
+        packaged = (self.index, self.package)
+        if any(packaged) != all(packaged) or any((*packaged, self.torchvision)) != (self.member is not None):
+            raise ValueError("index, package and member come together, and torchvision and member")
         if self.url is not None and not self.url.startswith(("https://", "http://", "file://")):
             raise ValueError(f"url must begin with https://, http:// or file://, is {self.url!r}")
         return self
@@ -84,8 +84,8 @@ class Model(_Row):
 
     - `operator`: the import path of the operator that runs it; `params`: its parameters where others are not given.
     - `classes`: a list of names, the name of one (`coco`), or None for networks without.
-    - `sha256` of the file; None where it is exported by oneself. `bytes`: its size, where that is known. `exports`:
-      sha256 of other exports of the same network, which the row's parameters fit, too.
+    - `sha256` of the file; None where the user exports it. `bytes`: its size, where that is known. `exports`: sha256 of
+      other files of the same network, exported otherwise, which the row describes as well.
     - `published`: the authors' figure; `measured`: the one found here, with its command, or `not measured`.
     """
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +12,8 @@ from typing import Any
 from dataflow.operator import Operator
 from operators.inference import ModelError
 from operators.models.registry import Model, Registry
+
+_OPERATOR = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 @dataclass(frozen=True)
@@ -18,32 +23,59 @@ class Used:
     file: Path
     model: Model | None
 
-    def setting(self, operator: Operator, name: str) -> Any:
-        """Returns a parameter of an operator; where it has its default, the registry's for this model, if there is
-        one."""
+    def default(self, name: str, default: Any) -> Any:
+        """Returns the registry's value of a parameter for this model; `default` where there is none."""
+        return default if self.model is None else self.model.params.get(name, default)
+
+    def setting(self, operator: Operator, name: str, default: Any) -> Any:
+        """Returns a parameter of an operator; where it is None, its `default`."""
         given = getattr(operator, name)
-        default = type(operator).spec.parameters.model_fields[name].default
-        return given if self.model is None or given != default else self.model.params.get(name, given)
+        return self.default(name, default) if given is None else given
 
 
 def use_model(operator: Operator, given: str) -> Used:
     """Returns the file of a model for an operator, and notes its digest under the name or path that was given.
 
-    A file of a row is known by its digest, wherever it lies. Raises FileNotFoundError for a missing file, with how to
-    get it, and ModelError for a name of no row, or a file in the cache that is not its row's.
+    A file of a row is known by its digest, wherever it lies; the digest of the row's parameters and classes is noted
+    beside it, under `NAME (row)`. Raises FileNotFoundError for a missing file, with how to get it, and ModelError for a
+    name of no row, a row that is for another operator, or a file in the cache that is not its row's.
     """
     registry = Registry.load()
     if not names_a_model(given):
+        if _OPERATOR.fullmatch(given) and not Path(given).exists():
+            raise ModelError(
+                f"{given} is an operator, but {type(operator).__name__}.model takes a name of `dataflow models list`, "
+                f"or an ONNX file (in graphs/core/perception.yaml `detector_operator` takes an operator)"
+            )
         file = operator.use_file(given)
-        return Used(file, registry.with_digest(operator.files[given]))
-    model = registry[given]
-    if not model.file.is_file():
-        raise FileNotFoundError(missing(model))
-    file = operator.use_file(model.file, name=given)
-    if not model.accepts(operator.files[given]):
-        found = operator.files[given]
-        raise ModelError(f"{file} is not the file of {given}: its sha256 is {found}, expected {model.sha256}")
+        model = registry.with_digest(operator.files[given])
+    else:
+        model = registry[given]
+        if not model.file.is_file():
+            raise FileNotFoundError(missing(model))
+        file = operator.use_file(model.file, name=given)
+        if not model.accepts(operator.files[given]):
+            raise ModelError(
+                f"{file} is not the file of {given}: its sha256 is {operator.files[given]}, expected {model.sha256}. "
+                f"`dataflow models get {given}` brings the right one"
+            )
+    if model is not None:
+        _check_row(operator, model)
+        row = json.dumps({"params": model.params, "classes": model.classes}, sort_keys=True, default=str)
+        operator.files[f"{given} (row)"] = hashlib.sha256(row.encode()).hexdigest()
     return Used(file, model)
+
+
+def _check_row(operator: Operator, model: Model) -> None:
+    kind = type(operator)
+    if not model.operator.endswith(f":{kind.__name__}"):
+        raise ModelError(f"{model.name} is run by {model.operator}, not by {kind.__name__}")
+    takes = [name for name, field in kind.spec.parameters.model_fields.items() if field.default is None]
+    if unknown := model.params.keys() - takes:
+        raise ModelError(
+            f"the registry's row {model.name} sets {', '.join(sorted(unknown))}, but {kind.__name__} takes only "
+            f"{', '.join(takes)} from it"
+        )
 
 
 def names_a_model(given: str) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Image, SegmentationMap
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param
+from operators.detection.coco import names_of
 from operators.image.letterbox import Fit, FitMode
 from operators.inference import ModelError, Provider, open_session
 from operators.model_metadata import told
@@ -45,18 +46,27 @@ class OnnxSegmenter(Operator):
     classes: str | None = Param(
         None,
         doc="text file with one class name a line, with or without its colour (`road 128 64 128`); none means the "
-        "names in the model's metadata, or numbers",
+        "names in the model's metadata, those of the registry, or numbers",
     )
     provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
-    output: str | None = Param(None, doc="name of the output with scores or classes; none means the first")
-    scores: Literal["logits", "probabilities"] = Param("logits", doc="what scores are")
+    output: str | None = Param(
+        None, doc="name of the output with scores or classes; none takes the registry's, or the first"
+    )
+    scores: Literal["logits", "probabilities"] | None = Param(
+        None, doc="what scores are; none takes the registry's, or logits"
+    )
     mean: tuple[float, float, float] | None = Param(
-        None, doc="subtracted from a pixel as a share of 1, red first; none: the metadata's, or ImageNet's"
+        None,
+        doc="subtracted from a pixel as a share of 1, red first; none: the registry's, the metadata's, or ImageNet's",
     )
     std: tuple[float, float, float] | None = Param(None, doc="what the difference is divided by; the same")
     bgr: bool = Param(False, doc="the network sees blue first")
-    fit: FitMode = Param("stretch", doc="how the image fills the input")
-    input_size: tuple[int, int] = Param((512, 512), doc="(width, height) where the model leaves it open", unit="px")
+    fit: FitMode | None = Param(None, doc="how the image fills the input; none takes the registry's, or stretch")
+    input_size: tuple[int, int] | None = Param(
+        None,
+        doc="(width, height) where the model leaves it open; none takes the registry's, or 512 x 512",
+        unit="px",
+    )
     confidence_threshold: float = Param(0.0, ge=0, le=1, tunable=True, doc="pixels below become void")
     class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")
     with_confidence: bool = Param(False, tunable=True, doc="also give the confidence of every pixel")
@@ -65,28 +75,30 @@ class OnnxSegmenter(Operator):
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError, or ModelError where parameters do not fit it."""
         used = use_model(self, self.model)
-        file, row = used.file, used.model
+        file = used.file
         self._session = open_session(file, self.provider)
-        self._shares = used.setting(self, "scores") == "probabilities"
+        self._shares = used.setting(self, "scores", "logits") == "probabilities"
         facts = told(file, self._session.get_modelmeta().custom_metadata_map)
         self._labels = facts.labels if self.classes is None else read_labels(self.use_file(self.classes))
-        if self._labels is None and row is not None and isinstance(row.classes, list):
-            self._labels = Labels(tuple(row.classes), {})
-        mean, std = self.mean or facts.mean, self.std or facts.std
-        if min(self.input_size) < 1 or (std is not None and min(std) <= 0):
-            raise ModelError(f"input_size and std must be above 0, are {self.input_size} and {std}")
+        if self._labels is None and (names := names_of(used.model)) is not None:
+            self._labels = Labels(names, {})
+        mean, std = used.setting(self, "mean", facts.mean), used.setting(self, "std", facts.std)
+        free = tuple(used.setting(self, "input_size", (512, 512)))
+        if min(free) < 1 or (std is not None and min(std) <= 0):
+            raise ModelError(f"input_size and std must be above 0, are {free} and {std}")
         self._input = image_input(
             file,
             self._session,
-            self.input_size,
+            (free[0], free[1]),
             bgr=self.bgr,
             mean=[255 * value for value in mean or _MEAN],
             scale=[255 * value for value in std or _DEVIATION],
         )
         if self._input.type is np.uint8 and (self.mean, self.std) != (None, None):
             raise ModelError(f"{file} takes pixels of uint8 as they are: leave mean and std out")
+        self._fit: FitMode = used.setting(self, "fit", "stretch")
         found = {each.name: each for each in self._session.get_outputs()}
-        self._output = used.setting(self, "output") or next(iter(found))
+        self._output = used.setting(self, "output", next(iter(found)))
         if self._output not in found:
             raise ModelError(f"{file} has no output {self._output!r}; it has {', '.join(found)}")
         self._sure = "int" not in found[self._output].type
@@ -100,7 +112,7 @@ class OnnxSegmenter(Operator):
 
     def process(self, image: Image) -> dict[str, Any]:
         """Raises ModelError where the model's output is no scores and no map of classes, or has other classes."""
-        fit = Fit.plan(self.fit, (image.width, image.height), self._input.size)
+        fit = Fit.plan(self._fit, (image.width, image.height), self._input.size)
         tensor = self._input.tensor(fit.apply(three_channels(image.data)))
         output = np.asarray(self._session.run([self._output], {self._input.name: tensor})[0])
         try:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import subprocess
+import sys
+import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -149,6 +152,72 @@ def test_video_streams_of_rerun_files_decode(codec: str, format_: str, of: str, 
     assert [m.stamp for m in found] == [START + k * PERIOD for k in range(24)]
     images = play(VideoDecoder(), {"video": found})["image"]
     assert all(np.array_equal(m.data, frame) for m, frame in zip(images, decoded(format_, packets), strict=True))
+
+
+def test_a_timeline_of_numbers_gives_no_times(tmp_path: Path) -> None:
+    with rr.RecordingStream("test", recording_id="numbers") as recording:
+        recording.save(tmp_path / "video.rrd")
+        for k, packet in enumerate(clip("h264")):
+            recording.set_time("frame", sequence=k)
+            recording.log("cam/video", rr.VideoStream.from_fields(sample=packet, codec="H264"))
+    bag = open_bag(tmp_path / "video.rrd")
+    assert bag.notes == (
+        "/cam/video is stamped by its timeline 'log_time', the time of logging: it has no other timeline of times",
+    )
+    found = [Proto.FromString(bytes(stored.data)) for stored in bag.messages(["/cam/video"])]
+    assert [each.data for each in found] == list(clip("h264"))
+
+
+def test_packets_before_their_timeline_leave_all_of_them_on_another(tmp_path: Path) -> None:
+    packets = clip("h264")
+    with rr.RecordingStream("test", recording_id="before") as recording:
+        recording.save(tmp_path / "video.rrd")
+        recording.log("cam/video", rr.VideoStream.from_fields(sample=packets[0], codec="H264"))
+        recording.set_time("frame time", duration=3.0)
+        recording.log("cam/video", rr.VideoStream.from_fields(sample=packets[1]))
+    bag = open_bag(tmp_path / "video.rrd")
+    assert "timeline 'log_time'" in bag.notes[0]
+    first, second = (stored.log_time for stored in bag.messages(["/cam/video"]))
+    assert 0 <= second - first < 60 * SECOND
+
+
+def test_video_of_no_stated_codec_is_refused_with_a_reason(tmp_path: Path) -> None:
+    with rr.RecordingStream("test", recording_id="no codec") as recording:
+        recording.save(tmp_path / "video.rrd")
+        recording.set_time("frame time", timestamp=np.datetime64(START, "ns"))
+        recording.log("cam/video", rr.VideoStream.from_fields(sample=clip("h264")[0]))
+    bag = open_bag(tmp_path / "video.rrd")
+    assert len(list(bag.messages(["/cam/video"]))) == 1
+    assert "video of format 'unknown' is not read" in Reading(bag, bag.topics["/cam/video"]).reason
+
+
+def test_the_first_of_several_recordings_is_read_and_the_others_named(tmp_path: Path) -> None:
+    files = [tmp_path / f"{name}.rrd" for name in ("one", "two")]
+    for file in files:
+        with rr.RecordingStream("test", recording_id=file.stem) as recording:
+            recording.save(file)
+            for k, packet in enumerate(clip("h264")):
+                recording.set_time("frame time", timestamp=np.datetime64(START + k * PERIOD, "ns"))
+                recording.log("cam/video", rr.VideoStream.from_fields(sample=packet, codec="H264"))
+    merge = [sys.executable, "-m", "rerun", "rrd", "merge", *map(str, files), "-o", str(tmp_path / "both.rrd")]
+    subprocess.run(merge, check=True, capture_output=True, timeout=60)
+    bag = open_bag(tmp_path / "both.rrd")
+    assert bag.topics["/cam/video"].count == 24
+    assert bag.notes[0] == "its recording 'two' is not read: the first one is, 'one'"
+
+
+def test_a_rerun_file_is_held_in_memory_once(tmp_path: Path) -> None:
+    packets = np.random.default_rng(0).integers(0, 256, (100, 40_000)).astype(np.uint8)
+    path = rerun_file(tmp_path / "video.rrd", rr.VideoCodec.H264, [row.tobytes() for row in packets], of="timestamp")
+    tracemalloc.start()  # counts what is outside of Rerun's columns
+    try:
+        bag = open_bag(path)
+        largest = max(len(stored.data) for stored in bag.messages(bag.topics))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert largest > packets.shape[1]
+    assert peak < packets.nbytes / 2
 
 
 def test_av1_of_a_rerun_file_is_refused_with_a_reason(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Clips of made patterns, encoded packet by packet by PyAV, and what it decodes of them: a second implementation."""
+"""Clips of made patterns, encoded packet by packet by PyAV, and what its FFmpeg decodes of them, called directly."""
 
 from __future__ import annotations
 

