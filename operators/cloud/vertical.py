@@ -61,7 +61,7 @@ class Vertical:
 
     @property
     def doubt(self) -> float:
-        """What is lacking to a decision: up to 1 nothing is."""
+        """How far the view is from deciding: up to 1 it does."""
         return float(max(self.rival / _RIVAL, self.sigma / _SURE))
 
     def before(self, T_first_now: Array) -> Vertical:

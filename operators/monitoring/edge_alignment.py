@@ -47,7 +47,7 @@ class Correction:
 
     Both are of points in the image camera's frame: x to the right and y down of `displacement`, and by `turn` the same
     ways as seen from the camera. One of them is zero: the one that explains near and far edges less well, by `margin`,
-    a share of how well the other does. `sure` is whether that tells a camera that is turned from a displaced one.
+    a share of how well the other does. `sure` is whether a turned camera and a displaced one can be distinguished so.
     """
 
     displacement: tuple[float, float]

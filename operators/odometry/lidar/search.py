@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 STEP, WIDE_STEP = 0.5, 1.0  # metres between poses, and those of a search that reaches far
 WIDE = 5.0  # metres from which a search reaches far
-ANY_TURN = np.arange(24) * (np.pi / 12)  # headings, where none is known
+ANY_TURN = np.asarray(np.arange(24) * (np.pi / 12), np.float64)  # headings, where none is known
 _SEARCHED = 120  # points that are looked at
 _WIDTH = 6.0  # standard deviations of the kernel
 _WORTH = 0.7  # share of the best pose's score from which another is worth a look
