@@ -109,7 +109,7 @@ class OperatorRunner(Runner):
 
     def set_parameter(self, name: str, value: Any) -> Any:
         started = time.time_ns()
-        stamp = max(self.done, NEVER + 1)
+        stamp = self.working_stamp if self.ended else max(self.done, NEVER + 1)
         plain = self.calls.parameter(name, value, (self.records.incarnation, stamp))
         self.records.add("param", stamp, started, detail={"name": name, "value": plain})
         return plain

@@ -79,8 +79,12 @@ class RecorderSink:
         `setup()` has no stamp; its record is stored at the stamp of the first message, so that viewers of the file
         show no long nothing before it."""
         self._unflushed.setdefault(operator, []).append(calls)
-        if stamp > 0 or self._clock > 0:
-            self._write_firings(operator, stamp if stamp > 0 else self._clock, payload)
+        if stamp > 0:
+            self._clock = self._clock or stamp
+            self._write_early()  # in the order of the calls
+            self._write_firings(operator, stamp, payload)
+        elif self._clock > 0:
+            self._write_firings(operator, self._clock, payload)
         else:
             self._early.append((operator, payload))
 

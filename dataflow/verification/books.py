@@ -132,9 +132,8 @@ class Book:
             if held.stream in self.made:
                 self.made[held.stream].add(*held.place)
         place = (record.incarnation, record.index)
-        if place > self._last:
-            self._last = place
-            self.finished = record.kind == "finish" or (self.finished and record.kind not in CALLS)
+        if record.kind in CALLS and place > self._last:
+            self._last, self.finished = place, record.kind == "finish"
 
     def counts(self, record: FiringRecord) -> bool:
         """Tells whether a record counts: one of those that are all there, or the beginning."""

@@ -214,3 +214,18 @@ def test_a_snapshot_that_is_too_large_to_be_recorded_is_left_out_and_counted(
     repeated = again(made, ran, MESSAGES[:2])
     assert repeated.result.verdict == "identical"
     assert again(made, ran, MESSAGES[:2], begin=150).result.began == "start"
+
+
+def test_a_parameter_that_is_set_after_the_end_has_the_stamp_of_the_end() -> None:
+    made, collector = dice(), Collector()
+    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 10**6)
+    runner.setup()
+    runner.push(STREAM, MESSAGES[0])
+    run_all(runner)
+    runner.end(STREAM, None, "")
+    run_all(runner)
+    runner.set_parameter("gain", 3.0)
+
+    finish, last = collector.records[-2:]
+    assert (finish.kind, last.kind, last.stamp) == ("finish", "param", finish.stamp)
+    assert again(made, collector, MESSAGES[:1]).result.verdict == "identical"

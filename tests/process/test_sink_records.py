@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,8 +12,12 @@ from process_doubles import RecordedChannel
 
 from dataflow.graph import load_text
 from dataflow.names import firings_key
+from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord, decode_batch, encode_batch
+from dataflow.records.reading import recorded_firings
+from dataflow.sinks.recorder import RecorderSink
 from dataflow.sinks.sink import SinkConfig, SinkProcess
+from dataflow.sync import NEVER
 from dataflow.transport import Envelope, Kind
 
 GRAPH = """\
@@ -155,3 +160,17 @@ def test_a_recorder_that_is_asked_for_its_state_says_first_that_it_has_ended() -
     assert kinds.index("ended") < kinds.index("state")
     recorder.process._control("poll", {"round": 8})
     assert len(recorder.channel.of("ended")) == 1
+
+
+def test_records_of_an_operator_are_stored_in_the_order_of_its_calls_though_no_message_comes(tmp_path: Path) -> None:
+    graph = load_text(GRAPH)
+    options = {"metadata": {}, "compression": "zstd", "overwrite": False}
+    sink = RecorderSink(tmp_path / "run.mcap", graph, [], options)
+    for index, (kind, stamp) in enumerate([("setup", NEVER), ("finish", 0), ("param", 7)]):
+        detail = {"name": "gain", "value": 1.0} if kind == "param" else {}
+        record = FiringRecord("last", 0, index, kind, stamp, detail=detail)  # type: ignore[arg-type]
+        sink.firings("last", stamp, encode_batch([record]))
+    sink.close("complete")
+
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert [record.index for record in recorded_firings(recording, "last")] == [0, 1, 2]

@@ -75,10 +75,17 @@ def test_the_book_of_an_operator_is_that_of_all_its_records_wherever_they_lie(da
     assert book.only_calls == (
         bool(repeated) and not lost and repeated[0].kind == "setup" and all(r.kind in CALLS for r in repeated[1:])
     )
-    last = max(laid, key=lambda r: (r.incarnation, r.index), default=None)
-    assert not book.finished or any(r.kind == "finish" for r in laid)
-    assert book.finished or last is None or last.kind != "finish"
+    calls = [r for r in laid if r.kind in CALLS]
+    last = max(calls, key=lambda r: (r.incarnation, r.index), default=None)
+    assert book.finished == (last is not None and last.kind == "finish")
     made = places_of([(r.incarnation, r.outputs[0].seq) for r in laid if r.outputs and r.outputs[0] is not None])
     (stream, *_) = graph.nodes["smooth"].outputs.values()
     assert book.made[stream].counts() == made.counts()
     assert books.taken["test/mix/mixed"].counts() == places_of([(0, r.stamp) for r in laid if r.inputs]).counts()
+
+
+def test_a_parameter_that_lies_before_the_finish_which_it_followed_does_not_hide_it() -> None:
+    kinds = {2: "param", 0: "setup", 1: "finish"}
+    laid = [FiringRecord("smooth", 0, index, kind, 0) for index, kind in kinds.items()]  # type: ignore[arg-type]
+    books = Books(FiringLog({"smooth": [encode_batch([r]) for r in laid]}, "run.mcap"), load_graph(MIXED))
+    assert books.of("smooth").finished
