@@ -28,7 +28,7 @@ _FARTHEST = 30.0  # metres that a search for an unknown velocity covers
 _TURN, _LARGEST_TURN = np.radians(4.0), np.radians(24.0)  # steps and reach of headings beside the predicted one
 _START_TURN = np.radians(20.0)  # per second, of a sensor whose velocity is unknown
 _STARTS, _LOST_STARTS, _FAR_STARTS = 3, 5, 12  # of which a pose is fitted
-_RIVAL = 0.03  # a second place whose agreement is that near to the best one's makes the pose ambiguous
+_RIVAL, _FAR_RIVAL = 0.03, 0.1  # a second place whose agreement is that near to the best one's makes a pose ambiguous
 
 
 class State(StrEnum):
@@ -114,22 +114,29 @@ class LidarTracker:
             return self._begin(scan, stamp)
         if self._motion.seconds(stamp) > self._patience + self._config.give_up:
             return self._anew(scan, stamp)
-        lost = self._motion.seconds(stamp) > self._patience
+        fresh = self._motion.fresh  # then it may be anywhere that it could have come to, but is not lost
+        lost = self._motion.seconds(stamp) > self._patience and not fresh
         starts = self._starts(scan, stamp, lost)
         if self._first is not None and self._first.offsets is not None:
             fits = self._second(scan, stamp, starts)
         else:
             fits = self._fitted(scan, stamp, starts)
         far = lost or self._far(stamp)
-        reason = self._doubt(fits[0], stamp, lost, far) or (_elsewhere(fits) if far else "")
+        reason = self._doubt(fits[0], stamp, lost, far)
+        if far and not reason:
+            reason = _elsewhere(fits, _FAR_RIVAL if fresh else _RIVAL, anywhere=lost or fresh)
         if reason:
             return self._unmeasured(scan, stamp, reason)
         return self._measured(scan, stamp, fits[0], State.RELOCALISED if lost else State.TRACKING)
 
     @property
     def _patience(self) -> float:
-        """Seconds without a measured pose until the sensor is lost: any time where no scan was in vain."""
-        return self._config.patience if self._missed else float("inf")
+        """Seconds without a measured pose until the sensor is lost: any time where no scan was in vain, and one scan."""
+        motion = self._motion
+        if not self._missed or motion is None:
+            return float("inf")
+        between = (motion.stamp - motion.before_stamp) * 1e-9 if motion.before_T is not None else 0.0
+        return max(self._config.patience, 2.5 * between)
 
     def _begin(self, scan: Scan, stamp: int) -> Tracked:
         self._motion = LidarMotion(stamp, np.eye(4), np.zeros(6), np.zeros((6, 6)))
@@ -156,7 +163,9 @@ class LidarTracker:
         T = self._motion.predicted(stamp, self._patience)
         reach, turn = self._strays(stamp)
         if lost:
-            turns, reach = ANY_TURN, _REACH
+            unseen = self._motion.seconds(stamp) - self._patience
+            turns = ANY_TURN
+            reach = min(_REACH + float(np.linalg.norm(self._motion.velocity[:3])) * unseen, _FARTHEST)
         elif reach < _BASIN:
             return [T]
         else:
@@ -195,18 +204,18 @@ class LidarTracker:
         return sorted(fits, key=lambda found: -found.inliers * found.paired)
 
     def _second(self, scan: Scan, stamp: int, starts: list[Matrix]) -> list[Fit]:
-        """Returns the fits of the second scan, which shows by what velocity both are to be deskewed.
+        """Returns the fits of the second scan, which shows by what velocity both are to be deskewed: of it and its rivals.
 
         As they were taken, both are skewed alike, so the motion between them comes out nearly right.
         """
         motion, first = self._motion, self._first
         assert motion is not None
         assert first is not None
-        found = self._fitted(replace(scan, offsets=None), stamp, starts)[0]
+        found, *others = self._fitted(replace(scan, offsets=None), stamp, starts)
         points = deskewed(first.points, first.offsets, motion.velocity_to(found.T, stamp))
         self._map = PlaneMap(self._config.voxel, self._config.levels)
         self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], 0)
-        return self._fitted(scan, stamp, [found.T])
+        return [*self._fitted(scan, stamp, [found.T]), *others]
 
     def _doubt(self, found: Fit, stamp: int, lost: bool, far: bool) -> str:
         """Returns why a fit is not to be believed, or nothing; more is asked of one that may be `far` away."""
@@ -328,13 +337,16 @@ _MOTION = ("stamp", "T", "velocity", "covariance", "fresh", "before_stamp", "bef
 _SCAN = ("points", "offsets", "sample", "unusable")
 
 
-def _elsewhere(fits: list[Fit]) -> str:
-    """Returns why a lost sensor may as well be elsewhere than where the first of some fits has it, or nothing."""
+def _elsewhere(fits: list[Fit], rival: float, *, anywhere: bool) -> str:
+    """Returns why a sensor may as well be elsewhere than where the first of some fits has it, or nothing.
+
+    Where it may be `anywhere`, no prediction stands in for what the scan does not constrain.
+    """
     best, *others = fits
-    for twist in best.blind:
+    for twist in best.blind if anywhere else ():
         if twist[:3].any():
             return _told_nothing(twist)
-    least = (1 - _RIVAL) * best.inliers * best.paired
+    least = (1 - rival) * best.inliers * best.paired
     if any(other.inliers * other.paired > least and apart(best.T, other.T) for other in others):
         return "ambiguous: the scan lies on the map in another place as well"
     return ""

@@ -251,6 +251,47 @@ def test_a_lidar_is_found_again_in_a_corridor_with_one_thing_in_it() -> None:
     assert states[0].startswith("relocalised"), states
 
 
+def street(seed: int) -> list[Any]:
+    """A road between facades that stand back by different lengths, with walls between them."""
+    rng = np.random.default_rng(seed)
+    world: list[Any] = [(2, -1.8, (-60, 160), (-12, 12))]
+    for side in (-1, 1):
+        x, before = -60.0, 8.0
+        while x < 150:
+            end, back = x + rng.uniform(3, 12), rng.uniform(5, 11)
+            world.append((1, side * back, (x, end), (-2, 6)))
+            world.append((0, x, tuple(sorted((side * before, side * back))), (-2, 6)))
+            x, before = end, back
+    return world
+
+
+def car(t: float) -> Array:
+    """A car of 12 m/s that speeds up and brakes."""
+    return se3.exp(np.array([12 * t + 2 * np.sin(t), 0.2 * np.sin(t), 0, 0, 0, 0.03 * np.sin(t)]))
+
+
+def driven(seed: int) -> Played:
+    """Plays a drive whose first scans show the velocity; then 7 m lie between two scans."""
+    return play(LidarOdometry(near=1.0), {"cloud": [scan(street(seed), car, k) for k in (0, 1, 2, *range(8, 50, 6))]})
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_a_car_that_moves_metres_between_scans_is_followed(seed: int) -> None:
+    played = driven(seed)
+    assert texts(played) == ["tracking: the map begins here", *["tracking"] * 9]
+    assert np.linalg.norm(errors(played, car)[:, :3], axis=1).max() < 0.05
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_step_of_metres_that_is_wrong_comes_with_a_doubt(seed: int) -> None:
+    played = driven(seed)
+    doubted = [text != "tracking" for text in texts(played)[1:]]
+    wrong = [bool(off > 0.3) for off in np.linalg.norm(errors(played, car)[1:, :3], axis=1)]
+    first = wrong.index(True) if True in wrong else len(wrong)
+    assert not any(wrong[:first])
+    assert True not in wrong or any(doubted[: first + 1])
+
+
 def test_another_place_is_not_taken_for_the_mapped_one_and_a_new_map_begins() -> None:
     elsewhere = [(axis, 3 * place, *spans) if axis == 2 else (axis, place, *spans) for axis, place, *spans in CORRIDOR]
     clouds = [scan(ROOM, circling, k) for k in range(6)] + [scan(elsewhere, along, k) for k in range(6, 18)]
