@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner, Result
 
 from dataflow.messages import Image
 from operators.detection import CustomDetector
@@ -27,6 +28,7 @@ from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
 from operators.learning.augmentation import NONE, Variation, fitted, tensor_of, warp
+from operators.training import commands
 from operators.weights import NetworkFileError, open_network, open_second, shipped
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
@@ -104,6 +106,11 @@ def dataflow_command(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, timeout=100)
 
 
+def called(command: str, *words: str) -> Result:
+    """The same command line in this process, which has imported torch."""
+    return CliRunner().invoke(getattr(commands, command), words)
+
+
 # ---- the first command of a user
 
 
@@ -145,14 +152,27 @@ def test_a_users_own_folder_becomes_a_detector_that_finds_their_objects(tmp_path
 
 def test_the_terminal_shows_the_score_and_how_to_use_the_file(tmp_path: Path) -> None:
     data, out = write_coco(tmp_path / "mine", 6), tmp_path / "mine.onnx"
-    options = ["--epochs", "1", "--batch", "4", "--size", "64x64", "--width", "0.25", "--out", str(out)]
-    first = dataflow_command("train", "detector", str(data), *options)
-    assert first.returncode == 0, first.stderr
+    options = [
+        "--epochs",
+        "1",
+        "--batch",
+        "4",
+        "--size",
+        "64x64",
+        "--width",
+        "0.25",
+        "--refiner-epochs",
+        "1",
+        "--out",
+        str(out),
+    ]
+    first = called("train", "detector", str(data), *options)
+    assert first.exit_code == 0, first.stderr
     assert "CustomDetector" in first.stdout
     assert "6 images" not in first.stderr  # one was set aside, and it says so
     assert "set aside" in first.stderr
-    second = dataflow_command("train", "detector", str(data), *options)
-    assert second.returncode == 2
+    second = called("train", "detector", str(data), *options)
+    assert second.exit_code == 2
     assert "exist already" in second.stderr
     assert "--resume" in second.stderr
 
@@ -161,19 +181,19 @@ def test_a_network_is_scored_on_the_images_that_its_own_training_set_aside(tmp_p
     file, _ = exported(tmp_path, 2, {"classes": ["crate [old]", "[ball]"], "seed": 5})
     data = write_yolo(tmp_path / "mine", 9)
     (data / "data.yaml").write_text("names: ['crate [old]', '[ball]']\n")
-    scored = dataflow_command("evaluate", "detector", str(data), "--weights", str(file))
-    assert scored.returncode == 0, scored.stderr
+    scored = called("evaluate", "detector", str(data), "--weights", str(file))
+    assert scored.exit_code == 0, scored.stderr
     assert "1 of 9 were set aside by seed 5" in scored.stderr
     assert "network.onnx: 1 validation images of 9" in scored.stdout
     assert "[old]" in scored.stdout or "[ball]" in scored.stdout
-    other = dataflow_command("evaluate", "detector", str(data), "--weights", str(file), "--seed", "3")
+    other = called("evaluate", "detector", str(data), "--weights", str(file), "--seed", "3")
     assert "1 of 9 were set aside by seed 3" in other.stderr
 
 
 def test_an_error_keeps_its_square_brackets(tmp_path: Path) -> None:
     missing = tmp_path / "v[old]"
-    failed = dataflow_command("train", "detector", str(missing), "--out", str(tmp_path / "a.onnx"))
-    assert failed.returncode == 2
+    failed = called("train", "detector", str(missing), "--out", str(tmp_path / "a.onnx"))
+    assert failed.exit_code == 2
     assert f"error: no data folder {str(missing)!r}" in failed.stderr
 
 
