@@ -29,8 +29,11 @@ class LidarOdometry(Operator):
     looked for within three metres of where it was, in any heading, and not believed where two places fit or a
     direction is not constrained; after `give_up` a new map begins there. The covariance is that of the whole way: it
     grows when the LiDAR leaves what it has mapped and with every bridge, and along directions that the surroundings do
-    not constrain (a bare corridor), which the status names. A scan that repeats the last one means that the LiDAR
-    stands: where a sensor may hang, ScanWatch before this operator holds it back.
+    not constrain (a bare corridor), which the status names. Where scans are so far apart that the prediction may be off
+    by half a metre, or the first step may be more than three, it is looked for around the prediction, and a pose with
+    a rival is not believed; a street that repeats itself exactly may yet be followed one period off. A scan that
+    repeats the last one means that the LiDAR stands: where a sensor may hang, ScanWatch before this operator holds it
+    back.
 
     Method: scan to map, point to plane. Yuan et al., "Efficient and probabilistic adaptive voxel mapping for accurate
     online LiDAR odometry", 2022; prediction and kernel as in Vizzo et al., "KISS-ICP", 2023; directions without support
@@ -67,7 +70,7 @@ class LidarOdometry(Operator):
     start_speed: float = Param(30.0, gt=0, doc="how fast it may move when first seen", unit="m/s")
     min_known: float = Param(0.2, ge=0, le=1, doc="least share of a scan in mapped places")
     min_inliers: float = Param(0.5, ge=0, le=1, doc="least share of the points on planes that agree with them")
-    patience: float = Param(0.5, ge=0, doc="time bridged by prediction", unit="s")
+    patience: float = Param(0.5, ge=0, doc="time bridged by prediction, and one scan at least", unit="s")
     give_up: float = Param(2.0, ge=0, doc="and time lost until a new map begins", unit="s")
 
     def setup(self) -> None:

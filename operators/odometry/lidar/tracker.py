@@ -28,7 +28,7 @@ _FARTHEST = 30.0  # metres that a search for an unknown velocity covers
 _TURN, _LARGEST_TURN = np.radians(4.0), np.radians(24.0)  # steps and reach of headings beside the predicted one
 _START_TURN = np.radians(20.0)  # per second, of a sensor whose velocity is unknown
 _STARTS, _LOST_STARTS, _FAR_STARTS = 3, 5, 12  # of which a pose is fitted
-_RIVAL, _FAR_RIVAL = 0.03, 0.1  # a second place whose agreement is that near to the best one's makes a pose ambiguous
+_RIVAL, _FAR_RIVAL = 0.03, 0.05  # a second place whose agreement is that near to the best one's makes a pose ambiguous
 
 
 class State(StrEnum):
@@ -131,7 +131,7 @@ class LidarTracker:
 
     @property
     def _patience(self) -> float:
-        """Seconds without a measured pose until the sensor is lost: any time where no scan was in vain, and one scan."""
+        """Seconds without a measured pose until the sensor is lost, two scans at least; any time if none was bad."""
         motion = self._motion
         if not self._missed or motion is None:
             return float("inf")
@@ -204,7 +204,7 @@ class LidarTracker:
         return sorted(fits, key=lambda found: -found.inliers * found.paired)
 
     def _second(self, scan: Scan, stamp: int, starts: list[Matrix]) -> list[Fit]:
-        """Returns the fits of the second scan, which shows by what velocity both are to be deskewed: of it and its rivals.
+        """Returns the fit of the second scan, which shows by what velocity both are to be deskewed, and its rivals.
 
         As they were taken, both are skewed alike, so the motion between them comes out nearly right.
         """

@@ -288,7 +288,6 @@ def test_a_step_of_metres_that_is_wrong_comes_with_a_doubt(seed: int) -> None:
     doubted = [text != "tracking" for text in texts(played)[1:]]
     wrong = [bool(off > 0.3) for off in np.linalg.norm(errors(played, car)[1:, :3], axis=1)]
     first = wrong.index(True) if True in wrong else len(wrong)
-    assert not any(wrong[:first])
     assert True not in wrong or any(doubted[: first + 1])
 
 
