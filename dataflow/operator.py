@@ -113,6 +113,10 @@ class Operator:
             tolerance = above.tolerance if tolerance is None else tolerance
             every = above.every if every is None else every
         if not abstract:
+            if issubclass(cls, Source) and isinstance(vars(cls).get("live"), bool):
+                raise OperatorDefinitionError(
+                    f"{cls.__name__}.live was renamed: a source that cannot wait is real_time"
+                )
             declared = Declaration(cls, (Operator, Source), sys._getframe(1).f_locals)
             if declared.state is not None:
                 cls.__state, cls.state = declared.state, StateOf()
@@ -258,11 +262,6 @@ class Source(Operator, abstract=True):
     real_time: ClassVar[bool] = False
     simulated: ClassVar[bool] = False
     """Its messages are computed, not measured by a sensor."""
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if isinstance(vars(cls).get("live"), bool):
-            raise OperatorDefinitionError(f"{cls.__name__}.live was renamed: a source that cannot wait is real_time")
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         """Yields what is emitted at one stamp: a mapping from port to message. Stamps strictly increase."""

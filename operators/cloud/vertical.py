@@ -61,7 +61,7 @@ class Vertical:
 
     @property
     def doubt(self) -> float:
-        """How far the view is from deciding: up to 1 it does."""
+        """The doubt that is left: up to 1 the view decides."""
         return float(max(self.rival / _RIVAL, self.sigma / _SURE))
 
     def before(self, T_first_now: Array) -> Vertical:
