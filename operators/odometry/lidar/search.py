@@ -14,7 +14,7 @@ from operators.odometry.lidar.map import PlaneMap
 Array = NDArray[np.float64]
 
 STEP, WIDE_STEP = 0.5, 1.0  # metres between poses, and those of a search that reaches far
-WIDE = 5.0  # metres from which a search reaches far
+WIDE = 4.0  # metres from which a search reaches far
 ANY_TURN = np.asarray(np.arange(24) * (np.pi / 12), np.float64)  # headings, where none is known
 _SEARCHED = 120  # points that are looked at
 _WIDTH = 6.0  # standard deviations of the kernel

@@ -24,7 +24,7 @@ FEWEST = 50  # points of a scan, and half as many in planes, that a pose may res
 _EPOCH = (1.0, 0.35)  # metres, radians: what the sensor moves until the map's new voxels count as younger
 _REACH = 3.0  # metres to each side that a search for the pose covers
 _BASIN = 0.5  # metres: nearer to the truth a fit needs no search
-_FARTHEST = 30.0  # metres that a search for an unknown velocity covers
+_LOST_REACH, _FARTHEST = 6.0, 20.0  # metres that a search for a lost sensor covers at most, and for a velocity: time
 _TURN, _LARGEST_TURN = np.radians(4.0), np.radians(24.0)  # steps and reach of headings beside the predicted one
 _START_TURN = np.radians(20.0)  # per second, of a sensor whose velocity is unknown
 _STARTS, _LOST_STARTS, _FAR_STARTS = 3, 5, 12  # of which a pose is fitted
@@ -112,10 +112,9 @@ class LidarTracker:
         self._spacing = spacing
         if self._motion is None:
             return self._begin(scan, stamp)
-        if self._motion.seconds(stamp) > self._patience + self._config.give_up:
+        if self._motion.seconds(stamp) > self._patience(stamp) + self._config.give_up:
             return self._anew(scan, stamp)
-        fresh = self._motion.fresh  # then it may be anywhere that it could have come to, but is not lost
-        lost = self._motion.seconds(stamp) > self._patience and not fresh
+        lost = self._motion.seconds(stamp) > self._patience(stamp)
         starts = self._starts(scan, stamp, lost)
         if self._first is not None and self._first.offsets is not None:
             fits = self._second(scan, stamp, starts)
@@ -124,19 +123,18 @@ class LidarTracker:
         far = lost or self._far(stamp)
         reason = self._doubt(fits[0], stamp, lost, far)
         if far and not reason:
+            fresh = self._motion.fresh and not lost
             reason = _elsewhere(fits, _FAR_RIVAL if fresh else _RIVAL, anywhere=lost or fresh)
         if reason:
             return self._unmeasured(scan, stamp, reason)
         return self._measured(scan, stamp, fits[0], State.RELOCALISED if lost else State.TRACKING)
 
-    @property
-    def _patience(self) -> float:
-        """Seconds without a measured pose until the sensor is lost, two scans at least; any time if none was bad."""
+    def _patience(self, stamp: int) -> float:
+        """Returns the seconds without a measured pose until the sensor is lost at a stamp: two scans at least."""
         motion = self._motion
         if not self._missed or motion is None:
-            return float("inf")
-        between = (motion.stamp - motion.before_stamp) * 1e-9 if motion.before_T is not None else 0.0
-        return max(self._config.patience, 2.5 * between)
+            return float("inf")  # no scan was bad
+        return max(self._config.patience, 2.5 * motion.seconds(stamp) / (self._missed + 1))
 
     def _begin(self, scan: Scan, stamp: int) -> Tracked:
         self._motion = LidarMotion(stamp, np.eye(4), np.zeros(6), np.zeros((6, 6)))
@@ -160,12 +158,12 @@ class LidarTracker:
     def _starts(self, scan: Scan, stamp: int, lost: bool) -> list[Matrix]:
         """Returns where to look: at the predicted pose, and around it where the sensor may be far from there."""
         assert self._motion is not None
-        T = self._motion.predicted(stamp, self._patience)
+        T = self._motion.predicted(stamp, self._patience(stamp))
         reach, turn = self._strays(stamp)
         if lost:
-            unseen = self._motion.seconds(stamp) - self._patience
+            unseen = self._motion.seconds(stamp) - self._patience(stamp)
             turns = ANY_TURN
-            reach = min(_REACH + float(np.linalg.norm(self._motion.velocity[:3])) * unseen, _FARTHEST)
+            reach = min(_REACH + float(np.linalg.norm(self._motion.velocity[:3])) * unseen, _LOST_REACH)
         elif reach < _BASIN:
             return [T]
         else:
@@ -230,7 +228,7 @@ class LidarTracker:
         if found.inliers < min_inliers:
             return f"{found.inliers:.0%} of the points on planes agree with them"
         if not lost:
-            off = se3.log(invert(self._motion.predicted(stamp, self._patience)) @ found.T)
+            off = se3.log(invert(self._motion.predicted(stamp, self._patience(stamp))) @ found.T)
             spread = self._motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
             if off @ np.linalg.solve(spread, off) > 50:
                 step, turn = np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:]))
@@ -282,7 +280,7 @@ class LidarTracker:
             nowhere = LidarMotion(stamp, np.eye(4), np.zeros(6), np.zeros((6, 6)))
             return self._result(State.LOST, f"{reason}, and there is no map yet", scan, nowhere, np.zeros((6, 6)))
         T, covariance = self._blindly(stamp)
-        lost = self._motion.seconds(stamp) > self._patience
+        lost = self._motion.seconds(stamp) > self._patience(stamp)
         velocity = np.zeros(6) if lost else self._motion.velocity
         there = replace(self._motion, T=T, velocity=velocity)
         return self._result(State.LOST if lost else State.PREDICTED, reason, scan, there, covariance)
@@ -291,7 +289,7 @@ class LidarTracker:
         """Returns the predicted pose and the covariance of its right perturbation."""
         assert self._motion is not None
         config = self._config
-        T = self._motion.predicted(stamp, self._patience)
+        T = self._motion.predicted(stamp, self._patience(stamp))
         spread = self._motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
         return T, as_right(self._motion.covariance, T) + spread
 

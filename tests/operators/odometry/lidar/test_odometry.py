@@ -16,7 +16,9 @@ from dataflow.testing import Played, play
 from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.odometry import LidarOdometry
+from operators.odometry.lidar import tracker
 from operators.odometry.lidar.map import PlaneMap, thinned
+from operators.odometry.lidar.search import around
 from operators.odometry.lidar.sweep import Sweep
 
 Array = NDArray[np.float64]
@@ -289,6 +291,23 @@ def test_a_step_of_metres_that_is_wrong_comes_with_a_doubt(seed: int) -> None:
     wrong = [bool(off > 0.3) for off in np.linalg.norm(errors(played, car)[1:, :3], axis=1)]
     first = wrong.index(True) if True in wrong else len(wrong)
     assert True not in wrong or any(doubted[: first + 1])
+
+
+def test_a_fast_sensor_that_is_lost_is_searched_for_in_bounded_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+
+    def counted(*given: Any) -> Any:
+        found = around(*given)
+        searched.append(len(found[0]))
+        return found
+
+    monkeypatch.setattr(tracker, "around", counted)
+    covered = [scan(street(3), car, k).replace(points=np.zeros((0, 3), np.float32)) for k in range(3, 12)]
+    elsewhere = [scan(street(9), car, k) for k in range(12, 30, 3)]
+    played = play(LidarOdometry(near=1.0), {"cloud": [scan(street(3), car, k) for k in range(3)] + covered + elsewhere})
+    assert texts(played)[-1].startswith("lost")
+    assert len(searched) > 5
+    assert max(searched) < 6000
 
 
 def test_another_place_is_not_taken_for_the_mapped_one_and_a_new_map_begins() -> None:
