@@ -63,8 +63,7 @@ def _keys_before(origin: Origin, channel: Channel, starts: Sequence[int]) -> lis
     order = np.argsort(entries.times, kind="stable")
     ends = np.searchsorted(entries.times[order], np.asarray(starts, np.int64), "right").tolist()
     keys: list[int | None] = []
-    looked, last = 0, -1
-    """The packets before `looked` need no second look: the last key frame among them is `last`, by rank."""
+    looked, last = 0, -1  # packets before `looked` need no second look: their last key frame is `last`, by rank
     for end in ends:
         for rank in range(end - 1, max(looked, end - FARTHEST) - 1, -1):
             time, chunk, offset = (int(column[order[rank]]) for column in entries.columns)

@@ -111,8 +111,8 @@ def node_of(content: Mapping[str, Any]) -> Node:
     gyro, accel = content["readings"]
     told = content.get("command")
     command = None if told is None else Command(int(told[0]), told[1], told[2], float(told[3]))
-    told = bool(content.get("refuted", False)), int(content.get("moving", 0))
-    return Node(int(content["time"]), hypotheses, gyro, accel, health, command, *told)
+    refuted, moving = bool(content.get("refuted", False)), int(content.get("moving", 0))
+    return Node(int(content["time"]), hypotheses, gyro, accel, health, command, refuted, moving)
 
 
 def plain_sample(sample: Sample) -> list[Any]:
