@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import dataflow
-from dataflow.messages import Detections2D
-from dataflow.messages.geometry import invert, transform_points
+from dataflow.messages import CameraInfo, Detections2D, Transforms
+from dataflow.messages.geometry import invert, matrix_to_quaternion, transform_points
+from operators.geometry.extrinsics import transform_between
 from operators.tracking.assignment import overlap
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -58,11 +59,27 @@ def scored(data: Path, scene: str, recording: Path) -> dict[str, Any]:
     out = recording.with_suffix(".json")
     labels = data / "scenes" / f"{scene}.json"
     command = [sys.executable, str(labels.parent / "score_scene.py"), str(labels), str(recording), "--json", str(out)]
+    command += ["--T", *first_camera(recording)]
     listing = subprocess.run(command, check=True, timeout=600, capture_output=True, text=True).stdout
     print(listing[: listing.index("\n{")], end="\n\n")
     figures: dict[str, Any] = json.loads(out.read_text())
     right = [line for line in listing.splitlines() if " RIGHT " in line]
     return figures | {"found_ids": [line[2:30].strip() for line in right]}
+
+
+def first_camera(recording: Path) -> list[str]:
+    """Returns the pose (x y z qx qy qz qw) of the first depth camera in the graph's frame, which begins at its base.
+
+    The scorer would take the first pose of the base for it, which comes later where the first views leave it open.
+    """
+    stream = dataflow.open(recording)
+    (mounted,) = (stream[name] for name in stream if name.endswith("mount/base_extrinsics"))
+    (depth,) = (stream[name] for name in stream if name.endswith("camera/depth_info"))
+    extrinsics, info = mounted[0], depth[0]
+    assert isinstance(extrinsics, Transforms)
+    assert isinstance(info, CameraInfo)
+    T = transform_between(extrinsics, info.frame, "base_link")
+    return [f"{number:.9f}" for number in (*T[:3, 3], *matrix_to_quaternion(T))]
 
 
 def often_detected(data: Path, scene: str, recording: Path) -> list[str]:

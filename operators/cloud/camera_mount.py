@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,12 +23,14 @@ Array = NDArray[np.float64]
 class State(Counts):
     """Holds the best view so far and what was decided by it: T_base_camera (4, 4), None where the base was given.
 
-    `first` is the stamp since when a view is sought, `known` the digest of the extrinsics that were completed last.
+    `ground` is the best view that showed the ground, `first` the stamp since when a view is sought, `known` the digest
+    of the extrinsics that were completed last.
     """
 
     done: bool = False
     first: int | None = None
     best: Vertical | None = None
+    ground: Vertical | None = None
     T: Array | None = None
     known: bytes = b""
     figures: dict[str, float] = field(default_factory=dict)
@@ -38,9 +40,9 @@ class CameraMount(Operator):
     """Completes the extrinsics of a camera by its base: a frame that is level, on the ground below, and looks ahead.
 
     The vertical comes from the level and upright surfaces of a view, and from the accelerometer where there is one; the
-    ground is the lowest level surface. The first view that shows them without doubt decides, for the map's frame begins
-    with it; after `patience` the best one so far does, with a warning. The base is level where the camera's odometry
-    began. Extrinsics that hold the base are passed on as they are.
+    ground is the lowest level surface, of that view or one before. The first view that shows the vertical without doubt
+    decides, for the map's frame begins with it; after `patience` the best one so far does, with a warning. The base is
+    level where the camera's odometry began. Extrinsics that hold the base are passed on as they are.
 
     Method: directions of surfaces as in Coughlan and Yuille, "Manhattan world", 1999.
     """
@@ -84,8 +86,8 @@ class CameraMount(Operator):
         found = find_vertical(cloud.points, expected, information)
         if found is not None and motion is not None:
             found = found.before(motion.matrix()) if np.isfinite(motion.matrix()).all() else None
-        if found is not None and (self.state.best is None or found.doubt < self.state.best.doubt):
-            self.state.best = found
+        if found is not None:
+            self._compare(found)
         patient = cloud.stamp - self.state.first < self.patience
         if patient and (found is None or found.doubt > 1):
             return None
@@ -93,6 +95,13 @@ class CameraMount(Operator):
             self.state.best = Vertical(expected, np.asarray(np.linalg.inv(information), np.float64), 1.0, None)
         self.state.done = True
         return self._decided(cloud, extrinsics, self.state.best)
+
+    def _compare(self, found: Vertical) -> None:
+        """Keeps a view that is better than those so far."""
+        if self.state.best is None or found.doubt < self.state.best.doubt:
+            self.state.best = found
+        if found.height is not None and (self.state.ground is None or found.doubt < self.state.ground.doubt):
+            self.state.ground = found
 
     def _expected(self, cloud: PointCloud, extrinsics: Transforms | None, imu: Imu | None) -> tuple[Array, Array]:
         """Returns where up is likely in the cloud's frame, with its information, before anything is seen."""
@@ -118,6 +127,8 @@ class CameraMount(Operator):
         return {"base_extrinsics": completed.replace(stamp=cloud.stamp)}
 
     def _decided(self, cloud: PointCloud, extrinsics: Transforms | None, found: Vertical) -> dict[str, Any]:
+        if found.height is None and self.state.ground is not None:
+            found = replace(found, height=self.state.ground.height)
         T = _on_base(found)
         down, roll = np.degrees(np.arcsin(-found.up[2])), np.degrees(np.arctan2(found.up[0], -found.up[1]))
         self.state.figures = {"looks down (°)": round(float(down), 1), "roll (°)": round(float(roll), 1)}

@@ -10,7 +10,8 @@ from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.testing import play
-from operators.cloud import CameraMount
+from operators.cloud import CameraMount, camera_mount
+from operators.cloud.vertical import Vertical
 from operators.geometry.extrinsics import transform_between
 
 NOTHING = np.zeros((0, 3))
@@ -111,6 +112,22 @@ def test_a_view_of_a_lost_odometry_does_not_decide() -> None:
     mount = CameraMount()
     assert mount.process(cloud(room(28, 0)), None, None, lost) is None
     assert mount.process(cloud(room(28, 0), 1)) is not None
+
+
+def test_the_ground_that_a_view_before_showed_counts_where_the_one_that_decides_shows_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    up, sure = np.array([0.0, -1.0, 0.0]), np.eye(3) * np.radians(0.5) ** 2
+    views = [Vertical(up, sure, 0.9, 1.2), Vertical(up, sure, 0.3, 1.4), Vertical(up, sure, 0.01, None)]
+    found = iter(views)
+    monkeypatch.setattr(camera_mount, "find_vertical", lambda *_: next(found))
+    mount = CameraMount()
+    assert mount.process(cloud(NOTHING)) is None
+    assert mount.process(cloud(NOTHING, 1)) is None
+    made = mount.process(cloud(NOTHING, 2))
+    assert made is not None
+    assert made["base_extrinsics"].matrix("depth")[2, 3] == pytest.approx(1.4)
+    assert "1.40 m above the ground" in made["status"].messages[0]
 
 
 def test_extrinsics_that_change_later_are_completed_again_with_the_same_mount() -> None:
