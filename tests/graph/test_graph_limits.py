@@ -69,6 +69,7 @@ def test_a_graph_that_would_grow_is_refused_at_its_line(
     assert said in problem.message
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "line", "said"),
     [

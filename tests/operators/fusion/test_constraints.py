@@ -84,6 +84,7 @@ def walked(seconds: float, stop: float) -> tuple[Array, Array]:
     return velocity, 0.4 * (moving > 0)
 
 
+@pytest.mark.long
 def test_what_was_put_down_stays_where_it_is() -> None:
     velocity, tremble = walked(18.0, 7.0)
     _, without = outage(velocity, tremble, 8.0)
@@ -100,6 +101,7 @@ def test_what_trembles_as_it_moves_slowly_is_not_taken_for_standing() -> None:
     assert count(operator, "robot/pose, used") > 80
 
 
+@pytest.mark.long
 def test_an_even_motion_that_the_filter_knows_is_not_stopped() -> None:
     t = np.arange(12 * RATE) / RATE
     velocity = np.column_stack([0.5 * np.clip(t - 1.5, 0, 1), 0 * t, 0 * t])  # without a tremble: as a rail
@@ -110,6 +112,7 @@ def test_an_even_motion_that_the_filter_knows_is_not_stopped() -> None:
     assert "standstill velocity, used" not in without.summary()
 
 
+@pytest.mark.long
 def test_what_rolls_drifts_less_where_it_cannot_slip() -> None:
     t = np.arange(22 * RATE) / RATE
     speed = 0.8 * np.clip((t - 0.8) / 2, 0, 1)

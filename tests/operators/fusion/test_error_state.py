@@ -175,6 +175,7 @@ def _nees(error: Array, covariance: Array, block: slice) -> float:
     return float(error[block] @ np.linalg.solve(covariance[block, block], error[block]))
 
 
+@pytest.mark.long
 def test_errors_are_as_large_as_the_covariance_says() -> None:
     from scipy.stats import chi2  # takes a second
 

@@ -184,6 +184,7 @@ def test_without_inertial_sensor_the_velocity_stays() -> None:
     np.testing.assert_allclose(at.velocity, [1.0, -0.5, 0.0], atol=0.05)
 
 
+@pytest.mark.long
 def test_headings_against_the_one_told_are_followed_for_a_time_in_motion_and_not_at_rest() -> None:
     rng, still = np.random.default_rng(0), np.array([0.0, 0.0, 9.80665])
     samples = [

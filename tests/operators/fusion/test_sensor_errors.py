@@ -50,6 +50,7 @@ def nees(filter: LateFilter, seconds: float = 10.0) -> float:
     return float(off @ np.linalg.solve(state.covariance[:3, :3], off))
 
 
+@pytest.mark.long
 def test_a_drift_taken_for_noise_makes_the_covariance_too_small_and_a_state_does_not() -> None:
     drifting = SensorErrors(drifts=(("fix", (DRIFT,) * 3, 1000.0),))
     white = np.mean([nees(driven(seed, SensorErrors())) for seed in range(6)])

@@ -32,6 +32,7 @@ def choosers(here: World) -> list[Thing]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_there_are_as_many_persons_as_are_asked_for(name: str) -> None:
     for people in (2, 3, 4):
@@ -40,6 +41,7 @@ def test_there_are_as_many_persons_as_are_asked_for(name: str) -> None:
         assert len(choosers(here)) == people - 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_who_chooses_has_six_candidates_and_gets_what_it_wants(name: str, seed: int) -> None:
@@ -98,6 +100,7 @@ def test_the_hand_takes_what_it_reaches_for(name: str, seed: int) -> None:
             before += act.seconds
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_who_chooses_passes_through_nothing(name: str, seed: int) -> None:
@@ -120,6 +123,7 @@ def test_who_chooses_passes_through_nothing(name: str, seed: int) -> None:
             assert not len(met), (t, {f"{names[int(k)].label} {names[int(k)].id}" for k in met})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_persons_more_keep_their_lanes_and_stay_off_the_robots_path(name: str) -> None:
     for seed in range(6):

@@ -52,6 +52,7 @@ def test_shakes_are_as_large_as_stated() -> None:
     np.testing.assert_allclose(angles.std(axis=0), 0.1, rtol=0.1)
 
 
+@pytest.mark.long
 def test_integrated_inertial_readings_follow_a_shaken_body() -> None:
     """Strapdown integration in three dimensions, from the true state at the start."""
     drive = Drive(Trajectory(OVAL), [bumps(4, 0.003), sway(4, 0.03, 0.1)])

@@ -49,6 +49,7 @@ def test_cells_are_free_taken_or_never_seen() -> None:
     assert cells_at(grid, free).tolist() == [0] * 4  # below the board too, which hangs above the band
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_the_map_agrees_with_rays_through_the_world(name: str) -> None:
     """Level rays from the path end in taken cells and pass through cells that are not."""
@@ -72,6 +73,7 @@ def test_the_map_agrees_with_rays_through_the_world(name: str) -> None:
     assert hit.all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_points_of_true_surfaces_lie_on_the_true_mesh(name: str) -> None:
     here, o3d = world(name), open3d()

@@ -129,6 +129,7 @@ def test_merged_ticks_are_all_ticks_in_order(sensors: list[tuple[float, int]]) -
     assert sorted(single, key=lambda t: (t.stamp, t.sensor)) == [tick for _, group in found for tick in group]
 
 
+@pytest.mark.long
 def test_lidar_points_lie_on_what_is_there_and_noise_is_along_the_beam() -> None:
     settings_ = {"rate": 1, "rings": 8, "columns": 90, "missing": 0, "resolution": 0}
     exact, noisy = (
@@ -172,6 +173,7 @@ def test_lidar_and_depth_camera_measure_the_same_surfaces() -> None:
     assert np.mean(apart < 0.02) > 0.85
 
 
+@pytest.mark.long
 def test_the_stereo_pair_sees_points_at_the_disparity_of_their_depth() -> None:
     size = {"width": 320, "height": 240}
     source = robot(
@@ -200,6 +202,7 @@ def placed(source: SimulatedRobot) -> dict[str, Array]:
     return dict(zip(message.child_frames, transform_matrix(message.translations, message.rotations), strict=True))
 
 
+@pytest.mark.long
 def test_the_depth_camera_can_be_turned_in_the_colour_camera() -> None:
     on = {"color_camera": {"rate": 1}, "stereo": {"rate": 1}}
     plain = placed(robot(**on, depth_camera={"rate": 1}))
@@ -234,6 +237,7 @@ def test_a_moving_lidar_says_when_it_measured() -> None:
     assert (np.diff(cloud.time_offsets) >= 0).all()  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_imu_noise_has_its_density_and_the_bias_walks() -> None:
     base = {"rate": 200, "gyro_walk": 0, "accel_walk": 0, "accel_noise": 0.01}
     white = stream(robot(duration="10s", hold=20, inertial={**base, "gyro_noise": 0.002}), "imu")
@@ -344,6 +348,7 @@ def test_a_wheel_with_a_bias_counts_too_much_by_that_share() -> None:
     np.testing.assert_allclose(ends[1].ticks / ends[0].ticks, [1.05, 0.98], atol=1e-3)
 
 
+@pytest.mark.long
 def test_wheel_odometry_errs_as_its_covariance_says() -> None:
     """Over many seeds, after rounds in which the constant scale errors add up, against wheels without error."""
 
@@ -387,6 +392,7 @@ def test_wheel_errors_are_as_large_as_stated() -> None:
     np.testing.assert_allclose(np.std(ends, axis=0), 0.02 * np.sqrt(way), rtol=0.3)
 
 
+@pytest.mark.long
 def test_sightings_scatter_as_their_covariances_say() -> None:
     quiet = {"rate": 20, "missing": 0, "max_range": 20}
     noisy, exact = (
@@ -401,6 +407,7 @@ def test_sightings_scatter_as_their_covariances_say() -> None:
     np.testing.assert_allclose(np.concatenate(pulls).std(axis=0), 1, rtol=0.15)
 
 
+@pytest.mark.long
 def test_a_camera_sights_landmarks_by_the_same_bearings_without_ranges() -> None:
     given = {"rate": 5, "max_range": 20}
     (both, *_), (bearings, *_) = (
@@ -474,6 +481,7 @@ def test_satellite_fixes_scatter_about_the_antenna() -> None:
     assert np.std([fix.altitude for fix in fixes]) == pytest.approx(1.0, rel=0.15)
 
 
+@pytest.mark.long
 def test_satellites_are_lost_under_a_roof() -> None:
     source = robot(world="yard", duration="82s", movers=False, gnss={"rate": 2, "sky": True, "drift": 0, "noise": 0.1})
     fixes: list[Any] = stream(source, "fix")

@@ -55,6 +55,7 @@ def frames(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [step for step in steps if "objects" in step]
 
 
+@pytest.mark.long
 def test_masks_and_boxes_in_the_image_count_the_same_pixels(steps: list[dict[str, Any]]) -> None:
     for step in frames(steps):
         found, mask = step["objects"], step["masks"]
@@ -246,6 +247,7 @@ def test_placement_does_not_depend_on_where_things_are(robot: SimulatedRobot) ->
     assert replace(world, things=tuple(away)).relations(0.0) == world.relations(0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_every_world_has_many_classes_movers_and_goals(name: str) -> None:
     world = make_world(name, 5, speed=0.5, hold=0.0, movers=True)

@@ -99,6 +99,7 @@ def errors(walk: Walk, made: LandmarkFilter) -> Array:
     return np.array([*(made.position - truth[:2]), turn])
 
 
+@pytest.mark.long
 def test_pose_and_map_are_near_the_truth_and_the_covariance_is_honest() -> None:
     nees, off = [], []
     for seed in range(30):
@@ -321,6 +322,7 @@ def test_an_unrelated_sensor_frame_is_named() -> None:
         play(LandmarkSlam(), {**messages, "sightings": elsewhere, "extrinsics": [extrinsics]})
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_victoria_park_is_mapped(data_dir: Path) -> None:
     from operators.sources.victoria_park import read_steps

@@ -85,6 +85,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # -- odometry and correction ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_odometry_is_that_of_lidar_odometry_and_pose_is_its_correction(around: Played) -> None:
     plain = play(LidarOdometry(), {"cloud": clouds(on_round(ROUND + 5))})
     assert around.digests()["odometry"] == plain.digests()["odometry"]
@@ -167,6 +168,7 @@ def test_a_loop_takes_drift_away() -> None:
     assert np.linalg.norm((middle.T - true)[:3, 3]) < 0.6 * np.linalg.norm((said[ROUND // 2] - true)[:3, 3])
 
 
+@pytest.mark.long
 def test_a_new_map_of_the_odometry_is_tied_to_the_old_one_when_two_scans_say_the_same() -> None:
     """The LiDAR is lost and carried across the room; its odometry begins anew, with a pose that means nothing."""
     slam, poses = mapper(), on_round(ROUND)
@@ -191,6 +193,7 @@ def test_a_new_map_of_the_odometry_is_tied_to_the_old_one_when_two_scans_say_the
 # -- saved maps ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
     poses = elsewhere(10)
     played = run(clouds(poses, first=60), map_file=str(saved))
@@ -199,6 +202,7 @@ def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
     assert errors(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0]).max() < 0.04
 
 
+@pytest.mark.long
 def test_a_saved_map_of_another_room_is_not_found(saved: Path) -> None:
     played = run(clouds(elsewhere(5), "hall"), map_file=str(saved))
     assert {text.split(":")[0] for text in texts(played)} == {"searching"}
@@ -206,6 +210,7 @@ def test_a_saved_map_of_another_room_is_not_found(saved: Path) -> None:
     assert played["correction"] == []
 
 
+@pytest.mark.long
 def test_a_room_that_looks_alike_in_four_headings_is_not_found(tmp_path: Path) -> None:
     run(clouds(on_round(ROUND), "square"), save=str(tmp_path / "square.npz"))
     played = run(clouds(elsewhere(4), "square", first=60), map_file=str(tmp_path / "square.npz"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from dataflow.execution.snapshots import pack_state, unpack_state
@@ -64,6 +65,7 @@ def errors(graph: KeyframeGraph[View]) -> NDArray[np.float64]:
     return np.array([np.linalg.norm(graph.nodes[k].T[:3, 3] - T[:3, 3]) for k, T in enumerate(PATH)])
 
 
+@pytest.mark.long
 def test_points_are_seen_where_they_are() -> None:
     graph, points = graph_of(PATH)
     rows = points.shared(np.arange(6), 3, 1000)

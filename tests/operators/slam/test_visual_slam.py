@@ -106,6 +106,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.long
 def test_odometry_is_that_of_visual_odometry_and_pose_is_its_correction(around: Played) -> None:
     plain = play(VisualOdometry(), streams(frames(on_round(ROUND + 6))), static=STATIC)
     assert around.digests()["odometry"] == plain.digests()["odometry"]
@@ -115,6 +116,7 @@ def test_odometry_is_that_of_visual_odometry_and_pose_is_its_correction(around: 
         assert (pose.frame, pose.child_frame, pose.stamp) == ("map", "depth", odometry.stamp)
 
 
+@pytest.mark.long
 def test_a_loop_takes_drift_away() -> None:
     """A focal length that is 1.5 % wrong makes the odometry drift on its way around."""
     poses = on_round(ROUND + 10)
@@ -129,12 +131,14 @@ def test_a_loop_takes_drift_away() -> None:
     assert len(played["map"]) > 0
 
 
+@pytest.mark.long
 def test_the_map_does_not_grow_where_it_was_already() -> None:
     played = run(frames(on_round(ROUND + 18)))
     views = [int(s.values[s.keys.index("views")]) for s in played["status"]]
     assert views[-1] - views[ROUND] < 0.5 * (views[18] - views[0])
 
 
+@pytest.mark.long
 def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
     poses = elsewhere(10)
     played = run(frames(poses), map_file=str(saved))
@@ -211,6 +215,7 @@ def test_a_damaged_map_and_one_of_another_version_are_refused(tmp_path: Path) ->
         VisualSlam(map_file=str(tmp_path / "none.npz")).setup()
 
 
+@pytest.mark.long
 def test_blind_frames_are_told_and_survived() -> None:
     poses = on_round(24)
     seen = frames(poses)
@@ -232,10 +237,12 @@ def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_re
         play(VisualSlam(), each)
 
 
+@pytest.mark.long
 def test_the_same_frames_give_the_same_bytes(around: Played) -> None:
     assert run(frames(on_round(ROUND + 6))).digests() == around.digests()
 
 
+@pytest.mark.long
 def test_a_restored_state_goes_on_alike() -> None:
     seen = frames(on_round(ROUND + 4))
     given = streams(seen)

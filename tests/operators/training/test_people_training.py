@@ -186,6 +186,7 @@ def test_the_posture_network_is_trained_scored_and_written(tmp_path: Path) -> No
     np.testing.assert_allclose(model.judge(shapes[1:2].astype(np.float32) / 127)[0], both[1], rtol=1e-4)
 
 
+@pytest.mark.long
 def test_simulated_people_are_seen_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulated_postures, "_LOOKS", 2)
     monkeypatch.setattr(simulated_postures, "_MORE", 0)
