@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.recognition.posture_data import BODY, POSTURES, Postures
-from operators.recognition.silhouette import HALF, MIDDLE, silhouette
+from operators.recognition.posture.data import BODY, POSTURES, Postures
+from operators.recognition.posture.silhouette import HALF, MIDDLE, silhouette
 from operators.simulator.frames import BODY_TO_OPTICAL, mounted
 from operators.simulator.optics import Optics, View, camera_rays
 from operators.simulator.persons import Person
