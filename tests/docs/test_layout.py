@@ -25,8 +25,8 @@ LONG = {
     "dataflow.supervision.plan:process_plans": 69,
     "dataflow.verification.verify:verify": 78,
     "operators.scene.commands:show": 69,
-    "operators.scene.cuboid:fit_cuboid": 81,
-    "operators.scene.lifting:lift": 61,
+    "operators.scene.map.cuboid:fit_cuboid": 81,
+    "operators.scene.lifting.frustums:lift": 61,
     "operators.training.learning:learn_object": 71,
 }
 """Functions of more than `MOST_LINES` lines, with their lines. The list only gets shorter, and its numbers smaller."""

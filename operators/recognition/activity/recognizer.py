@@ -17,8 +17,8 @@ from operators.recognition.activity.looks import Looks
 from operators.recognition.activity.model import ActivityModel
 from operators.recognition.activity.samples import STEP
 from operators.recognition.activity.scene_agents import mattering, seen_times
-from operators.scene.agents import UNKNOWN
 from operators.scene.bodies import Body
+from operators.scene.graph.agents import UNKNOWN
 from operators.weights import shipped, trained_in_simulation
 
 

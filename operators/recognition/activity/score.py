@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from operators.scene.agents import UNKNOWN
+from operators.scene.graph.agents import UNKNOWN
 
 
 def macro_f1(true: Sequence[str], said: Sequence[str]) -> float:

@@ -20,7 +20,7 @@ from operators.detection.nms import class_wise_nms, intersection_over_union
 from operators.network_input import three_channels
 from operators.recognition.objects.learned_object import LEAST, PROPOSALS, LearnedObject, LearnedObjectError
 from operators.recognition.objects.proposals import F32, Glance, Trunk
-from operators.scene.map_file import learned_files, together
+from operators.scene.map.file import learned_files, together
 from operators.weights import open_network, shipped, trained_in_simulation
 
 _MAYBE, _STEPS = 0.003, 2  # probability from which a box is drawn to the outline, and how often that is repeated

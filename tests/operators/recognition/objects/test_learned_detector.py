@@ -17,7 +17,7 @@ from operators.detection import CustomDetector
 from operators.recognition import LearnedDetector
 from operators.recognition.objects.learned_object import LearnedObject, LearnedObjectError, Shown, learn, shown_in
 from operators.recognition.objects.proposals import Trunk, inner_maps
-from operators.scene.map_file import LearnedFile, SavedMap
+from operators.scene.map.file import LearnedFile, SavedMap
 from operators.training.learning import learn as command
 from operators.weights import shipped
 
