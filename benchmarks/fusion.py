@@ -107,7 +107,7 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
     """
     from dataflow.messages import Imu, Pose, Transforms
     from operators.simulator.settings import Gnss, Inertial
-    from operators.simulator.worlds import make_world
+    from operators.simulator.worlds.make import make_world
 
     rng = np.random.default_rng([seed, 7])
     imu, gnss, rate = Inertial(), Gnss(), 100

@@ -27,7 +27,7 @@ from operators.scene import SceneGraphBuilder
 from operators.scene.box_overlap import shared_volume, upright_iou
 from operators.scene.map.cells import Cells
 from operators.scene.scoring import Box, boxes_of, match_nodes
-from operators.simulator.worlds import make_world
+from operators.simulator.worlds.make import make_world
 
 Array = NDArray[np.float64]
 THICK, IOU, VIEWS, SIDE = 0.3, 0.25, 3, 0.1

@@ -60,7 +60,7 @@ def rendered(cache: Path, world: str, seed: int, seconds: int, mount: str | None
 
 def _render(file: Path, world: str, seed: int, seconds: int, mount: str | None) -> None:
     from operators.simulator import SimulatedRobot
-    from operators.simulator.worlds import make_world
+    from operators.simulator.worlds.make import make_world
 
     color: dict[str, Any] = {"rate": 10}
     speed = 0.8 if mount is None else float(MOUNTS[mount]["speed"])

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from operators.recognition.activity.episodes import Episode
 from operators.simulator.drive import Drive
-from operators.simulator.frames import BODY_TO_OPTICAL, mounted
 from operators.simulator.scene import Thing
-from operators.simulator.worlds import make_world
+from operators.simulator.sensors.frames import BODY_TO_OPTICAL, mounted
+from operators.simulator.worlds.make import make_world
 from operators.training.made_worlds import Chosen, file_of, write_lacking
 
 TRAINING, VALIDATION, HELD_OUT = 40_000, 45_000, 50_000
