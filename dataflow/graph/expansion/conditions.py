@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dataflow.graph.drafts import Choice, GraphInput, Pattern
+from dataflow.graph.expansion.wiring import OR
 from dataflow.graph.problems import Problems, did_you_mean
-from dataflow.graph.tree import UNKNOWN, Items, Leaf, Tree, describe
-from dataflow.graph.wiring import OR
+from dataflow.graph.yaml.tree import UNKNOWN, Items, Leaf, Tree, describe
 
 NOT = "not "
 

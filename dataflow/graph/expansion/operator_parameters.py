@@ -8,7 +8,7 @@ from typing import Any
 import pydantic
 
 from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
-from dataflow.graph.tree import Leaf, Table, at, describe, plain, unknown
+from dataflow.graph.yaml.tree import Leaf, Table, at, describe, plain, unknown
 from dataflow.operator import Operator
 
 

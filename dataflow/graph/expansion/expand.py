@@ -9,21 +9,21 @@ import posixpath
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from dataflow.graph import document
-from dataflow.graph.conditions import failed
 from dataflow.graph.drafts import Absence, Alias, Choice, Draft, Expansion, GraphInput, Pattern, Scope
-from dataflow.graph.fields import Fields
-from dataflow.graph.graph_parameters import GraphParameters
+from dataflow.graph.expansion.conditions import failed
+from dataflow.graph.expansion.graph_parameters import GraphParameters
+from dataflow.graph.expansion.operator_parameters import operator_parameters
+from dataflow.graph.expansion.settings import Setting, overridden, read_settings
+from dataflow.graph.expansion.wiring import Wiring
 from dataflow.graph.keys import NAME_RULE, has_wildcard, key_fault, name_fault
-from dataflow.graph.limits import MAX_DEPTH, MAX_OPERATORS, Budget
 from dataflow.graph.lookup import NotFound, find_operator
 from dataflow.graph.model import current_path
-from dataflow.graph.operator_parameters import operator_parameters
 from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
-from dataflow.graph.references import substitute
-from dataflow.graph.settings import Setting, overridden, read_settings
-from dataflow.graph.tree import Entry, Items, Leaf, Table, Tree
-from dataflow.graph.wiring import Wiring
+from dataflow.graph.yaml import document
+from dataflow.graph.yaml.fields import Fields
+from dataflow.graph.yaml.limits import MAX_DEPTH, MAX_OPERATORS, Budget
+from dataflow.graph.yaml.references import substitute
+from dataflow.graph.yaml.tree import Entry, Items, Leaf, Table, Tree
 from dataflow.messages.base import Message, message_types
 from dataflow.operator import Operator
 

@@ -16,7 +16,7 @@ from example_messages import example
 from messages_page import families
 
 from dataflow.messages import Message, MessageError, array, scalar
-from dataflow.messages.compiled_digest import ONE_UPDATE
+from dataflow.messages.fields.compiled_digest import ONE_UPDATE
 
 TYPES = [cls for classes in families().values() for cls in classes]
 ODD: tuple[Any, ...] = (

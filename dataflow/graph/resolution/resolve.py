@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from dataflow.graph.drafts import Draft, Expansion, GraphInput, Pattern, Wired
-from dataflow.graph.fields import Fields
-from dataflow.graph.flight import KEYS as FLIGHT_KEYS
-from dataflow.graph.flight import read_flight
 from dataflow.graph.keys import canonical, has_wildcard, key_fault
 from dataflow.graph.model import Bundle, Graph, Node
-from dataflow.graph.network import read_network
-from dataflow.graph.order import fed_by_devices, in_order, refuse_stuck_cycles
-from dataflow.graph.policies import live_policy, sync_every, sync_tolerance
-from dataflow.graph.presence import said
 from dataflow.graph.problems import Problems, did_you_mean
+from dataflow.graph.resolution.flight import KEYS as FLIGHT_KEYS
+from dataflow.graph.resolution.flight import read_flight
+from dataflow.graph.resolution.network import read_network
+from dataflow.graph.resolution.order import fed_by_devices, in_order, refuse_stuck_cycles
+from dataflow.graph.resolution.policies import live_policy, sync_every, sync_tolerance
+from dataflow.graph.resolution.presence import said
+from dataflow.graph.resolution.streams import Streams
 from dataflow.graph.sections import ON_FAILURE, PANELS, Record, View
-from dataflow.graph.streams import Streams
-from dataflow.graph.tree import Leaf, Tree
+from dataflow.graph.yaml.fields import Fields
+from dataflow.graph.yaml.tree import Leaf, Tree
 from dataflow.operator import InputPort, is_source
 from dataflow.sync.stamps import format_duration
 

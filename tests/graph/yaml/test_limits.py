@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.graph import GraphError, Problem, document, limits, load_bundle, load_graph, load_text
-from dataflow.graph.limits import MAX_BUNDLE, MAX_OPERATORS, MAX_TEXT
+from dataflow.graph import GraphError, Problem, load_bundle, load_graph, load_text
+from dataflow.graph.yaml import document, limits
+from dataflow.graph.yaml.limits import MAX_BUNDLE, MAX_OPERATORS, MAX_TEXT
 
 HEAD = 'graph: g\noperators:\n  camera: {use: "graph_operators:Camera"}\n'
 MEMORY = 1_000_000_000

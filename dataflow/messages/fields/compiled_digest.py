@@ -1,4 +1,4 @@
-"""The text of a message class's digest function (`dataflow.messages.compiled`), and the bytes that it digests."""
+"""The text of a message class's digest function, and the bytes that it digests (`compiled` calls it)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from dataflow.messages.fields import ArrayField, ScalarField
+from dataflow.messages.fields.declared import ArrayField, ScalarField
 
 ONE_UPDATE = 1 << 14
 """Bytes of an array up to which it is copied into the buffer that is digested, instead of being digested in place."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import re
 
-from dataflow.graph.fields import Fields
 from dataflow.graph.problems import did_you_mean
 from dataflow.graph.sections import Network
-from dataflow.graph.tree import Table, Tree, plain
+from dataflow.graph.yaml.fields import Fields
+from dataflow.graph.yaml.tree import Table, Tree, plain
 
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream|vsock|serial|unixpipe)/[^\s#?]+([?#][^\s]*)?")
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")

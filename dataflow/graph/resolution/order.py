@@ -6,10 +6,10 @@ import heapq
 from collections.abc import Iterable, Mapping, Sequence
 
 from dataflow.graph.drafts import Wired
-from dataflow.graph.fields import Fields
 from dataflow.graph.model import Stream
-from dataflow.graph.policies import sync_tolerance
 from dataflow.graph.problems import Place, Problems
+from dataflow.graph.resolution.policies import sync_tolerance
+from dataflow.graph.yaml.fields import Fields
 from dataflow.operator import Source
 from dataflow.sync.demand import Edge as DemandEdge
 from dataflow.sync.demand import stuck_cycle

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dataflow.graph.drafts import Choice, GraphInput, Pattern, Scope
-from dataflow.graph.fields import Fields
 from dataflow.graph.keys import canonical, has_wildcard, key_fault
 from dataflow.graph.problems import Place, Problems, did_you_mean
-from dataflow.graph.tree import Items, Leaf, Tree
+from dataflow.graph.yaml.fields import Fields
+from dataflow.graph.yaml.tree import Items, Leaf, Tree
 
 OR = "|"
 """Stands between streams of which the first that is there is taken."""

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dataflow.messages.compiled_digest import content_text, digest_text
-from dataflow.messages.fields import (
+from dataflow.messages.fields.compiled_digest import content_text, digest_text
+from dataflow.messages.fields.declared import (
     INT64_MAX,
     INT64_MIN,
     MISSING,
@@ -26,7 +26,7 @@ from dataflow.messages.fields import (
     canonical_stamp,
     scalar_value,
 )
-from dataflow.messages.memory import LARGE, copied
+from dataflow.messages.fields.memory import LARGE, copied
 
 _FROZEN, _FROZEN_IS = 0x401, 0x001
 """Of numpy's array flags C-contiguous and writeable, and what they are in a frozen array."""

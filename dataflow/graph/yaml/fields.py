@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from dataflow.graph.keys import NAME_RULE, name_fault
 from dataflow.graph.problems import Problems, did_you_mean
-from dataflow.graph.tree import UNKNOWN, Items, Leaf, Table, Tree, describe
+from dataflow.graph.yaml.tree import UNKNOWN, Items, Leaf, Table, Tree, describe
 from dataflow.sync.stamps import parse_duration
 
 Choice = TypeVar("Choice", bound=str)

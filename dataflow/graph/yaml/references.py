@@ -6,9 +6,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from dataflow.graph.limits import MAX_NESTING, NESTED_TOO_DEEP, Budget
 from dataflow.graph.problems import Place, Problems
-from dataflow.graph.tree import UNKNOWN, Entry, Items, Leaf, Table, Tree, describe, measured, moved
+from dataflow.graph.yaml.limits import MAX_NESTING, NESTED_TOO_DEEP, Budget
+from dataflow.graph.yaml.tree import UNKNOWN, Entry, Items, Leaf, Table, Tree, describe, measured, moved
 
 REFERENCE = re.compile(r"\$\{[^{}\n]*\}")
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.messages.memory import copied
+from dataflow.messages.fields.memory import copied
 
 ScalarKind = Literal["bool", "int", "float", "str", "strs"]
 Scalar = bool | int | float | str | tuple[str, ...]

@@ -5,15 +5,15 @@ from __future__ import annotations
 import posixpath
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from dataflow.graph.document import parse_scalar
 from dataflow.graph.drafts import Scope
-from dataflow.graph.fields import Fields
+from dataflow.graph.expansion.settings import Setting
 from dataflow.graph.keys import NAME_RULE, name_fault
-from dataflow.graph.limits import REFERENCE_COST, SCALAR_COST, Budget
 from dataflow.graph.problems import Problems, did_you_mean
-from dataflow.graph.references import Lookup, Reference, substitute
-from dataflow.graph.settings import Setting
-from dataflow.graph.tree import Leaf, Table, Tree
+from dataflow.graph.yaml.document import parse_scalar
+from dataflow.graph.yaml.fields import Fields
+from dataflow.graph.yaml.limits import REFERENCE_COST, SCALAR_COST, Budget
+from dataflow.graph.yaml.references import Lookup, Reference, substitute
+from dataflow.graph.yaml.tree import Leaf, Table, Tree
 
 FOLDER = "graph:folder"
 """The reference that stands for the folder of the file it is written in."""

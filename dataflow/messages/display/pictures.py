@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.messages.png import png, turbo
+from dataflow.messages.display.png import png, turbo
 
 SHOWN_PIXELS = 960
 """Pictures are thinned to at most this width and height."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from dataflow.graph import document
 from dataflow.graph.problems import SETTINGS, Place, Problems
-from dataflow.graph.tree import UNKNOWN, Entry, Leaf, Table, Tree
+from dataflow.graph.yaml import document
+from dataflow.graph.yaml.tree import UNKNOWN, Entry, Leaf, Table, Tree
 
 
 @dataclass(slots=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from dataflow.graph.fields import Fields
 from dataflow.graph.problems import did_you_mean
 from dataflow.graph.sections import Flight, Trigger
-from dataflow.graph.tree import Items, Leaf, Table, Tree
+from dataflow.graph.yaml.fields import Fields
+from dataflow.graph.yaml.tree import Items, Leaf, Table, Tree
 
 KEYS = ("keep", "after", "when", "folder", "files", "disk")
 AFTER = 10_000_000_000

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dataflow.graph.drafts import Draft
-from dataflow.graph.fields import Fields
 from dataflow.graph.model import Live, QueuePolicy, Restart, StalePolicy
 from dataflow.graph.problems import did_you_mean
-from dataflow.graph.tree import Leaf, Table, Tree
+from dataflow.graph.yaml.fields import Fields
+from dataflow.graph.yaml.tree import Leaf, Table, Tree
 from dataflow.operator import InputPort, OperatorSpec
 
 QUEUE_SIZE = 16

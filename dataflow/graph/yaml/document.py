@@ -17,10 +17,10 @@ from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.nodes import Node as YamlNode
 from ruamel.yaml.reader import ReaderError
 
-from dataflow.graph.limits import MAX_DIGITS, MAX_NESTING, MAX_TEXT, MAX_VALUES, NESTED_TOO_DEEP
 from dataflow.graph.problems import Place, Problems
-from dataflow.graph.references import REFERENCE
-from dataflow.graph.tree import UNKNOWN, Entry, Items, Leaf, Table, Tree
+from dataflow.graph.yaml.limits import MAX_DIGITS, MAX_NESTING, MAX_TEXT, MAX_VALUES, NESTED_TOO_DEEP
+from dataflow.graph.yaml.references import REFERENCE
+from dataflow.graph.yaml.tree import UNKNOWN, Entry, Items, Leaf, Table, Tree
 
 _FLOW = "{}[],:#"
 _HIDDEN = "".join(chr(0xF8D0 + i) for i in range(len(_FLOW)))
