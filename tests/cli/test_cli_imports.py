@@ -160,4 +160,4 @@ def test_describing_operators_loads_no_large_library(tmp_path: Path, name: str) 
     assert loaded & {"torch", "torchvision", "onnxruntime", "scipy.stats", "pandas", "open3d"} == set()
     if name == "CloudBuilder":
         assert "operators.cloud.cloud_builder" in loaded
-        assert loaded & {"operators.cloud.clusterer", "operators.slam.lidar_slam", "scipy.spatial"} == set()
+        assert loaded & {"operators.cloud.clusterer", "operators.slam.lidar.slam", "scipy.spatial"} == set()

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from dataflow.messages.geometry import invert
 from operators.simulator.drive import Drive, bumps, sway
-from operators.simulator.frames import mounted
-from operators.simulator.inertial import true_reading
+from operators.simulator.sensors.frames import mounted
+from operators.simulator.sensors.inertial import true_reading
 from operators.simulator.settings import Inertial
 from operators.simulator.trajectory import Trajectory
 

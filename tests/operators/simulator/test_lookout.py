@@ -9,7 +9,7 @@ from dataflow.messages import Activity, Detections2D, Odometry
 from operators.simulator.lookout import watching
 from operators.simulator.robot import SimulatedRobot
 from operators.simulator.settings import ColorCamera
-from operators.simulator.worlds import make_world
+from operators.simulator.worlds.make import make_world
 
 
 def robot(world: str, seed: int, people: int = 3, **params: object) -> SimulatedRobot:

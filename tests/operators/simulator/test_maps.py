@@ -9,12 +9,12 @@ import pytest
 
 from dataflow.messages.geometry import quaternion_to_matrix
 from operators.simulator import maps
-from operators.simulator.furnishing import FLOOR
-from operators.simulator.native import open3d
+from operators.simulator.rendering.native import open3d
 from operators.simulator.scene import Builder, Light, World
 from operators.simulator.shapes import Array, Material, box, pose, sheet
+from operators.simulator.things.furnishing import FLOOR
 from operators.simulator.trajectory import Trajectory
-from operators.simulator.worlds import NAMES, make_world
+from operators.simulator.worlds.make import NAMES, make_world
 
 BAND = (0.05, 1.5)
 

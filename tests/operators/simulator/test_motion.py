@@ -11,16 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from operators.simulator import corridor, office, table_top, yard
 from operators.simulator.drive import Drive
-from operators.simulator.inertial import true_reading
-from operators.simulator.movers import STANDING, Driving
-from operators.simulator.native import open3d
-from operators.simulator.persons import Person
+from operators.simulator.people.movers import STANDING, Driving
+from operators.simulator.people.persons import Person
+from operators.simulator.rendering.native import open3d
 from operators.simulator.scene import Thing, World
+from operators.simulator.sensors.inertial import true_reading
 from operators.simulator.settings import Inertial
 from operators.simulator.trajectory import Trajectory
-from operators.simulator.worlds import NAMES, make_world
+from operators.simulator.worlds import corridor, office, table_top, yard
+from operators.simulator.worlds.make import NAMES, make_world
 
 ROBOT_RADIUS, ROBOT_HEIGHT = 0.22, 1.3
 OVAL = np.stack([2 * np.cos(np.arange(12) * math.pi / 6), np.sin(np.arange(12) * math.pi / 6)], axis=1)

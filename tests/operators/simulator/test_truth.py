@@ -15,18 +15,18 @@ from dataflow.messages import Boxes3D, Detections2D, SceneGraph, SegmentationMap
 from dataflow.messages.geometry import invert, quaternion_to_matrix, transform_points
 from operators.simulator import SimulatedRobot
 from operators.simulator.classes import ACTIVITIES, THINGS
-from operators.simulator.furnishing import FLOOR
-from operators.simulator.furniture import rover
-from operators.simulator.movers import Carried
-from operators.simulator.optics import Optics
-from operators.simulator.persons import Person
+from operators.simulator.people.movers import Carried
+from operators.simulator.people.persons import Person
 from operators.simulator.relations import PLACEMENT, SPATIAL
-from operators.simulator.renderer import Renderer
+from operators.simulator.rendering.optics import Optics
+from operators.simulator.rendering.renderer import Renderer
 from operators.simulator.scene import Builder, Light, Still, World
 from operators.simulator.shapes import Material, bounds, box, pose
+from operators.simulator.things.furnishing import FLOOR
+from operators.simulator.things.furniture import rover
 from operators.simulator.trajectory import Trajectory
 from operators.simulator.truth import masks, velocity
-from operators.simulator.worlds import NAMES, make_world
+from operators.simulator.worlds.make import NAMES, make_world
 
 WORLDS = ("office", "table_top")
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
