@@ -82,6 +82,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("run:run", MAKE),
     Command("replay:replay", MAKE),
     Command("verification:verify", MAKE),
+    Command("debug:debug", MAKE),
     Command("inspection:check", LOOK),
     Command("inspection:show", LOOK),
     Command("doctor:doctor", LOOK),

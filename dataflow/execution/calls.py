@@ -156,17 +156,19 @@ def _call(operator: Operator, firing: Firing) -> Outputs:
     given = firing.inputs
     for name, absent in operator.spec.absent.items():
         value = given.get(name, absent)
-        arguments[name] = value.value if value.__class__ is Entry else _value_of(value)
+        arguments[name] = value.value if value.__class__ is Entry else value_of(value)
     if operator.spec.takes_context:
         arguments["context"] = Context(firing.stamp, firing.tick, firing.stale, firing.late)
     return operator.process(**arguments)
 
 
-def _value_of(given: InputValue) -> Any:
+def value_of(given: InputValue) -> Any:
     """Returns what `process()` gets: a message, None, a tuple of messages, or a dict from stream to message."""
     match given:
         case None:
             return None
+        case Entry():
+            return given.value
         case Entry():
             return given.value
         case Mapping():

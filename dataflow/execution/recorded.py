@@ -77,7 +77,7 @@ class RecordedRunner(Runner):
         self._next = next(self._ahead, None)
         self._inputs: FiringInputs | None = None
         """Of the next call, once it is its turn."""
-        self._changed: dict[str, Any] = {}
+        self.changed: dict[str, Any] = {}
         self._latest: dict[str, tuple[int, int]] = {}
         self._open = set(node.taken)
 
@@ -106,10 +106,10 @@ class RecordedRunner(Runner):
             if record.kind == "param":
                 changes[record.detail["name"]] = record.detail["value"]
             elif record.kind == "setup":
-                self._changed |= changes
+                self.changed |= changes
                 changes = {}
             elif (taken := taken_by(record)) is not None:
-                self._changed |= taken.at_setup
+                self.changed |= taken.at_setup
                 changes = dict(taken.since)
         again = [r for r in before if r.kind == "setup" or ((t := taken_by(r)) is not None and t.again)]
         if again:
@@ -123,7 +123,7 @@ class RecordedRunner(Runner):
     def _change(self, values: Mapping[str, Any], incarnation: int) -> None:
         """Sets parameters to values that they had when the recording was made."""
         for name, value in dict(values).items():
-            self._changed[name] = value
+            self.changed[name] = value
             try:
                 self.calls.parameter(name, value, (incarnation, NEVER))
             except RAISED as error:
@@ -212,7 +212,7 @@ class RecordedRunner(Runner):
         """A fresh operator, with the parameters as they were last set; its static messages."""
         close_quietly(self.operator)
         self.operator = self.calls.operator = self.node.make()
-        self._change(self._changed, incarnation)
+        self._change(self.changed, incarnation)
         return self.calls.setup()
 
     def _take_up_at(self, record: FiringRecord) -> None:
@@ -220,7 +220,7 @@ class RecordedRunner(Runner):
         taken = taken_by(record)
         if taken is None:
             return
-        self._changed |= taken.at_setup
+        self.changed |= taken.at_setup
         if taken.again or self.result.verified:
             self._make_anew(record.incarnation)
         else:
@@ -235,7 +235,7 @@ class RecordedRunner(Runner):
         place, detail = (record.incarnation, record.stamp), record.detail
         try:
             if record.kind == "param":
-                self._changed[detail["name"]] = detail["value"]
+                self.changed[detail["name"]] = detail["value"]
                 self.calls.parameter(detail["name"], detail["value"], place)
             else:
                 self.calls.reset(detail["input"], place)

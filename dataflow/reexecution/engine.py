@@ -155,12 +155,10 @@ class Recomputation:
 
         Raises `OperatorFailure`, `RecordingError`, `Stuck`.
         """
-        limit_threads(self._threads)
         try:
-            self._driver.set_up()
-            self._feed.setup()
+            self.begin()
             began = time.monotonic()
-            while (left := self._driver.turn()) and not until():
+            while (left := self.turn()) and not until():
                 pass
             self.wall = time.monotonic() - began
             if left:
@@ -171,6 +169,16 @@ class Recomputation:
         if waiting := [r.node.name for r in self.runners.values() if not r.ended]:
             raise Stuck(f"everything is read and {', '.join(waiting)} still wait: {self.runners[waiting[0]].waiting()}")
         return self.results()
+
+    def begin(self) -> None:
+        """Sets the operators up. Raises `OperatorFailure`, `RecordingError`."""
+        limit_threads(self._threads)
+        self._driver.set_up()
+        self._feed.setup()
+
+    def turn(self) -> bool:
+        """Has every operator make at most one call. False where nothing is left to do. Raises as `run`."""
+        return self._driver.turn()
 
     def close(self, *, besides: str = "") -> None:
         """Closes all operators but the one named."""

@@ -11,7 +11,7 @@ from dataflow.execution.feeds.playable import PlayableStreams
 from dataflow.execution.generators.seeding import version_of
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.sections import Network
-from dataflow.messages.base import message_type
+from dataflow.messages.base import Message, message_type
 from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import ENDS, GRAPH, RUN
@@ -174,6 +174,18 @@ def final_stamps(recording: PlayableStreams, streams: Iterable[str]) -> dict[str
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise RecordingError(f"{recording.path}: how stream {stream!r} ended cannot be read: {error!r}") from error
     return finals
+
+
+def recorded_message(recording: Recording, stream: str, place: tuple[int, int], stamp: int) -> Message | None:
+    """Returns the message of a stream with that place (incarnation, number) and stamp (ns); None where the recording
+    does not hold it."""
+    info = recording.streams.get(stream)
+    if info is None or info.message_type is None:
+        return None
+    for found in recording.messages([stream], start=stamp, end=stamp):
+        if (found.incarnation, found.seq) == place:
+            return found.message
+    return None
 
 
 def processes_of(recording: Recording) -> dict[str, str]:

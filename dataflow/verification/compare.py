@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from dataflow.graph.model import Graph
-from dataflow.messages.base import Message
 from dataflow.recording import Recording
 from dataflow.recording.streams.diff import FieldDifference, differences
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import Emission, FiringRecord
+from dataflow.reexecution.recorded_run import recorded_message
 from dataflow.sync import Entry
 
 NOT_STORED = "the recording does not hold this message"
@@ -114,7 +114,7 @@ class Comparer:
         if self._tolerance is None and comparison.first and not _is_of_the_first(comparison, record):
             comparison.beyond += 1
             return
-        recorded = self._recorded(stream, entry, expected)
+        recorded = recorded_message(self._recording, stream, (entry.incarnation, entry.seq), expected.stamp)
         fields: Sequence[FieldDifference] = ()
         if recorded is not None:
             fields, largest = differences(recorded, entry.value, self._tolerance)
@@ -159,17 +159,6 @@ class Comparer:
         assert record is not None
         assert emission is not None
         return record, emission
-
-    def _recorded(self, stream: str, entry: Entry, emission: Emission) -> Message | None:
-        """The recorded message in whose place `entry` was made; it may have another stamp."""
-        info = self._recording.streams.get(stream)
-        if info is None or info.message_type is None:
-            return None
-        place = (entry.incarnation, entry.seq)
-        for found in self._recording.messages([stream], start=emission.stamp, end=emission.stamp):
-            if (found.incarnation, found.seq) == place:
-                return found.message
-        return None
 
 
 def _is_of_the_first(comparison: OutputComparison, record: FiringRecord) -> bool:

@@ -293,12 +293,13 @@ def _difference(v: Verification, first: Difference, compared: OutputComparison |
         if output.note:
             yield f"  {output.port}: {output.note}, so only digests can be compared"
         for found in output.fields[:FIELDS_SHOWN]:
-            yield f"  {output.port}.{_field(found)}"
+            yield f"  {output.port}.{difference_text(found)}"
         if len(output.fields) > FIELDS_SHOWN:
             yield f"  {output.port}: {len(output.fields) - FIELDS_SHOWN} more fields differ"
 
 
-def _field(found: FieldDifference) -> str:
+def difference_text(found: FieldDifference) -> str:
+    """A field that differs, in words."""
     largest = "" if found.max_difference is None else f", by at most {found.max_difference:.3g}"
     if found.index is None:
         return f"{found.field}: recorded {found.a}, here {found.b}{largest}"

@@ -1,0 +1,127 @@
+"""`dataflow debug`: to any recorded call of an operator, and into it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dataflow.cli.support.arguments import (
+    Json,
+    ModuleFolders,
+    RecordingFile,
+    Settings,
+    existing_recording,
+    find_modules_in,
+    graph_file,
+)
+from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural
+
+if TYPE_CHECKING:
+    from dataflow.cli.support.debug_shell import Shell
+
+
+def debug(
+    recording: RecordingFile,
+    operator: Annotated[
+        str,
+        typer.Argument(
+            metavar="OPERATOR[@SECONDS]", help="The operator, and when to begin: at its last call by then (else 0)."
+        ),
+    ],
+    do: Annotated[
+        list[str] | None,
+        typer.Option("--do", metavar="COMMAND", help="Do this and end, without a prompt. May be given several times."),
+    ] = None,
+    graph: Annotated[
+        Path | None,
+        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
+    ] = None,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    json: Json = False,
+) -> None:
+    """Go to any recorded call of an operator: what it was given, what it made, its state before and after.
+
+    The operator runs here, fed from the recording, call by call, forwards and back. Each call is compared with what was
+    recorded. At the prompt, or by --do:
+
+      goto N, goto @SECONDS, next, back   to a call
+      until EXPRESSION                    to the next one for which Python finds it true
+      diff                                to the first one that does not give what was recorded
+      inputs, outputs, state, print E     look at it
+      again                               make it once more, with the source as it was edited since
+      step                                make it once more under pdb
+
+    Exit code 0; 1: a --do, or a line of standard input, could not be done; 2: it could not begin.
+
+    Examples:
+
+      dataflow debug run.mcap odometry
+      dataflow debug run.mcap odometry@12.3
+      dataflow debug run.mcap odometry --do diff --do state
+      dataflow debug run.mcap tracker --do "until len(out.tracks.ids) > 3"
+    """
+    with friendly_errors():
+        recording = existing_recording(recording)
+        if graph is None and settings:
+            raise fail("--set changes a graph file: name it with --graph")
+        find_modules_in(path)
+        _take_environment(recording)
+        from dataflow.cli.support.debug_shell import Shell, WrongCommand
+        from dataflow.debugging.debugger import Debugger
+        from dataflow.graph import load_graph
+        from dataflow.recording import Recording
+
+        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+        name, _, when = operator.partition("@")
+        with Recording(recording) as opened:
+            stamps = (info.first for info in opened.streams.values() if not info.static)
+            debugger = Debugger(opened, name, loaded)
+            shell = Shell(debugger, min((stamp for stamp in stamps if stamp is not None), default=0), json=json)
+            try:
+                first = shell.number(f"@{when}") if when else 0
+            except WrongCommand as error:
+                raise fail(str(error)) from None
+            try:
+                _converse(shell, [f"goto {first}", *(do or ())], interactive=do is None)
+            finally:
+                debugger.close()
+
+
+def _converse(shell: Shell, lines: list[str], *, interactive: bool) -> None:
+    """Does the lines, then those of standard input if wanted. Ends the command with 1 where one could not be done."""
+    failed = False
+    for line in lines:
+        shell.onecmd(line)
+        failed = failed or shell.failed
+    if interactive and sys.stdin.isatty():
+        shell.cmdloop(f"{plural(shell.calls, 'call')}; help lists the commands")
+        return
+    for line in sys.stdin if interactive else ():
+        if shell.onecmd(line.strip()):
+            break
+        failed = failed or shell.failed
+    if failed:
+        raise typer.Exit(DIFFERENT)
+
+
+def _take_environment(recording: Path) -> None:
+    """Begins anew with the environment of operators where this process has another one: libraries read the number of
+    their threads, and Python the salt of hashes, when they begin."""
+    from dataflow.cli import start
+    from dataflow.execution.threads import environment
+    from dataflow.recording import Recording
+    from dataflow.reexecution.recorded_run import resolved_graph
+
+    with Recording(recording) as opened:
+        graph = resolved_graph(opened)
+    wanted = environment(1 if graph is None else graph.threads)
+    if start.words is not None and any(
+        os.environ.get(name) != value for name, value in wanted.items() if name != "PYTHONPATH"
+    ):
+        out.file.flush()
+        os.execve(sys.executable, [sys.executable, "-P", "-m", "dataflow.cli.main", *start.words], wanted)

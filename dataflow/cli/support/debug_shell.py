@@ -1,0 +1,312 @@
+"""The prompt of `dataflow debug`."""
+
+from __future__ import annotations
+
+import cmd
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from rich.markup import escape
+from rich.text import Text
+
+from dataflow.cli.support.output import out, plural, print_json_line
+from dataflow.cli.support.verdicts import difference_text
+from dataflow.execution.snapshots import pack_state
+from dataflow.messages.base import Message
+from dataflow.messages.display.text import field_text
+
+if TYPE_CHECKING:
+    from dataflow.debugging.debugger import Debugger
+    from dataflow.debugging.fired import Fired
+
+MOST_FIELDS = 8
+"""Fields that are shown of an output that differs."""
+
+
+class WrongCommand(ValueError):
+    """A line that cannot be done; the message says what would be right."""
+
+
+class Shell(cmd.Cmd):
+    """Reads lines, goes where they say, and prints what is there.
+
+    `origin`: the stamp of 0 s, ns; `json`: calls are printed as one JSON object a line.
+    """
+
+    prompt = "(dataflow) "
+    doc_header = "Commands (help COMMAND shows more)"
+
+    def __init__(self, debugger: Debugger, origin: int, *, json: bool = False) -> None:
+        super().__init__()
+        self._debugger, self._origin, self._json = debugger, origin, json
+        self.failed = False
+        """Whether the last line could not be done."""
+
+    @property
+    def calls(self) -> int:
+        """The number of calls of the operator."""
+        return len(self._debugger.calls)
+
+    # ------------------------------------------------------------------------------------------------- going
+
+    def do_goto(self, line: str) -> None:
+        """goto N | goto @SECONDS | goto -1      to call N (0 is the first, -1 the last), or the last one by then"""
+        self._show(self._debugger.goto(self.number(line)))
+
+    def do_next(self, line: str) -> None:
+        """next [N]      one call on, or N"""
+        self._show(self._debugger.goto(self._here() + _count(line)))
+
+    def do_back(self, line: str) -> None:
+        """back [N]      one call back, or N"""
+        self._show(self._debugger.goto(max(0, self._here() - _count(line))))
+
+    def do_until(self, line: str) -> None:
+        """until EXPRESSION      on to the next call for which a Python expression is true
+
+        It sees inp and out (by input and output: out.boxes), stamp (ns), number, same (as recorded), error.
+        Example: until len(out.detections.boxes) > 3
+        """
+        try:
+            code = compile(line, "<until>", "eval")
+        except SyntaxError as error:
+            raise WrongCommand(f"until {line}: no Python expression: {error.msg}") from None
+        found = self._debugger.until(lambda fired: bool(_evaluated(code, line, fired.names())))
+        if found is None:
+            out.print(f"no call after this one is so: {escape(line)}")
+        else:
+            self._show(found)
+
+    def do_diff(self, line: str) -> None:
+        """diff      to the first call of all that does not give what was recorded"""
+        found = self._debugger.first_difference()
+        if found is None:
+            out.print(f"{plural(len(self._debugger.calls), 'call')}: all give what was recorded")
+        else:
+            self._show(found)
+
+    # ------------------------------------------------------------------------------------------------- looking
+
+    def do_show(self, line: str) -> None:
+        """show      the call where we are"""
+        self._show(self._fired())
+
+    def do_inputs(self, line: str) -> None:
+        """inputs [NAME]      the fields of what the call was given"""
+        self._messages(self._fired().inputs, line)
+
+    def do_outputs(self, line: str) -> None:
+        """outputs [PORT]      the fields of what the call made"""
+        self._messages(self._fired().outputs, line)
+
+    def do_state(self, line: str) -> None:
+        """state [PART]      the parts of the state that the call changed, before and after; or one part"""
+        fired = self._fired()
+        before, after = fired.states()
+        if before is None or after is None:
+            raise WrongCommand(f"{self._debugger.node.name} has no state")
+        if line and line not in {*before, *after}:
+            raise WrongCommand(f"no part {line!r}; there are: {', '.join(sorted({*before, *after}))}")
+        pairs = [(line, before.get(line), after.get(line))] if line else changes(before, after)
+        for name, was, now in pairs:
+            out.print(Text.assemble((f"{name}\n", "bold"), f"  before  {_plain(was)}"), soft_wrap=True)
+            out.print(Text(f"  after   {_plain(now)}"), soft_wrap=True)
+
+    def do_print(self, line: str) -> None:
+        """print EXPRESSION      the value of a Python expression, which also sees before and after, the states"""
+        fired = self._fired()
+        before, after = fired.states()
+        value = _evaluated(line, line, {**fired.names(), "before": before, "after": after})
+        out.print(Text(field_text(value)), soft_wrap=True)
+
+    do_p = do_print
+
+    # ------------------------------------------------------------------------------------------------- again
+
+    def do_again(self, line: str) -> None:
+        """again      take over edited source, make the call once more from the same state, and compare"""
+        changed = self._debugger.reload()
+        out.print(f"[dim]taken over: {', '.join(changed)}[/]" if changed else "[dim]no source has changed[/]")
+        self._show(self._debugger.again())
+
+    def do_step(self, line: str) -> None:
+        """step      make the call once more under pdb, from its first line"""
+        self._show(self._debugger.step_into())
+
+    def do_quit(self, line: str) -> bool:
+        """quit      leave"""
+        return True
+
+    do_q = do_exit = do_EOF = do_quit
+
+    # ------------------------------------------------------------------------------------------------- the loop
+
+    def onecmd(self, line: str) -> bool:
+        """Does what a line says. An error is printed, and the loop goes on."""
+        from dataflow.execution.failure import OperatorFailure
+        from dataflow.recording import RecordingError
+        from dataflow.reexecution.engine import Stuck
+        from dataflow.reexecution.recorded_run import ReplayError
+
+        self.failed = False
+        try:
+            return bool(super().onecmd(line))
+        except (WrongCommand, ReplayError, RecordingError, OperatorFailure, Stuck) as error:
+            self.failed = True
+            out.print(Text.assemble(("error: ", "bold red"), str(error)), soft_wrap=True)
+        except KeyboardInterrupt:
+            self.failed = True
+            out.print("[yellow]interrupted[/]")
+        return False
+
+    def default(self, line: str) -> None:
+        word = line.split()[0]
+        raise WrongCommand(f"no command {word!r}; there are: {', '.join(self._words())}")
+
+    def emptyline(self) -> bool:
+        return False
+
+    def completenames(self, text: str, *ignored: Any) -> list[str]:
+        return [word for word in self._words() if word.startswith(text)]
+
+    def _complete_input(self, text: str, *ignored: Any) -> list[str]:
+        return [n for n in self._debugger.node.inputs if n.startswith(text)]
+
+    def _complete_output(self, text: str, *ignored: Any) -> list[str]:
+        return [n for n in self._debugger.node.outputs if n.startswith(text)]
+
+    complete_inputs, complete_outputs = _complete_input, _complete_output
+
+    def _words(self) -> list[str]:
+        names = (name.removeprefix("do_") for name in self.get_names() if name.startswith("do_"))
+        return sorted(n for n in names if n not in ("EOF", "p", "q"))
+
+    def number(self, word: str) -> int:
+        """The number of a call that a word names: N, or @SECONDS."""
+        at_time = word.startswith("@")
+        try:
+            value = float(word[1:]) if at_time else int(word)
+        except ValueError:
+            raise WrongCommand(f"goto {word}: expected the number of a call, or @SECONDS") from None
+        return self._debugger.number_at(self._origin + round(value * 1e9)) if at_time else int(value)
+
+    def _here(self) -> int:
+        return -1 if self._debugger.at is None else self._debugger.at.number
+
+    def _fired(self) -> Fired:
+        if self._debugger.at is None:
+            raise WrongCommand("no call was made yet: goto one")
+        return self._debugger.at
+
+    def _show(self, fired: Fired) -> None:
+        if self._json:
+            print_json_line(self.values(fired))
+        else:
+            out.print(Text("\n").join(self.lines(fired)), soft_wrap=True)
+
+    def values(self, fired: Fired) -> dict[str, Any]:
+        """A call as JSON values."""
+        return {
+            "operator": self._debugger.node.name,
+            "number": fired.number,
+            **fired.call._asdict(),
+            "same": fired.same,
+            "injected": fired.injected,
+            "inputs": {name: self._what(value) for name, value in fired.inputs.items()},
+            "outputs": {m.port: {"same": m.same, "fields": [f.as_json() for f in m.fields]} for m in fired.made},
+            "changed": fired.changed(),
+            "error": fired.error,
+            "recorded_error": fired.recorded_error,
+        }
+
+    def lines(self, fired: Fired) -> Iterator[Text]:
+        """A call in some lines: when it was, what was given, what came out, what it changed."""
+        of = f"call {fired.number} of {len(self._debugger.calls)}"
+        when = (fired.call.stamp - self._origin) * 1e-9
+        how = f"{fired.call.kind} at {when:.3f} s" if fired.call.kind != "finish" else "finish"
+        verdict = ("as recorded", "green") if fired.same else ("not as recorded", "red")
+        yield Text.assemble((self._debugger.node.name, "bold"), f"  {of}, {how}: ", verdict)
+        if fired.injected:
+            yield Text("  the run tried out a fault here: the operator was not called")
+        for name, value in fired.inputs.items():
+            yield Text(f"  given    {name:<14} {self._what(value)}")
+        for made in fired.made:
+            what = "identical" if made.same else _difference(made.here, made.recorded)
+            yield Text.assemble(
+                f"  made     {made.port:<14} {self._what(made.here)}  ", (what, "" if made.same else "red")
+            )
+            for field in made.fields[:MOST_FIELDS]:
+                yield Text(f"             {difference_text(field)}")
+            if len(made.fields) > MOST_FIELDS:
+                yield Text(f"             and {plural(len(made.fields) - MOST_FIELDS, 'more field')}")
+        if fired.before is not None:
+            yield Text(f"  changed  {', '.join(fired.changed()) or 'nothing'} of its state")
+        if fired.error is not None or fired.recorded_error is not None:
+            yield Text(f"  recorded {fired.recorded_error or 'no error'}")
+            yield Text.assemble("  raised   ", (fired.error or "nothing", "red"))
+
+    def _what(self, value: Any) -> str:
+        match value:
+            case None:
+                return "nothing"
+            case Message():
+                return f"{value.SCHEMA} at {(value.stamp - self._origin) * 1e-9:.3f} s"
+            case Mapping():
+                return "; ".join(f"{stream}: {self._what(message)}" for stream, message in value.items()) or "nothing"
+            case _:
+                return f"{plural(len(value), 'message')}" + (f", the last {self._what(value[-1])}" if value else "")
+
+    def _messages(self, messages: Mapping[str, Any], name: str) -> None:
+        if name and name not in messages:
+            raise WrongCommand(f"no {name!r} here; there are: {', '.join(messages)}")
+        for key, value in messages.items():
+            if not name or key == name:
+                out.print(Text.assemble((key, "bold"), f"  {self._what(value)}"), soft_wrap=True)
+                for message in _each(value):
+                    for field, held in message.items():
+                        out.print(Text(f"  {field:<20} {field_text(held)}"), soft_wrap=True)
+
+
+def _each(value: Any) -> Iterator[Message]:
+    match value:
+        case Message():
+            yield value
+        case Mapping():
+            yield from value.values()
+        case tuple():
+            yield from value
+        case _:
+            return
+
+
+def changes(before: Any, after: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Place, value before and after of what differs in two states, as deep as mappings go."""
+    if isinstance(before, Mapping) and isinstance(after, Mapping):
+        for name in sorted({*before, *after}):
+            yield from changes(before.get(name), after.get(name), f"{place}.{name}" if place else name)
+    elif pack_state({"": before}) != pack_state({"": after}):
+        yield place, before, after
+
+
+def _difference(here: Message | None, recorded: Message | None) -> str:
+    if here is None:
+        return "differs: a message was recorded, nothing came now"
+    return "differs from the recorded one" if recorded is not None else "differs: nothing, or another one, was recorded"
+
+
+def _count(line: str) -> int:
+    if line and not line.isdigit():
+        raise WrongCommand(f"{line}: expected how many calls")
+    return int(line or 1)
+
+
+def _evaluated(code: Any, text: str, names: dict[str, Any]) -> Any:
+    try:
+        return eval(code, names)
+    except Exception as error:
+        raise WrongCommand(f"{text}: {type(error).__name__}: {error}") from None
+
+
+def _plain(value: Any) -> str:
+    text = field_text(value)
+    return text if len(text) <= 400 else f"{text[:400]}… {len(text):,} characters in all"

@@ -1,0 +1,218 @@
+"""Any recorded call can be gone to, in any order, and is then what it was."""
+
+from __future__ import annotations
+
+import importlib
+import random
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dataflow
+from dataflow.debugging.debugger import DebugError, Debugger
+from dataflow.debugging.fired import SPACING
+from dataflow.recording import Recording
+
+KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
+
+ADDER = '''
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dataflow.messages import FeatureVector
+from dataflow.operator import In, Operator, Out, Source
+{more_imports}
+
+def vector(stamp, number):
+    return FeatureVector(stamp=stamp, vectors=np.array([[number]], np.float32), model="made")
+
+
+class Numbers(Source):
+    x: Out[FeatureVector]
+
+    def stream(self):
+        for k in range(30):
+            yield {{"x": vector(1_700_000_000_000_000_000 + k * 100_000_000, k)}}
+
+
+@dataclass
+class State:
+    total: float = 0.0
+
+
+class Adder(Operator):
+    """Adds up."""
+
+    x: In[FeatureVector]
+    total: Out[FeatureVector]
+    state: State
+
+    def process(self, x):
+        {line}
+        return {{"total": vector(x.stamp, self.state.total)}}
+'''
+
+
+@pytest.fixture(params=["run.mcap", "live.mcap"])
+def kept(request: pytest.FixtureRequest) -> Iterator[Recording]:
+    with Recording(KEPT / request.param) as recording:
+        yield recording
+
+
+@pytest.mark.parametrize("operator", ["look", "smooth", "busy", "tally"])
+def test_all_calls_are_as_recorded_forwards_and_in_any_order(kept: Recording, operator: str) -> None:
+    debugger = Debugger(kept, operator)
+    forwards = [debugger.goto(number) for number in range(len(debugger.calls))]
+
+    assert all(fired.same for fired in forwards)
+    order = random.Random(3).sample(range(len(debugger.calls)), 8)
+    for number in order:
+        again = debugger.goto(number)
+        assert (again.call, again.before, again.after) == (
+            forwards[number].call,
+            forwards[number].before,
+            forwards[number].after,
+        )
+        assert [m.here.digest() for m in again.made if m.here] == [
+            m.here.digest() for m in forwards[number].made if m.here
+        ]
+    debugger.close()
+
+
+@pytest.mark.parametrize("operator", ["smooth", "tally"])
+def test_a_state_goes_over_to_the_next_call_of_an_incarnation(kept: Recording, operator: str) -> None:
+    debugger = Debugger(kept, operator)
+    before = debugger.goto(0)
+    for number in range(1, len(debugger.calls)):
+        fired = debugger.goto(number)
+        follows = fired.call.incarnation == before.call.incarnation and fired.call.record == before.call.record + 1
+        assert not follows or fired.before == before.after
+        before = fired
+
+
+def test_a_call_is_found_by_its_time(kept: Recording) -> None:
+    debugger = Debugger(kept, "busy")
+    for number in (0, 3, 70):
+        stamp = debugger.calls[number].stamp
+        found = debugger.calls[debugger.number_at(stamp)]
+        assert found.stamp <= stamp
+    assert debugger.number_at(0) == 0
+    assert debugger.goto(-1).number == len(debugger.calls) - 1
+
+
+def test_what_is_not_there_is_named(kept: Recording) -> None:
+    with pytest.raises(DebugError, match="'none' are recorded; there are: busy, look, smooth, tally"):
+        Debugger(kept, "none")
+    with pytest.raises(DebugError, match="'robot' is a source"):
+        Debugger(kept, "robot")
+    debugger = Debugger(kept, "busy")
+    with pytest.raises(DebugError, match=f"has calls 0 to {len(debugger.calls) - 1}, there is no 4000"):
+        debugger.goto(4000)
+    with pytest.raises(DebugError, match="goto one"):
+        debugger.again()
+
+
+def written(folder: Path, line: str, more_imports: str = "") -> Path:
+    file = folder / "debugged_adder.py"
+    file.write_text(ADDER.format(line=line, more_imports=more_imports))
+    return file
+
+
+RIGHT = "self.state.total += float(x.vectors[0, 0])"
+
+
+@pytest.fixture
+def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recording]:
+    written(tmp_path, RIGHT)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "debugged_adder", raising=False)
+    module = importlib.import_module("debugged_adder")
+    graph = dataflow.Graph().add("numbers", module.Numbers).add("adder", module.Adder)
+    graph.connect("adder", x="numbers/x").run(record=tmp_path / "run.mcap")
+    with Recording(tmp_path / "run.mcap") as recording:
+        yield recording
+    monkeypatch.delitem(sys.modules, "debugged_adder", raising=False)
+
+
+def test_going_back_begins_from_a_state_on_the_way(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dataflow.debugging.fired.SPACING", 0)
+    debugger = Debugger(added, "adder")
+    debugger.goto(25)
+    assert SPACING > 0
+
+    debugger.goto(20)
+
+    work = debugger._work
+    assert work is not None
+    assert work.results()["adder"].verified == 1
+    assert debugger.at is not None
+    assert debugger.at.states()[0] == {"total": sum(range(20))}
+    assert debugger.at.changed() == ("total",)
+
+
+def test_edited_source_is_taken_over_and_compared_from_the_same_state(added: Recording, tmp_path: Path) -> None:
+    debugger = Debugger(added, "adder")
+    debugger.goto(10)
+    assert debugger.reload() == []
+    written(tmp_path, RIGHT + "; self.state.total += 0.5 * (x.stamp % 200_000_000 == 0)")
+    assert debugger.reload() == ["debugged_adder"]
+
+    assert not debugger.again().same  # at 1.0 s
+    (made,) = debugger.again().made
+    assert [field.field for field in made.fields] == ["vectors"]
+    assert made.recorded is not None
+    assert made.recorded.vectors.item() == sum(range(11))
+    assert made.here is not None
+    assert made.here.vectors.item() == sum(range(11)) + 0.5
+    first = debugger.first_difference()
+    assert first is not None
+    assert first.number == 0
+
+    written(tmp_path, RIGHT)
+    debugger.reload()
+    assert debugger.goto(10).same
+    assert debugger.first_difference() is None
+
+
+def test_source_that_does_not_run_leaves_the_old_one(added: Recording, tmp_path: Path) -> None:
+    debugger = Debugger(added, "adder")
+    debugger.goto(4)
+    written(tmp_path, "self.state.total +=")
+    with pytest.raises(DebugError, match="cannot be used, the old one is: SyntaxError"):
+        debugger.reload()
+    written(tmp_path, RIGHT, more_imports="import no_such_module")
+    with pytest.raises(DebugError, match="no_such_module"):
+        debugger.reload()
+    assert debugger.again().same
+
+
+def test_a_condition_is_gone_to(added: Recording) -> None:
+    debugger = Debugger(added, "adder")
+    found = debugger.until(lambda fired: fired.outputs["total"].vectors.item() > 100)
+    assert found is not None
+    assert found.number == 14
+    assert found.before is not None
+    later = debugger.until(lambda fired: fired.number % 10 == 0)
+    assert later is not None
+    assert later.number == 20
+    assert debugger.until(lambda fired: False) is None
+    assert debugger.at is later
+    assert debugger.goto(21).number == 21
+
+
+def test_an_error_is_shown_with_its_line(added: Recording, tmp_path: Path) -> None:
+    debugger = Debugger(added, "adder")
+    debugger.goto(2)
+    written(tmp_path, "self.state.total /= x.vectors.size - 1")
+    debugger.reload()
+
+    fired = debugger.again()
+
+    assert not fired.same
+    assert "ZeroDivisionError" in (fired.error or "")
+    assert "debugged_adder.py" in (fired.error or "")
+    assert fired.recorded_error is None
