@@ -72,9 +72,9 @@ class Clock:
 def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     """Returns the one clock for all topics that are used together.
 
-    Header stamps, unless more than a tenth of a topic's are missing (zero or negative), one goes back by more than 5 s or
-    for good, most of them repeat, or the topics' headers are of different clocks: then log times, for all. Fewer that are missing
-    are placed by the log.
+    Header stamps, unless more than a tenth of a topic's are missing (zero or negative), one goes back by more than 5 s
+    or for good, most of them repeat, or the topics' headers are of different clocks: then log times, for all. Fewer
+    that are missing are placed by the log.
     """
     if wanted == "log":
         return Clock("log", "asked for")

@@ -90,7 +90,8 @@ def check_motion(material: Material) -> Iterator[Finding]:
 def _motion_of(material: Material, stream: str) -> Motion | None:
     """The motion in a stream; None where fewer messages than `FEWEST` have stamps that go forward."""
     rows: list[tuple[object, ...]] = []
-    stamps, world, body = [], "", ""
+    stamps: list[int] = []
+    world = body = ""
     for message in material.messages(stream):
         if stamps and message.stamp <= stamps[-1]:
             continue
