@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.state import plain, typed
 from operators.geometry.se3 import Matrix
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fitter
-from operators.odometry.rgbd.memory import from_plain, to_plain
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import scaled_intrinsics
-from operators.odometry.rgbd.tracker import RgbdOdometry
+from operators.odometry.rgbd.tracker import RgbdOdometry, RgbdState
 from operators.odometry.tracking import Status, TrackResult
 from operators.slam.graph_memory import graph_from_plain, graph_to_plain
 from operators.slam.map_points import MapPoints
@@ -59,8 +59,8 @@ class RgbdSlam:
         if result.keyframe:
             factor = max(1, image.shape[1] // self._config.image_width)
             working = replace(self.camera, K_color=scaled_intrinsics(self.camera.K_color, 1.0 / factor))
-            state = self._odometry.snapshot()
-            added = self.graph.add(state.keyframes[-1], Fitter(working, self._config, state.noise), self._jumped)
+            state = self._odometry.state
+            added = self.graph.add(state.map.newest, Fitter(working, self._config, state.noise), self._jumped)
             self._jumped &= not added.node
         missing = result.status in (Status.PREDICTED, Status.LOST)
         adrift = f"odometry {result.status}: {result.reason}" if missing else ""
@@ -78,7 +78,7 @@ class RgbdSlam:
     def snapshot(self) -> Mapping[str, Any]:
         """Returns all that the next result depends on, as plain values."""
         return {
-            "odometry": to_plain(self._odometry.snapshot()),
+            "odometry": plain(self._odometry.state),
             "graph": graph_to_plain(self.graph, view_to_plain),
             "points": self.graph.points.to_plain(),
             "jumped": self._jumped,
@@ -86,7 +86,8 @@ class RgbdSlam:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Goes on from a snapshot of the same camera and settings."""
-        self._odometry.restore(from_plain(state["odometry"]))
+        known = typed(RgbdState, state["odometry"], current=self._odometry.state)
+        self._odometry = RgbdOdometry(self.camera, self._config, known)
         graph_from_plain(self.graph, state["graph"], view_from_plain)
         self.graph.points = MapPoints.from_plain(state["points"])
         self._jumped = bool(state["jumped"])

@@ -35,7 +35,7 @@ def view(k: int) -> View:
     odometry = RgbdOdometry(CAMERA)
     depth = seen.depth + 0.0015 * seen.depth**2 * np.random.default_rng(k).standard_normal(seen.depth.shape)
     odometry.track(seen.image, depth.astype(np.float32), 0)
-    return View.of(odometry.snapshot().keyframes[-1], CAMERA)
+    return View.of(odometry.state.map.newest, CAMERA)
 
 
 def node(k: int, T: Matrix) -> Node[View]:
