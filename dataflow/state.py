@@ -198,6 +198,14 @@ def state_hints(state: Any) -> dict[str, Any]:
     return {each.name: hints[each.name] for each in dataclasses.fields(state)}
 
 
+def _with_arguments(hint: Any, bound: Mapping[Any, Any]) -> Any:
+    """Returns a type with the arguments of a generic class put in for its type variables."""
+    if isinstance(hint, typing.TypeVar):
+        return bound.get(hint, hint)
+    open_ = () if isinstance(hint, type) else getattr(hint, "__parameters__", ())
+    return hint[tuple(bound.get(each, each) for each in open_)] if open_ else hint
+
+
 def _check_names(name: str, hints: Iterable[str], state: Any) -> None:
     if not isinstance(state, Mapping):
         raise StateError(f"{name} is a {type(state).__name__}, expected its fields")
@@ -247,6 +255,8 @@ class _Typing:
             return self._one_of(arguments, value, place, current)
         if origin is typing.Annotated:
             return self.typed(arguments[0], value, place, current)
+        if isinstance(origin, typing.TypeVar):
+            return self.typed(origin.__bound__ or Any, value, place, current)
         if origin in (Any, object, typing.Literal):
             return value
         if origin in _SEQUENCES:
@@ -261,7 +271,7 @@ class _Typing:
         if origin is complex:
             return complex(*_listed(value, place, 2))
         if isinstance(origin, type):
-            return self._object(origin, value, place, current)
+            return self._object(origin, arguments, value, place, current)
         raise StateError(f"{place}: a {hint!r} cannot be restored")
 
     def _one_of(self, members: Sequence[Any], value: Any, place: str, current: Any) -> Any:
@@ -299,7 +309,7 @@ class _Typing:
             made[key] = self.typed(of_item, item, f"{place}[{plain_key!r}]", there.get(key))
         return made
 
-    def _object(self, kind: type, value: Any, place: str, current: Any) -> Any:
+    def _object(self, kind: type, arguments: Sequence[Any], value: Any, place: str, current: Any) -> Any:
         """An array, number of numpy, enum, message, dataclass or object with `restore()`."""
         if issubclass(kind, np.ndarray | np.generic):
             if not isinstance(value, np.ndarray | np.generic):
@@ -321,11 +331,13 @@ class _Typing:
             made.restore(value)
             return made
         if dataclasses.is_dataclass(kind):
-            return self._dataclass(kind, value, place, current)
+            return self._dataclass(kind, arguments, value, place, current)
         raise StateError(f"{place}: a {kind.__name__} cannot be restored")
 
-    def _dataclass(self, kind: Any, value: Any, place: str, current: Any) -> Any:
-        hints, fields = _hints(kind), dataclasses.fields(kind)
+    def _dataclass(self, kind: Any, arguments: Sequence[Any], value: Any, place: str, current: Any) -> Any:
+        bound = dict(zip(getattr(kind, "__parameters__", ()), arguments, strict=False))
+        hints = {name: _with_arguments(hint, bound) for name, hint in _hints(kind).items()}
+        fields = dataclasses.fields(kind)
         _check_names(f"{place} ({kind.__name__})", [each.name for each in fields], value)
         restored = {
             each.name: self.typed(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections import Counter, defaultdict, deque
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Number, Odometry
 from dataflow.operator import KEPT, In, Operator, Out, Param, Remembered
 from dataflow.state import StateError, plain, typed
+
+V = TypeVar("V")
 
 
 class Mode(enum.Enum):
@@ -310,3 +312,29 @@ def test_an_operator_without_a_state_gives_no_snapshot() -> None:
     assert Plain().snapshot() is None
     with pytest.raises(NotImplementedError, match="Plain gives snapshots but cannot restore"):
         Plain().restore({})
+
+
+@dataclass
+class Kept(Generic[V]):
+    place: str
+    view: V | None = None
+
+
+@dataclass
+class Shelf(Generic[V]):
+    by_id: dict[int, Kept[V]] = field(default_factory=dict)
+
+
+def test_a_generic_dataclass_comes_back_with_the_types_that_it_is_used_with() -> None:
+    shelf = Shelf({1: Kept("there", Track(1, np.zeros(3))), 2: Kept("here")})
+
+    back = typed(Shelf[Track], unpack_state(pack_state(plain(shelf))))
+
+    assert isinstance(back.by_id[1].view, Track)
+    assert back.by_id[2] == Kept("here")
+
+
+def test_one_of_several_dataclasses_is_found_by_its_fields() -> None:
+    back = typed(Place | Kept[int] | Track, unpack_state(pack_state(plain(Track(1, np.zeros(3))))))
+
+    assert isinstance(back, Track)
