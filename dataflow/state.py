@@ -248,7 +248,7 @@ class _Typing:
     new_part: NewPart
 
     def typed(self, hint: Any, value: Any, place: str, current: Any) -> Any:
-        origin, arguments = typing.get_origin(hint) or hint, typing.get_args(hint)
+        origin, arguments = typing.get_origin(hint) or hint or types.NoneType, typing.get_args(hint)
         if origin in _SCALARS:
             return _scalar(origin, value, place)
         if origin in (typing.Union, types.UnionType):

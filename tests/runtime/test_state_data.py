@@ -61,6 +61,7 @@ class State:
     places: deque[Place] = field(default_factory=lambda: deque(maxlen=2))
     seen: set[str] = field(default_factory=set)
     pairs: dict[tuple[int, str], float] = field(default_factory=dict)
+    ordered: dict[str, None] = field(default_factory=dict)
     by_id: defaultdict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
     last: Odometry | None = None
     kind: Literal["a", "b"] = "a"
@@ -140,7 +141,7 @@ def filled() -> State:
     state = State(last=odometry, raw=b"\0\1", phase=1 + 2j, single=np.float32(0.1), spare=(1.0, 2.5), kind="b")
     state.tracks = {9: Track(9, np.arange(3.0), "cup", Mode.FOLLOW), 2: Track(2, np.zeros((0, 3)))}
     state.places.extend(Place(k, np.full(3, k, float)) for k in range(3))
-    state.seen, state.pairs = {"b", "a"}, {(1, "near"): 0.5}
+    state.seen, state.pairs, state.ordered = {"b", "a"}, {(1, "near"): 0.5}, {"b": None, "a": None}
     state.by_id[4].append(1.5)
     state.windows["left"] = Window()
     state.windows["left"].add(2.0)
