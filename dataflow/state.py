@@ -18,6 +18,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import enum
+import functools
 import itertools
 import types
 import typing
@@ -126,6 +127,10 @@ def reset_state(old: Any, new: Any) -> None:
             setattr(new, each.name, getattr(old, each.name))
 
 
+_AS_IS = frozenset({types.NoneType, bool, int, float, str, bytes, np.ndarray, np.float64, np.int64, np.bool_})
+"""The types of most values, which are asked for first: a state may have thousands."""
+
+
 def plain(value: Any, place: str = "state") -> Any:
     """Returns a value as a snapshot holds it. Raises `StateError` for one of another type, with its place."""
     match value:
@@ -136,14 +141,14 @@ def plain(value: Any, place: str = "state") -> Any:
         case complex():
             return [value.real, value.imag]
         case Message():
-            content = {f.name: plain(getattr(value, f.name), f"{place}.{f.name}") for f in type(value).FIELDS}
-            return {"schema": value.SCHEMA, "stamp": value.stamp, **content}
+            names = [each.name for each in type(value).FIELDS]
+            return {"schema": value.SCHEMA, "stamp": value.stamp, **_plain_attributes(value, names, place)}
         case _ if hasattr(value, "snapshot"):
             return value.snapshot()
         case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            return {f.name: plain(getattr(value, f.name), f"{place}.{f.name}") for f in dataclasses.fields(value)}
+            return _plain_attributes(value, _field_names(type(value)), place)
         case deque():
-            return [value.maxlen, [plain(item, f"{place}[{k}]") for k, item in enumerate(value)]]
+            return [value.maxlen, _plain_items(value, place)]
         case Mapping():
             return [[plain(key, place), plain(item, f"{place}[{key!r}]")] for key, item in value.items()]
         case set() | frozenset():
@@ -153,12 +158,27 @@ def plain(value: Any, place: str = "state") -> Any:
             except TypeError:
                 raise StateError(f"{place} is a set of values that have no order; use a dict or a list") from None
         case list() | tuple():
-            return [plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
+            return _plain_items(value, place)
         case _:
             raise StateError(
                 f"{place} is a {type(value).__name__}; a state holds numbers, strings, bytes, None, numpy arrays, "
                 "enums, messages, dataclasses, objects with snapshot() and restore(), and collections of these"
             )
+
+
+def _plain_attributes(value: Any, names: Iterable[str], place: str) -> dict[str, Any]:
+    return {
+        name: own if type(own := getattr(value, name)) in _AS_IS else plain(own, f"{place}.{name}") for name in names
+    }
+
+
+def _plain_items(value: Iterable[Any], place: str) -> list[Any]:
+    return [item if type(item) in _AS_IS else plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
+
+
+@functools.cache
+def _field_names(kind: Any) -> tuple[str, ...]:
+    return tuple(each.name for each in dataclasses.fields(kind))
 
 
 def typed(hint: Any, value: Any, place: str = "state", current: Any = None, new_part: NewPart | None = None) -> Any:
