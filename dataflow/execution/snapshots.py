@@ -36,14 +36,28 @@ def differing_fields(recorded: bytes, here: bytes) -> str:
     before, now = unpack_state(recorded), unpack_state(here)
     if not (isinstance(before, Mapping) and isinstance(now, Mapping)):
         return "another kind of value"
+    if (other := _other_version(before, now)) is not None:
+        return f"of another version of the operator: {other}"
+    return "in " + ", ".join(
+        name for name in sorted(now) if pack_state({"": before[name]}) != pack_state({"": now[name]})
+    )
+
+
+def _other_version(before: Any, now: Any, place: str = "") -> str | None:
+    """Returns in words where two states are of two versions: mappings, messages aside, have other keys."""
+    if not (isinstance(before, Mapping) and isinstance(now, Mapping)):
+        forms = {type(each) if isinstance(each, list | Mapping) else None for each in (before, now)}
+        other = len(forms) > 1 and before is not None and now is not None
+        return f"the recorded one holds {place} in another form" if other else None
+    if "schema" in before or "schema" in now:
+        return None
     if before.keys() != now.keys():
         lacks, more = (
             ", ".join(sorted(names)) or "none" for names in (now.keys() - before.keys(), before.keys() - now.keys())
         )
-        return f"of another version of the operator: the recorded one lacks {lacks} and has {more} besides"
-    return "in " + ", ".join(
-        name for name in sorted(now) if pack_state({"": before[name]}) != pack_state({"": now[name]})
-    )
+        return f"the recorded one lacks {lacks} and has {more} besides{f' in {place}' if place else ''}"
+    found = (_other_version(before[name], now[name], f"{place}.{name}".lstrip(".")) for name in sorted(now))
+    return next((each for each in found if each), None)
 
 
 def _plain(value: Any, place: str) -> Any:
