@@ -23,6 +23,7 @@ NORMALIZATIONS: Mapping[str, tuple[tuple[float, float, float], tuple[float, floa
     "none": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
     "unit": ((0.0, 0.0, 0.0), (255.0, 255.0, 255.0)),
     "imagenet": ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375)),
+    "clip": ((122.7709383, 116.7460125, 104.09373615), (68.5005327, 66.6321579, 70.32316305)),
 }
 """Mean and scale of pixels from 0 to 255, red first, by their names."""
 
@@ -30,6 +31,7 @@ _TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
     "tensor(uint8)": np.uint8,
+    "tensor(int32)": np.int32,
 }
 _COLORED = re.compile(r"(?P<name>.*?\S)\s+(?P<red>\d{1,3})[\s,]+(?P<green>\d{1,3})[\s,]+(?P<blue>\d{1,3})")
 
@@ -40,7 +42,7 @@ class ImageInput:
 
     - `size`: (width, height) in pixels, `layout`: where its channels stand, `type`: of its numbers.
     - A number of the tensor is (pixel - `mean`) / `scale`, by channel in RGB order, pixels from 0 to 255; an input of
-      uint8 takes the pixels as they are.
+      uint8 or int32 takes the pixels as they are.
     """
 
     name: str
@@ -55,8 +57,8 @@ class ImageInput:
         """Returns the tensor of RGB pixels (H, W, 3) of the input's size."""
         channels = pixels[..., ::-1] if self.bgr else pixels
         ordered = channels.transpose(2, 0, 1) if self.layout == "nchw" else channels
-        if self.type is np.uint8:
-            return np.ascontiguousarray(ordered[None])
+        if issubclass(self.type, np.integer):
+            return np.ascontiguousarray(ordered[None], self.type)
         tensor = np.ascontiguousarray(ordered[None], np.float32)
         if any(self.mean):
             tensor -= self._by_channel(self.mean)

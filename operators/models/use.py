@@ -11,7 +11,7 @@ from typing import Any
 
 from dataflow.operator import Operator
 from operators.inference import ModelError
-from operators.models.registry import Model, Registry
+from operators.models.registry import Model, PartName, Registry
 
 _OPERATOR = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
@@ -53,17 +53,33 @@ def use_model(operator: Operator, given: str) -> Used:
         model = registry[given]
         if not model.file.is_file():
             raise FileNotFoundError(missing(model))
-        file = operator.use_file(model.file, name=given)
-        if not model.accepts(operator.files[given]):
-            raise ModelError(
-                f"{file} is not the file of {given}: its sha256 is {operator.files[given]}, expected {model.sha256}. "
-                f"`dataflow models get {given}` brings the right one"
-            )
+        file = _right_file(operator, model)
     if model is not None:
         _check_row(operator, model)
         row = json.dumps({"params": model.params, "classes": model.classes}, sort_keys=True, default=str)
         operator.files[f"{given} (row)"] = hashlib.sha256(row.encode()).hexdigest()
     return Used(file, model)
+
+
+def use_part(operator: Operator, model: Model, name: PartName) -> Path:
+    """Returns the file of a part of a model for an operator, and notes its digest under the part's name.
+
+    Raises ModelError where the row has no such part or the file is another, FileNotFoundError with how to get it.
+    """
+    part = model.part(name)
+    if not part.file.is_file():
+        raise FileNotFoundError(missing(part))
+    return _right_file(operator, part)
+
+
+def _right_file(operator: Operator, model: Model) -> Path:
+    file = operator.use_file(model.file, name=model.name)
+    if not model.accepts(operator.files[model.name]):
+        raise ModelError(
+            f"{file} is not the file of {model.name}: its sha256 is {operator.files[model.name]}, expected "
+            f"{model.sha256}. `dataflow models get {model.name}` brings the right one"
+        )
+    return file
 
 
 def _check_row(operator: Operator, model: Model) -> None:

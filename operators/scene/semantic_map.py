@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,9 @@ class SemanticMap(Operator):
         doc="the same objects as nodes without relations, with when each was last seen; and the surfaces, whose ids "
         "are 0 (the floor) and from -11 down"
     )
+    seen: Out[Detections2D] = Out(
+        doc="of `images` those of objects that are given, with the ids of their nodes; where there are any images"
+    )
     status: Out[Diagnostics] = Out(
         doc="objects by what became of them, doubted ones too; a warning for a view without points"
     )
@@ -165,7 +168,7 @@ class SemanticMap(Operator):
         ]
         known.floor = self._surfaces.floor
         view = RangeView(points[:: 1 + len(points) // 20_000], T, 0.012)
-        known.update(cloud.stamp, [each for each in seen if each is not None], view)
+        joined = known.update(cloud.stamp, [each for each in seen if each is not None], view)
         if surfaces is not None and surfaces.stamp == cloud.stamp:
             parts = seen_surfaces(surfaces, cloud, T, self.max_range)
             self._surfaces.update(cloud.stamp, parts, view, known.heading)
@@ -184,11 +187,15 @@ class SemanticMap(Operator):
         self._counts["views without points"] += not len(points)
         self._counts["objects"], self._counts["moved"] = len(objects), known.moved
         self._counts["doubted"], self._counts["surfaces"] = counts["doubted"], len(planes)
-        return {
+        made = {
             "objects": self._boxes(cloud.stamp, objects, scores),
             "nodes": nodes_of(cloud.stamp, self._frame, self._classes, objects, scores, planes),
             "status": _status(cloud.stamp, counts),
         }
+        if images is not None and images.stamp == boxes.stamp and images.count == boxes.count:
+            rows = [k for k, each in enumerate(seen) if each is not None]
+            made["seen"] = _of_nodes(images, dict(zip(rows, joined, strict=True)), {o.id for o in objects})
+        return made
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -328,6 +335,22 @@ def _images(
     rows = images.boxes.astype(np.float64)
     whole = np.where(np.arange(4) < 2, rows > _BORDER, rows < size - _BORDER)
     return [ImageView(P, box - 0.5, edges, eye) for box, edges in zip(rows, whole, strict=True)]
+
+
+def _of_nodes(images: Detections2D, joined: Mapping[int, int], given: Collection[int]) -> Detections2D:
+    """Returns the rows of images that show given nodes, by the node of each row that has one."""
+    rows = [k for k, i in joined.items() if i in given]
+    return Detections2D(
+        stamp=images.stamp,
+        frame=images.frame,
+        width=images.width,
+        height=images.height,
+        class_names=images.class_names,
+        boxes=images.boxes[rows],
+        scores=images.scores[rows],
+        class_ids=images.class_ids[rows],
+        ids=np.array([joined[k] for k in rows], np.int64),
+    )
 
 
 def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:
