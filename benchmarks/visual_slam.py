@@ -35,10 +35,10 @@ from operators.odometry.rgbd.camera import RgbdCamera  # noqa: E402
 from operators.odometry.rgbd.settings import RgbdOdometryConfig  # noqa: E402
 from operators.odometry.rgbd.tracker import RgbdOdometry  # noqa: E402
 from operators.slam.keyframe_graph import Node  # noqa: E402
-from operators.slam.rgbd_slam import RgbdSlam, SlamResult  # noqa: E402
-from operators.slam.visual_graph import GraphSettings  # noqa: E402
-from operators.slam.visual_map_file import read_visual_map, write_visual_map  # noqa: E402
-from operators.slam.visual_view import View  # noqa: E402
+from operators.slam.visual.graph import GraphSettings  # noqa: E402
+from operators.slam.visual.map_file import read_visual_map, write_visual_map  # noqa: E402
+from operators.slam.visual.mapper import RgbdSlam, SlamResult  # noqa: E402
+from operators.slam.visual.view import View  # noqa: E402
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ def rendered(cache: Path, world: str, seed: int, seconds: int, mount: str | None
 
 def _render(file: Path, world: str, seed: int, seconds: int, mount: str | None) -> None:
     from operators.simulator import SimulatedRobot
-    from operators.simulator.worlds import make_world
+    from operators.simulator.worlds.make import make_world
 
     color: dict[str, Any] = {"rate": 10}
     speed = 0.8 if mount is None else float(MOUNTS[mount]["speed"])

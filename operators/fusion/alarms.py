@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from operators.fusion.gate import GateConfig, Health
-from operators.fusion.late_filter import TOO_LATE
-from operators.fusion.sensor_settings import never_yields
+from operators.fusion.filter.gate import GateConfig, Health
+from operators.fusion.filter.late_filter import TOO_LATE
+from operators.fusion.sensors.settings import never_yields
 
 _ANY = GateConfig()
 _RECENT = 2_000_000_000

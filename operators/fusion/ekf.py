@@ -24,20 +24,20 @@ from dataflow.messages import (
 )
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
 from operators.fusion.alarms import Alarms
-from operators.fusion.constraints import Constraints
-from operators.fusion.control import Command
-from operators.fusion.covariances import Unusable
-from operators.fusion.error_state import Noise
-from operators.fusion.filter_history import Measurement
-from operators.fusion.imu_dropout import ImuDropout
-from operators.fusion.inertial import InertialConfig, InertialSensor
-from operators.fusion.initialisation import Prior, coasting_node, prior_of
-from operators.fusion.last_measurements import LastMeasurements
-from operators.fusion.late_filter import FilterConfig, LateFilter
-from operators.fusion.lever_arms import LeverArms
+from operators.fusion.filter.control import Command
+from operators.fusion.filter.error_state import Noise
+from operators.fusion.filter.history import Measurement
+from operators.fusion.filter.imu_dropout import ImuDropout
+from operators.fusion.filter.initialisation import Prior, coasting_node, prior_of
+from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.output import diagnostics, figures, odometry_of, unmeasured, well_known
-from operators.fusion.sensor_settings import SensorSettings, errors_of, name_of, never_yields, unheard, use_of
-from operators.fusion.sensors import Surroundings, measurements, turning
+from operators.fusion.sensors.constraints import Constraints
+from operators.fusion.sensors.covariances import Unusable
+from operators.fusion.sensors.inertial import InertialConfig, InertialSensor
+from operators.fusion.sensors.interpretation import Surroundings, measurements, turning
+from operators.fusion.sensors.last_measurements import LastMeasurements
+from operators.fusion.sensors.lever_arms import LeverArms
+from operators.fusion.sensors.settings import SensorSettings, errors_of, name_of, never_yields, unheard, use_of
 
 Array = NDArray[np.float64]
 _DEFAULT = SensorSettings()

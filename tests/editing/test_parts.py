@@ -41,6 +41,7 @@ def test_a_part_holds_the_span_byte_for_byte(recorded: Path, tmp_path: Path) -> 
     assert found == expected
 
 
+@pytest.mark.long
 def test_a_replay_of_a_part_makes_what_the_whole_one_makes_there(stateful: Path, tmp_path: Path) -> None:
     part = cut(stateful, tmp_path / "part.mcap", 0.5, 0.8)
 
@@ -76,6 +77,7 @@ def test_only_the_end_cut_off_verifies_wholly_up_to_there(recorded: Path, tmp_pa
     assert not report.identical  # of the run's end nothing is known
 
 
+@pytest.mark.long
 def test_a_cut_that_cuts_nothing_off_is_the_whole(recorded: Path, tmp_path: Path) -> None:
     copy = cut(recorded, tmp_path / "copy.mcap", None, None)
 

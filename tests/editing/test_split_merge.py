@@ -38,6 +38,7 @@ def merged(paths: list[Path], out: Path, *prefixes: str) -> list[str]:
             origin.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", [{"every": SECOND // 4}, {"size": 20_000}], ids=["time", "size"])
 def test_the_merge_of_a_split_is_the_whole(recorded: Path, tmp_path: Path, how: dict[str, int]) -> None:
     with Origin(recorded) as origin:

@@ -18,6 +18,7 @@ from mcap.records import Channel, Schema
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import CUT, RECORDING, Kind
 from dataflow.recording.mcap.attachments import Attachment, Place
+from dataflow.recording.mcap.cache import ChunkCache
 from dataflow.recording.mcap.chunks import Column
 from dataflow.recording.mcap.contents import Entries
 from dataflow.recording.mcap.index import McapFile, RawMessage
@@ -52,9 +53,10 @@ class PartedFile:
     def __init__(self, path: Path, parts: Sequence[Path], *, watch: Watch | None = None) -> None:
         self.path = path
         self._files: list[McapFile] = []
+        cache = ChunkCache()
         try:
             for part in parts:
-                self._files.append(McapFile(part, watch=watch))
+                self._files.append(McapFile(part, watch=watch, cache=cache))
                 if not any(name == RECORDING for name, _ in self._files[-1].metadata):
                     raise RecordingError(f"{part} is no recording of this program, so {path} is not one in parts")
         except BaseException:

@@ -103,7 +103,8 @@ class Recording:
 
         Static streams come first and whole, whatever `start` and `end`. Each stream keeps its own order; an incarnation
         whose clock has jumped back is merged as if it followed directly on the one before. Memory holds the index and
-        at most 256 MiB of decompressed chunks. Without `streams`, those that have no message type are left out.
+        16 MiB of decompressed chunks, or up to 256 MiB where more are in use at a time. Without `streams`, those that
+        have no message type are left out.
 
         Raises `RecordingError` for an unknown stream, one without a message type, and data that does not decode.
         """

@@ -26,7 +26,7 @@ from dataflow.operator import Context, ParameterError
 from dataflow.testing import play
 from operators.fusion import EkfFusion
 from operators.geometry.geodesy import earth_centred, east_north_up
-from operators.simulator.gnss import geodetic
+from operators.simulator.sensors.gnss import geodetic
 
 
 def twist(stamp: int, frame: str = "base_link") -> Twist:

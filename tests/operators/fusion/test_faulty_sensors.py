@@ -285,6 +285,7 @@ ABSORBED = pytest.mark.xfail(
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [0.5, pytest.param(-0.5, marks=ABSORBED), 1.0, -2.0, 3.1])
 def test_a_first_heading_told_wrongly_is_warned_of_within_a_second_and_while_it_is_wrong(wrong: float) -> None:
     told = []

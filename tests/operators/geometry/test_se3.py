@@ -84,6 +84,7 @@ def test_orthonormalised_is_a_rotation_near_by(x: np.ndarray, seed: int) -> None
     np.testing.assert_allclose(R, T[:3, :3], atol=1e-2)
 
 
+@pytest.mark.long
 def test_covariance_about_fixed_axes_is_that_of_perturbed_poses() -> None:
     rng = np.random.default_rng(3)
     A = rng.normal(0, 0.003, (6, 6))

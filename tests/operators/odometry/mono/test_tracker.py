@@ -117,6 +117,7 @@ def test_a_blank_wall_is_named() -> None:
     assert "too little texture" in results[-1].track.reason
 
 
+@pytest.mark.long
 def test_a_view_of_something_else_is_lost_until_a_new_map_begins() -> None:
     images = list(rendered(30))
     elsewhere = [np.ascontiguousarray(np.rot90(i, 2)) for i in images]  # the same walls upside down

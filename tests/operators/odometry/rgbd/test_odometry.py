@@ -316,6 +316,7 @@ def test_frozen_images_are_noticed_and_not_used() -> None:
     assert {r.status for r in results[11:25]} == {Status.PREDICTED}
 
 
+@pytest.mark.long
 def test_lost_depth_is_bridged_by_the_depth_of_the_map() -> None:
     """Twenty degrees of turning without depth: new corners take theirs from what the map expects there."""
     frames, poses = sequence(60, 1.5)
@@ -384,6 +385,7 @@ def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
     assert errors(results[-5:], poses[-5:])[0] < 0.03
 
 
+@pytest.mark.long
 def test_a_wrong_place_is_taken_back_with_another_that_was_found_meanwhile() -> None:
     frames, poses = sequence(60, 1.5)
     stamps = [int(i * 1e9 / 30) for i in range(len(frames))]
@@ -420,6 +422,7 @@ def test_a_right_place_is_not_taken_back() -> None:
     assert errors(results, poses[25:])[0] < 0.03
 
 
+@pytest.mark.long
 def test_new_map_apart_is_joined_when_the_old_one_is_seen_again() -> None:
     """The camera is turned to the other side of the room while it sees nothing, and comes back later."""
     frames, poses = sequence(40)
@@ -438,6 +441,7 @@ def test_new_map_apart_is_joined_when_the_old_one_is_seen_again() -> None:
     assert errors(results[-2:], poses[-2:])[0] < 0.03
 
 
+@pytest.mark.long
 def test_a_view_that_is_found_again_in_a_new_map_apart_says_nothing_of_the_old_one() -> None:
     frames, poses = sequence(60, 1.5)
     turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
@@ -600,6 +604,7 @@ def test_same_frames_give_the_same_bytes_after_other_random_draws() -> None:
     assert digest(follow(frames)) == first
 
 
+@pytest.mark.long
 def test_same_frames_give_the_same_bytes_in_another_process(repository: Path) -> None:
     script = (
         "import importlib.util as u;"
@@ -717,6 +722,7 @@ def test_operator_refuses_an_image_that_its_calibration_does_not_describe() -> N
 # -- recorded data -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_recorded_sequence_is_followed_within_2_5_cm(data_dir: Path) -> None:
     from evo.core.metrics import APE, PoseRelation, StatisticsType

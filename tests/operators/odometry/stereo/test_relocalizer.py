@@ -52,6 +52,7 @@ def aside(poses: list[Matrix]) -> list[Matrix]:
     return [T @ se3.exp(np.array([0.25, 0.05, 0.0, 0.0, -0.04, 0.0])) for T in poses]
 
 
+@pytest.mark.long
 def test_an_old_view_after_a_gap_is_found_at_its_place() -> None:
     pairs, poses = sequence(25)
     back = aside(poses[6::-1])
@@ -72,6 +73,7 @@ def test_a_camera_that_stood_still_in_the_dark_goes_on_where_it_was() -> None:
     assert max(off(r, poses[17]) for r in after) < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("paper", [4, 11], ids=["the other way", "another hallway"])
 def test_a_view_that_nothing_kept_shows_is_lost_and_then_apart_until_an_old_one_comes(paper: int) -> None:
     pairs, poses = sequence(25)
@@ -94,6 +96,7 @@ def test_a_view_that_nothing_kept_shows_is_lost_and_then_apart_until_an_old_one_
     assert "unknown" not in after[-1].reason
 
 
+@pytest.mark.long
 def test_a_new_map_is_moved_to_where_it_belongs_when_the_old_one_is_seen() -> None:
     """It turns round in the dark, drives on, and turns back in the light: the new map then joins the old one."""
     pairs, poses = sequence(25)
@@ -110,6 +113,7 @@ def test_a_new_map_is_moved_to_where_it_belongs_when_the_old_one_is_seen() -> No
         assert np.linalg.norm((invert(truth[k.stamp // PERIOD]) @ k.T_world_camera)[:3, 3]) < 0.3
 
 
+@pytest.mark.long
 def test_the_same_pairs_give_the_same_bytes_also_from_a_snapshot_in_a_new_map() -> None:
     pairs, poses = sequence(25)
     there = seen([poses[17] @ AROUND] * 3, noise=5)
