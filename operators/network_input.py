@@ -84,20 +84,21 @@ def image_input(
 ) -> ImageInput:
     """Reads what the model's input of an image takes; `free` is the (width, height) where an extent is left open.
 
-    The model may have so many `others` besides, after it.
+    The model may have so many `others` besides; the image is the first of four dimensions.
 
     Raises ModelError for a model whose input is no image of three channels in one of the layouts and types.
     """
     inputs = session.get_inputs()
-    found = [each for each in layouts if _is_image(inputs[0].shape, each)] if 1 <= len(inputs) <= 1 + others else []
-    if not found or inputs[0].type not in types:
+    image = next((each for each in inputs if len(each.shape) == 4), inputs[0])
+    found = [each for each in layouts if _is_image(image.shape, each)] if len(inputs) <= 1 + others else []
+    if not found or image.type not in types:
         described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
         shapes = " or ".join({"nchw": "[1, 3, H, W]", "nhwc": "[1, H, W, 3]"}[each] for each in layouts)
         raise ModelError(f"{file} must have one input {' or '.join(types)} {shapes}, has {described}")
-    layout, shape = found[0], inputs[0].shape
+    layout, shape = found[0], image.shape
     height, width = shape[2:] if layout == "nchw" else shape[1:3]
     size = (width if isinstance(width, int) else free[0], height if isinstance(height, int) else free[1])
-    return ImageInput(inputs[0].name, size, layout, _TYPES[inputs[0].type], bgr, tuple(mean), tuple(scale))
+    return ImageInput(image.name, size, layout, _TYPES[image.type], bgr, tuple(mean), tuple(scale))
 
 
 def _is_image(shape: Sequence[Any], layout: Layout) -> bool:

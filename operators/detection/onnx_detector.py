@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dataflow.messages import Detections2D, Image
-from dataflow.operator import In, Operator, Out, Param
+from dataflow.operator import In, Operator, Out, Param, ParameterError
 from operators.detection.coco import names_of
 from operators.detection.custom.finder import GridFinder
 from operators.detection.decoders import DecoderName
@@ -16,7 +16,7 @@ from operators.detection.messages import detections_of
 from operators.image.letterbox import FitMode
 from operators.inference import ModelError, Provider
 from operators.models.registry import Registry
-from operators.models.use import Used, names_a_model, use_model
+from operators.models.use import Used, names_a_model, use_model, use_part
 from operators.network_input import read_labels, three_channels
 from operators.weights import kind_of, trained_in_simulation
 
@@ -44,8 +44,10 @@ class OnnxDetector(Operator):
     )
     classes: str | None = Param(
         None,
+        tunable=True,
         doc="text file with one class name a line, or the names with commas between (`mug, fire extinguisher`); none "
-        "takes the registry's, those of the model's metadata, or the 80 of COCO",
+        "takes the registry's, those of the model's metadata, or the 80 of COCO. A network with an open vocabulary "
+        "finds what is named, and names may be added while it runs",
     )
     score_threshold: float | None = Param(
         None, ge=0, le=1, tunable=True, doc="boxes below are dropped; none takes the registry's for the model, or 0.3"
@@ -95,6 +97,18 @@ class OnnxDetector(Operator):
         self._iou = float(used.default("nms_iou", family))
         self.log.info("%s", self._described(used, decoder))
 
+    def on_parameter(self, name: str) -> None:
+        """Adds names to those that are found. Raises ParameterError where the network cannot, or the first change."""
+        if name != "classes":
+            return
+        known, finder = self._finder.names, self._finder
+        if not (isinstance(finder, ExportedFinder) and finder.is_open):
+            raise ParameterError(f"{self.model} finds the {len(known)} classes that it was trained for, and no others")
+        names = known if self.classes is None else self._names(self.classes)
+        if names[: len(known)] != known:
+            raise ParameterError(f"names may be added, after those before: {', '.join(known)}")
+        finder.find_also(names[len(known) :])
+
     def process(self, image: Image) -> Detections2D:
         """Raises ModelError where the model's output is not what the decoder reads, or has other classes than names."""
         score = self._score if self.score_threshold is None else self.score_threshold
@@ -120,11 +134,12 @@ class OnnxDetector(Operator):
             fit=used.setting(self, "fit", None),
             free_side=used.setting(self, "input_size", _SIDE),
             masks=self.masks,
+            tokenizer=None if used.model is None or not used.model.parts else use_part(self, used.model, "tokenizer"),
         )
 
     def _names(self, classes: str) -> tuple[str, ...]:
         names = tuple(name.strip() for name in classes.split(","))
-        file = len(names) == 1 or Path(classes).is_file()
+        file = Path(classes).is_file() or (len(names) == 1 and bool(Path(classes).suffix))
         return read_labels(self.use_file(classes)).names if file else names
 
     def _described(self, used: Used, decoder: str) -> str:

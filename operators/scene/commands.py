@@ -82,7 +82,6 @@ def show(
     except (QueryError, RecordingError, ValueError, OSError) as error:
         Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None
-    names = graph.names()
     if json:
         content = as_json(graph, activities)
         if matches is not None:
@@ -94,17 +93,19 @@ def show(
     elif matches is None:
         _tell(recording, graph, activities, since)
     else:
-        out = Console()
-        for m in matches:
-            place = ", ".join(f"{v:.2f}" for v in graph.positions[m.node])
-            reasons = "; ".join(
-                f"{p.replace('_', ' ')} {names[o] if s == m.node else names[s]}" for s, p, o in m.because
-            )
-            out.print(f"{names[m.node]} at ({place}) m, score {m.score:.2f}" + (f": {reasons}" if reasons else ""))
+        _answer(graph, matches)
         if not matches:
-            out.print(f"nothing at {since:.1f} s is {query}", highlight=False)
+            Console().print(f"nothing at {since:.1f} s is {query}", highlight=False)
     if matches is not None and not matches:
         raise typer.Exit(1)
+
+
+def _answer(graph: SceneGraph, matches: list[Match]) -> None:
+    out, names = Console(), graph.names()
+    for m in matches:
+        place = ", ".join(f"{v:.2f}" for v in graph.positions[m.node])
+        reasons = "; ".join(f"{p.replace('_', ' ')} {names[o] if s == m.node else names[s]}" for s, p, o in m.because)
+        out.print(f"{names[m.node]} at ({place}) m, score {m.score:.2f}" + (f": {reasons}" if reasons else ""))
 
 
 def _asked(path: Path, stream: str | None, graph: SceneGraph, query: str) -> list[Match]:

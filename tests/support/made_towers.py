@@ -71,6 +71,39 @@ def write_text_tower(file: Path, merges: Path, *, mask: bool = True) -> Path:
     return _saved(file, nodes, inputs, outputs, [numpy_helper.from_array(v, name) for name, v in values.items()])
 
 
+def write_open_detector(file: Path, merges: Path, boxes: Any, colors: Any) -> Path:
+    """A network of OWL-ViT's signature: it finds boxes (N, 4), which have colours (N, 3), by words for these."""
+    import onnx
+    from onnx import helper, numpy_helper
+
+    text = onnx.load(write_text_tower(file.with_suffix(".text.onnx"), merges)).graph
+    nodes = [
+        *text.node,
+        helper.make_node("Transpose", ["text_embeds"], ["by_class"], perm=[1, 0]),
+        helper.make_node("MatMul", ["of_boxes", "by_class"], ["alike"]),
+        helper.make_node("ReduceMean", ["pixel_values"], ["mean"], axes=[1, 2, 3], keepdims=0),
+        helper.make_node("Sub", ["mean", "mean"], ["nothing"]),
+        helper.make_node("Add", ["alike", "nothing"], ["rows"]),
+        helper.make_node("Unsqueeze", ["rows", "first"], ["logits"]),
+        helper.make_node("Identity", ["given"], ["pred_boxes"]),
+    ]
+    given = np.array(boxes, np.float32)[None]
+    values = {"of_boxes": np.array(colors, np.float32), "first": np.array([0]), "given": given}
+    number, real = onnx.TensorProto.INT64, onnx.TensorProto.FLOAT
+    inputs = {
+        "input_ids": (number, ["c", "length"]),
+        "pixel_values": (real, [1, 3, 48, 64]),
+        "attention_mask": (number, ["c", "length"]),
+    }
+    outputs = {
+        "logits": (real, [1, given.shape[1], "c"]),
+        "pred_boxes": (real, list(given.shape)),
+        "text_embeds": (real, ["c", 3]),
+    }
+    kept = [*text.initializer, *(numpy_helper.from_array(v, name) for name, v in values.items())]
+    return _saved(file, nodes, inputs, outputs, kept)
+
+
 def write_row(folder: Path, name: str = "colors") -> Path:
     """A registry file with a row of the towers, whose files lie in a cache beside it."""
     cache = folder / "cache"

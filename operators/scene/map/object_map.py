@@ -99,6 +99,12 @@ class ObjectMap:
         """Heading of most things around, in [0, pi / 2); None where none stands out."""
         return self._heading
 
+    def widen(self, classes: int, kinds: Kinds) -> None:
+        """Takes in classes that were added after those before."""
+        self._classes, self._kinds = classes, kinds
+        for object in (*self.objects.values(), *(old for _, old in self.gone.values())):
+            object.votes = np.pad(object.votes, (0, classes - len(object.votes)))
+
     def confirmed(self) -> list[MapObject]:
         """Returns the objects that were seen often enough, whatever their size and class, by rising id."""
         return [o for _, o in sorted(self.objects.items()) if self._is_sure(o)]

@@ -242,7 +242,11 @@ class SemanticMap(Operator):
         if pose.frame != self._frame:
             raise ValueError(f"the pose is in {pose.frame!r}, the map in {self._frame!r}")
         if boxes.class_names != self._classes:
-            raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self._classes}")
+            if boxes.class_names[: len(self._classes)] != self._classes:
+                raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self._classes}")
+            self._classes = boxes.class_names
+            self._counts["unknown classes"] = warn_of_unknown(self, self._labels, self._classes)
+            self._map.widen(len(self._classes), Kinds.of(self._labels, self._classes))
         return self._map
 
     def _take_up(self, saved: SavedMap, stamp: int) -> None:

@@ -219,6 +219,18 @@ def test_boxes_in_the_image_bear_the_ids_of_their_nodes() -> None:
     assert "seen" not in operator.process(boxes, clusters, cloud.replace(stamp=cloud.stamp + 1), pose)
 
 
+def test_classes_may_be_added_and_not_be_exchanged() -> None:
+    given = views([[CRATE, OTHER]] * 6)
+    wider = [(b.replace(class_names=(*b.class_names, "lamp")), *rest) for b, *rest in given[3:]]
+    lamps = [(b.replace(class_ids=np.full(b.count, len(b.class_names) - 1, np.int32)), *rest) for b, *rest in wider]
+    plain, grown, renamed = (mapped([*given[:3], *more]) for more in (given[3:], wider, lamps))
+    assert last(grown).class_names == (*given[0][0].class_names, "lamp")
+    assert last(grown).replace(class_names=last(plain).class_names).digest() == last(plain).digest()
+    assert ids(last(renamed)) == ids(last(plain)), "votes for a new class join those for old ones"
+    with pytest.raises(OperatorFailure, match="boxes have the classes"):
+        mapped([given[0], (given[1][0].replace(class_names=("lamp", "mug")), *given[1][1:])])
+
+
 def test_images_of_another_camera_are_refused() -> None:
     (view,) = with_images([CRATE], 1)
     operator = SemanticMap()
