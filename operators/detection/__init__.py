@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from operators.detection.box_segmenter import BoxSegmenter
     from operators.detection.custom_detector import CustomDetector
     from operators.detection.drawing import draw_detections
+    from operators.detection.keypoint_detector import KeypointDetector
     from operators.detection.onnx_detector import OnnxDetector
     from operators.detection.score_filter import ScoreFilter
     from operators.detection.torchvision_detector import TorchvisionDetector, TorchvisionRigDetector
@@ -18,6 +19,7 @@ else:
             "box_segmenter": ("BoxSegmenter",),
             "custom_detector": ("CustomDetector",),
             "drawing": ("draw_detections",),
+            "keypoint_detector": ("KeypointDetector",),
             "onnx_detector": ("OnnxDetector",),
             "score_filter": ("ScoreFilter",),
             "torchvision_detector": ("TorchvisionRigDetector", "TorchvisionDetector"),
@@ -27,6 +29,7 @@ else:
 __all__ = [
     "BoxSegmenter",
     "CustomDetector",
+    "KeypointDetector",
     "OnnxDetector",
     "ScoreFilter",
     "TorchvisionDetector",

@@ -9,6 +9,7 @@ import pytest
 
 from operators.detection.coco import CLASS_LISTS
 from operators.detection.decoders import LAYOUTS
+from operators.detection.keypoints import KEYPOINT_LAYOUTS
 from operators.inference import ModelError
 from operators.models.registry import Model, Registry
 
@@ -46,7 +47,7 @@ def test_every_row_fits_its_operator(model: Model) -> None:
     given = {name for name, field in fields.items() if field.default is None or model.source.torchvision is not None}
     assert model.params.keys() <= given
     if "decoder" in model.params:
-        assert model.params["decoder"] in (*LAYOUTS, "grid")
+        assert model.params["decoder"] in (*LAYOUTS, *KEYPOINT_LAYOUTS, "grid")
     if isinstance(model.classes, str):
         assert model.classes in CLASS_LISTS
     assert model.licence.code
