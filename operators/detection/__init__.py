@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from operators.detection.custom_detector import CustomDetector
     from operators.detection.drawing import draw_detections
     from operators.detection.keypoint_detector import KeypointDetector
-    from operators.detection.onnx_detector import OnnxDetector
+    from operators.detection.onnx_detector import OnnxDetector, OnnxRigDetector
     from operators.detection.score_filter import ScoreFilter
     from operators.detection.torchvision_detector import TorchvisionDetector, TorchvisionRigDetector
 else:
@@ -20,7 +20,7 @@ else:
             "custom_detector": ("CustomDetector",),
             "drawing": ("draw_detections",),
             "keypoint_detector": ("KeypointDetector",),
-            "onnx_detector": ("OnnxDetector",),
+            "onnx_detector": ("OnnxRigDetector", "OnnxDetector"),
             "score_filter": ("ScoreFilter",),
             "torchvision_detector": ("TorchvisionRigDetector", "TorchvisionDetector"),
         },
@@ -31,6 +31,7 @@ __all__ = [
     "CustomDetector",
     "KeypointDetector",
     "OnnxDetector",
+    "OnnxRigDetector",
     "ScoreFilter",
     "TorchvisionDetector",
     "TorchvisionRigDetector",

@@ -55,6 +55,7 @@ class ExportedFinder:
             others=2 if self._layout.words else int(self._layout.sized),
         )
         self._feed = self._size_input() if self._layout.sized else {}
+        self._batch = next(each.shape[0] for each in self._session.get_inputs() if each.name == self._input.name)
         self._fit: FitMode = self._layout.fit if fit is None else fit
         self._masks = masks and self._layout.draw is not None
         labels = told(file, self._session.get_modelmeta().custom_metadata_map).labels if names is None else None
@@ -93,14 +94,37 @@ class ExportedFinder:
         """Overlap above which the family's authors drop the weaker box of a class."""
         return self._layout.nms_iou
 
-    def find(self, pixels: NDArray[np.uint8], threshold: float, nms_iou: float, most: int) -> Candidates:
-        """Finds the best `most` objects in an image (H, W, 3), RGB, in its pixels, by falling score.
+    def find_each(
+        self, images: Sequence[NDArray[np.uint8]], threshold: float, nms_iou: float, most: int
+    ) -> list[Candidates]:
+        """Finds the best `most` objects in each image (H, W, 3), RGB, in its pixels, by falling score.
 
-        Raises ModelError where the model's output is not what the decoder reads, or has other classes than names.
+        All images go in at once where the model takes so. Raises ModelError where the model's output is not what the
+        decoder reads, or has other classes than names.
         """
-        fit = Fit.plan(self._fit, (pixels.shape[1], pixels.shape[0]), self._input.size)
-        answers = self._session.run(None, {self._input.name: self._input.tensor(fit.apply(pixels)), **self._feed})
-        outputs = [a.astype(np.float32) if a.dtype == np.float16 else a for a in map(np.asarray, answers)]
+        fits = [Fit.plan(self._fit, (each.shape[1], each.shape[0]), self._input.size) for each in images]
+        tensors = [self._input.tensor(fit.apply(each)) for fit, each in zip(fits, images, strict=True)]
+        answers = self._answers(tensors)
+        return [self._read(each, fit, threshold, nms_iou, most) for each, fit in zip(answers, fits, strict=True)]
+
+    def _answers(self, tensors: Sequence[NDArray[Any]]) -> list[Outputs]:
+        """Returns the outputs for each image, with a batch axis of 1."""
+        count = len(tensors)
+        at_once = count > 1 and not self._feed and not isinstance(self._batch, int)
+        batches = [np.concatenate(tensors)] if at_once else tensors
+        runs = [self._session.run(None, {self._input.name: batch, **self._feed}) for batch in batches]
+        answers = [[a.astype(np.float32) if a.dtype == np.float16 else a for a in map(np.asarray, r)] for r in runs]
+        if not at_once:
+            return list(answers)
+        if any(a.ndim == 0 or len(a) != count for a in answers[0]):
+            shapes = ", ".join(str(a.shape) for a in answers[0])
+            raise ModelError(
+                f"{self._file} was given {count} images and answered {shapes}, which cannot be told apart by image; "
+                f"export it for one image at a time"
+            )
+        return [[a[k : k + 1] for a in answers[0]] for k in range(count)]
+
+    def _read(self, outputs: Outputs, fit: Fit, threshold: float, nms_iou: float, most: int) -> Candidates:
         try:
             found = self._layout.decode(outputs, self._input.size, threshold)
         except ValueError as error:

@@ -33,12 +33,13 @@ class Used:
         return self.default(name, default) if given is None else given
 
 
-def use_model(operator: Operator, given: str) -> Used:
+def use_model(operator: Operator, given: str, kind: str | None = None) -> Used:
     """Returns the file of a model for an operator, and notes its digest under the name or path that was given.
 
     A file of a row is known by its digest, wherever it lies; the digest of the row's parameters and classes is noted
-    beside it, under `NAME (row)`. Raises FileNotFoundError for a missing file, with how to get it, and ModelError for a
-    name of no row, a row that is for another operator, or a file in the cache that is not its row's.
+    beside it, under `NAME (row)`. A row is for operators of this class, or of the one named `kind`. Raises
+    FileNotFoundError for a missing file, with how to get it, and ModelError for a name of no row, a row that is for
+    another operator, or a file in the cache that is not its row's.
     """
     registry = Registry.load()
     if not names_a_model(given):
@@ -55,7 +56,7 @@ def use_model(operator: Operator, given: str) -> Used:
             raise FileNotFoundError(missing(model))
         file = _right_file(operator, model)
     if model is not None:
-        _check_row(operator, model)
+        _check_row(operator, model, kind or type(operator).__name__)
         row = json.dumps({"params": model.params, "classes": model.classes}, sort_keys=True, default=str)
         operator.files[f"{given} (row)"] = hashlib.sha256(row.encode()).hexdigest()
     return Used(file, model)
@@ -82,14 +83,13 @@ def _right_file(operator: Operator, model: Model) -> Path:
     return file
 
 
-def _check_row(operator: Operator, model: Model) -> None:
-    kind = type(operator)
-    if not model.operator.endswith(f":{kind.__name__}"):
-        raise ModelError(f"{model.name} is run by {model.operator}, not by {kind.__name__}")
-    takes = [name for name, field in kind.spec.parameters.model_fields.items() if field.default is None]
+def _check_row(operator: Operator, model: Model, kind: str) -> None:
+    if not model.operator.endswith(f":{kind}"):
+        raise ModelError(f"{model.name} is run by {model.operator}, not by {kind}")
+    takes = [name for name, field in type(operator).spec.parameters.model_fields.items() if field.default is None]
     if unknown := model.params.keys() - takes:
         raise ModelError(
-            f"the registry's row {model.name} sets {', '.join(sorted(unknown))}, but {kind.__name__} takes only "
+            f"the registry's row {model.name} sets {', '.join(sorted(unknown))}, but {kind} takes only "
             f"{', '.join(takes)} from it"
         )
 
