@@ -1,0 +1,239 @@
+"""Fixes sources of chance in this process, or changes what they give: before any code of an operator is imported.
+
+A fixed source gives the same in every process: clocks go on by a millisecond a call, entropy comes from a counter,
+`id()` numbers the objects that it is asked for, fresh memory has one pattern.
+"""
+
+from __future__ import annotations
+
+import builtins
+import ctypes
+import functools
+import gc
+import itertools
+import os
+import random
+import sys
+import time
+import uuid
+from collections.abc import Callable, Collection
+from datetime import date, datetime, tzinfo
+from typing import Any
+
+import numpy as np
+import xxhash
+from numpy.random import bit_generator
+
+from dataflow.causes.places import Places
+from dataflow.causes.sources import (
+    ENTROPY,
+    FILE,
+    HEAP,
+    IDENTITY,
+    MONOTONIC,
+    NUMPY,
+    PROCESS,
+    RANDOM,
+    THREADS,
+    UUID,
+    VARIABLE,
+    WALL,
+    kind_of,
+    name_of,
+)
+from dataflow.execution.generators import lazy_numpy
+
+TICK_NS = 1_000_000
+LATER_NS = 400 * 86_400 * 10**9 + 3_723 * 10**9
+"""By how much the time of day is changed: more than a year, and neither whole days nor whole hours."""
+FILL = 0x5A
+
+
+class Interventions:
+    """Replaces functions of Python and numpy. `began`: the time of day (ns) that a fixed clock begins with."""
+
+    def __init__(self, places: Places, began: int) -> None:
+        self._places, self._began = places, began
+        self._drawn = itertools.count()
+
+    def fix(self, sources: Collection[str]) -> None:
+        """Makes sources give the same in every process."""
+        for source, install in {
+            WALL: lambda: self._set_clock(self._ticking(self._began)),
+            MONOTONIC: self._fix_monotonic,
+            RANDOM: self._fix_random,
+            NUMPY: self._fix_numpy,
+            UUID: self._fix_identifiers,
+            ENTROPY: self._fix_entropy,
+            IDENTITY: self._fix_identities,
+            PROCESS: lambda: self._replace(os, "getpid", lambda: 4242),
+            THREADS: self._take_turns,
+            HEAP: lambda: self._fill(FILL),
+        }.items():
+            if source in sources:
+                install()
+
+    def vary(self, sources: Collection[str]) -> None:
+        """Makes sources give something else than they do here."""
+        hidden = {name_of(source) for source in sources if kind_of(source) == FILE}
+        if hidden:
+            _hide(hidden)
+        for source in sources:
+            if kind_of(source) == VARIABLE:
+                os.environ[name_of(source)] = changed(os.environ.get(name_of(source)))
+        if WALL in sources:
+            real = time.time_ns
+            self._set_clock(lambda: real() + LATER_NS)
+        if HEAP in sources:
+            self._fill(FILL)
+
+    def _replace(self, module: Any, name: str, value: Callable[..., Any]) -> None:
+        """Has all code but the engine and the standard library get `value` from a function."""
+        real = getattr(module, name)
+
+        @functools.wraps(real)
+        def replaced(*args: Any, **kwargs: Any) -> Any:
+            return (real if self._places.passes(sys._getframe(1)) else value)(*args, **kwargs)
+
+        setattr(module, name, replaced)
+
+    def _ticking(self, start: int) -> Callable[[], int]:
+        count = itertools.count(start, TICK_NS)
+        return lambda: next(count)
+
+    def _set_clock(self, now: Callable[[], int]) -> None:
+        real, set_wall = time.clock_gettime_ns, time.CLOCK_REALTIME
+        self._replace(time, "time_ns", now)
+        self._replace(time, "time", lambda: now() / 1e9)
+        for name in ("localtime", "gmtime", "ctime"):
+            self._replace(time, name, _at(getattr(time, name), now))
+        strftime, localtime = time.strftime, time.localtime
+        self._replace(time, "strftime", lambda form, at=None: strftime(form, at or localtime(now() / 1e9)))
+        self._replace(time, "clock_gettime_ns", lambda clock: now() if clock == set_wall else real(clock))
+        self._replace(time, "clock_gettime", lambda clock: (now() if clock == set_wall else real(clock)) / 1e9)
+        self._set_dates(now)
+
+    def _set_dates(self, now: Callable[[], int]) -> None:
+        """Replaces the methods of `datetime` itself: it may be imported by name, and compared by type."""
+        passes = self._places.passes
+        plain_now, plain_today, plain_utcnow = datetime.now, date.today, datetime.utcnow
+
+        def current(cls: type[datetime], tz: tzinfo | None = None) -> datetime:
+            return plain_now(tz) if passes(sys._getframe(1)) else cls.fromtimestamp(now() / 1e9, tz)
+
+        def today(cls: type[date]) -> date:
+            return plain_today() if passes(sys._getframe(1)) else cls.fromtimestamp(now() / 1e9)
+
+        def utcnow(cls: type[datetime]) -> datetime:
+            return plain_utcnow() if passes(sys._getframe(1)) else cls.utcfromtimestamp(now() / 1e9)
+
+        methods = {datetime: {"now": current, "today": today, "utcnow": utcnow}, date: {"today": today}}
+        for cls, replaced in methods.items():
+            gc.get_referents(vars(cls))[0].update({n: classmethod(f) for n, f in replaced.items()})
+            ctypes.pythonapi.PyType_Modified(ctypes.py_object(cls))
+
+    def _fix_monotonic(self) -> None:
+        now = self._ticking(10**12)
+        for name in ("monotonic", "perf_counter", "process_time", "thread_time"):
+            self._replace(time, f"{name}_ns", now)
+            self._replace(time, name, lambda: now() / 1e9)
+
+    def _fix_random(self) -> None:
+        seed = random.Random.seed
+
+        def fixed(self: random.Random, a: Any = None, version: int = 2) -> None:
+            seed(self, 0 if a is None else a, version)
+
+        random.Random.seed = fixed  # type: ignore[method-assign]
+        random.seed = functools.partial(fixed, random._inst)
+        random.seed(0)
+
+    def _fix_numpy(self) -> None:
+        bit_generator.randbits = lambda bits: int.from_bytes(self._bytes((bits + 7) // 8)) >> -bits % 8
+        lazy_numpy.seed_lazily(0)
+
+    def _fix_identifiers(self) -> None:
+        for name in ("uuid1", "uuid4"):
+            setattr(uuid, name, lambda *_: uuid.UUID(bytes=self._bytes(16), version=4))
+
+    def _fix_entropy(self) -> None:
+        urandom, generates = os.urandom, getattr(bit_generator.randbits, "__self__", self)
+
+        def fixed(size: int) -> bytes:
+            frame = sys._getframe(1)  # identifiers and numpy's generators are sources by themselves
+            apart = frame.f_globals.get("__name__") == "uuid" or frame.f_locals.get("self", 0) is generates
+            return urandom(size) if apart else self._bytes(size)
+
+        os.urandom = fixed
+        os.getrandom = lambda size, flags=0: self._bytes(size)
+        random._urandom = fixed  # type: ignore[attr-defined]
+
+    def _bytes(self, size: int) -> bytes:
+        number = next(self._drawn)
+        blocks = [xxhash.xxh3_128_digest(f"{number}/{k}") for k in range(size // 16 + 1)]
+        return b"".join(blocks)[:size]
+
+    def _fix_identities(self) -> None:
+        real, kept = builtins.id, dict[int, tuple[int, object]]()
+
+        def numbered(thing: object) -> int:
+            if self._places.of(sys._getframe(1).f_code) != "own":
+                return real(thing)
+            return kept.setdefault(real(thing), (4096 + 16 * len(kept), thing))[0]
+
+        builtins.id = numbered
+
+    def _take_turns(self) -> None:
+        """Lets one thread run until it waits or ends, on one core; sleeps of operators are left out."""
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+        sys.setswitchinterval(1000.0)
+        sleep = time.sleep
+        self._replace(time, "sleep", lambda seconds: sleep(0))
+
+    def _fill(self, pattern: int) -> None:
+        for name in ("empty", "empty_like"):
+            setattr(np, name, _filled(getattr(np, name), pattern))
+
+
+def _at(real: Callable[..., Any], now: Callable[[], int]) -> Callable[..., Any]:
+    return lambda seconds=None: real(now() / 1e9 if seconds is None else seconds)
+
+
+def _filled(make: Callable[..., Any], pattern: int) -> Callable[..., Any]:
+    @functools.wraps(make)
+    def filled(*args: Any, **kwargs: Any) -> Any:
+        array = make(*args, **kwargs)
+        if isinstance(array, np.ndarray) and not array.dtype.hasobject:
+            ctypes.memset(array.ctypes.data, pattern, array.nbytes)
+        return array
+
+    return filled
+
+
+def _hide(paths: Collection[str]) -> None:
+    def refuse(event: str, args: tuple[Any, ...]) -> None:
+        if event == "open" and isinstance(args[0], str | bytes):
+            path = os.path.abspath(os.fsdecode(args[0]))
+            if path in paths:
+                raise FileNotFoundError(2, "hidden by --why", path)
+
+    sys.addaudithook(refuse)
+
+
+def changed(value: str | None) -> str:
+    """Returns another value of an environment variable: another number, another word, or 1 where it has none.
+
+    The path of a file that exists stays: what is in that file matters, and is asked for itself.
+    """
+    if value is None:
+        return "1"
+    if os.path.exists(value):
+        return value
+    try:
+        return str(int(value) + 1)
+    except ValueError:
+        pass
+    try:
+        return repr(float(value) + 1.0)
+    except ValueError:
+        return f"{value}_"
