@@ -83,7 +83,7 @@ def faulty(folder: Path, names: list[str]) -> Iterator[tuple[str, Why]]:
     """Records and verifies faulty operators; asks about each."""
     gain = folder / "gain.txt"
     gain.write_text("1.5")
-    uses = {name: f"use: 'zoo.faulty:{name}'" for name in ["Leaves", *names]}
+    uses = {n: f"use: 'zoo.{'loaded' if n == 'Loaded' else 'faulty'}:{n}'" for n in ["Leaves", *names]}
     uses["FromFile"] = f"use: 'zoo.faulty:FromFile', params: {{path: '{gain}'}}"
     paths = recorded(folder, {"before": uses["Leaves"], **uses})
     gain.write_text("2.5")

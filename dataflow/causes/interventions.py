@@ -16,6 +16,7 @@ import random
 import sys
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable, Collection
 from datetime import date, datetime, tzinfo
 from typing import Any
@@ -41,6 +42,7 @@ from dataflow.causes.sources import (
     kind_of,
     name_of,
 )
+from dataflow.causes.traps import ForNumpy
 from dataflow.execution.generators import lazy_numpy
 
 TICK_NS = 1_000_000
@@ -54,10 +56,11 @@ class Interventions:
 
     def __init__(self, places: Places, began: int) -> None:
         self._places, self._began = places, began
-        self._drawn = itertools.count()
+        self._drawn = Counter[str]()
 
     def fix(self, sources: Collection[str]) -> None:
         """Makes sources give the same in every process."""
+        ForNumpy.install()
         for source, install in {
             WALL: lambda: self._set_clock(self._ticking(self._began)),
             MONOTONIC: self._fix_monotonic,
@@ -149,28 +152,29 @@ class Interventions:
         random.seed(0)
 
     def _fix_numpy(self) -> None:
-        bit_generator.randbits = lambda bits: int.from_bytes(self._bytes((bits + 7) // 8)) >> -bits % 8
+        bit_generator.randbits = lambda bits: int.from_bytes(self._bytes(NUMPY, (bits + 7) // 8)) >> -bits % 8
         lazy_numpy.seed_lazily(0)
 
     def _fix_identifiers(self) -> None:
         for name in ("uuid1", "uuid4"):
-            setattr(uuid, name, lambda *_: uuid.UUID(bytes=self._bytes(16), version=4))
+            setattr(uuid, name, lambda *_: uuid.UUID(bytes=self._bytes(UUID, 16), version=4))
 
     def _fix_entropy(self) -> None:
-        urandom, generates = os.urandom, getattr(bit_generator.randbits, "__self__", self)
+        urandom = os.urandom
 
         def fixed(size: int) -> bytes:
             frame = sys._getframe(1)  # identifiers and numpy's generators are sources by themselves
-            apart = frame.f_globals.get("__name__") == "uuid" or frame.f_locals.get("self", 0) is generates
-            return urandom(size) if apart else self._bytes(size)
+            apart = frame.f_globals.get("__name__") == "uuid" or isinstance(frame.f_locals.get("self"), ForNumpy)
+            return urandom(size) if apart else self._bytes(ENTROPY, size)
 
         os.urandom = fixed
-        os.getrandom = lambda size, flags=0: self._bytes(size)
+        os.getrandom = lambda size, flags=0: self._bytes(ENTROPY, size)
         random._urandom = fixed  # type: ignore[attr-defined]
 
-    def _bytes(self, size: int) -> bytes:
-        number = next(self._drawn)
-        blocks = [xxhash.xxh3_128_digest(f"{number}/{k}") for k in range(size // 16 + 1)]
+    def _bytes(self, source: str, size: int) -> bytes:
+        """Returns the next bytes for a source: what others draw must not change them."""
+        self._drawn[source] += 1
+        blocks = [xxhash.xxh3_128_digest(f"{source}/{self._drawn[source]}/{k}".encode()) for k in range(size // 16 + 1)]
         return b"".join(blocks)[:size]
 
     def _fix_identities(self) -> None:

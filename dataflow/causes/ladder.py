@@ -97,17 +97,16 @@ class Ladder:
             if made.same(base):
                 found.settled = True
                 return None
-            if found.settled is None:
-                found.settled = self._fire(Setting(fixed)).same(base)
             return made
 
         def confirmed(source: str, made: Rerun) -> bool:
-            """Several threads may make the same each time, and yet not the same as one: that is no cause."""
-            return source != THREADS or not self._fire(Setting(fixed - {THREADS})).same(made)
+            """Nothing is a cause as long as the operator does not repeat with all sources fixed. Several threads may
+            make the same each time, and yet not the same as one: that is no cause, either."""
+            if found.settled is None:
+                found.settled = self._fire(Setting(fixed)).same(base)
+            return found.settled and (source != THREADS or not self._fire(Setting(fixed - {THREADS})).same(made))
 
         self._search(found, [unseen, *([s] for s in trapped)], effect, confirmed)
-        if found.settled is False:
-            found.causes.clear()
 
     def _find_varied(self, found: Findings, base: Rerun) -> None:
         seen = dict.fromkeys(source for source, _, _ in found.first.sites)
@@ -142,7 +141,7 @@ class Ladder:
                     left[1:1] = [_Group(sources[:half]), _Group(sources[half:], tuple(sources[:half]))]
                 elif made is None or confirmed(sources[0], made):
                     found.causes.append(sources[0])
-                else:
+                elif found.settled is not False:
                     found.cleared.append(sources[0])
             except _SpentError:
                 found.open = [tuple(group.sources) for group in left]

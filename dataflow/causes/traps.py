@@ -58,8 +58,15 @@ _BUILT_IN: dict[str, tuple[str | None, str]] = {
 }
 """By qualified name of a built-in function: its module (None for methods), and the source that it reads."""
 _ZONED = ("localtime", "strftime", "ctime", "mktime", "datetime.now", "datetime.today", "date.today")
-_GENERATES = bit_generator.randbits.__self__
-"""Gives the entropy for numpy's generators that are made without a seed."""
+
+
+class ForNumpy(random.SystemRandom):
+    """Gives the entropy for numpy's generators that are made without a seed, and for nothing else."""
+
+    @staticmethod
+    def install() -> None:
+        """Has numpy ask it rather than a generator that it shares with `secrets`."""
+        bit_generator.randbits = ForNumpy().getrandbits
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +100,7 @@ class Traps:
 
     def set(self) -> None:
         """Begins to log, in this thread and in those to come."""
+        ForNumpy.install()
         lazy_numpy.seed_lazily(random.SystemRandom().getrandbits(32))  # its lock shows who draws
         sys.addaudithook(self._opened)
         threading.setprofile(self._called)
@@ -123,7 +131,7 @@ class Traps:
         if source is VARIABLE:
             self._note(named(VARIABLE, os.fsdecode(local["key"])), f"os.environ[{local['key']!r}]", frame.f_back)
         elif source is ENTROPY:
-            if local["self"] is _GENERATES:
+            if isinstance(local["self"], ForNumpy):
                 self._note(NUMPY, "a generator without a seed", frame.f_back)
         elif source is not NUMPY or self._unseeded():
             call = {THREADS: "Thread.start", NUMPY: "np.random"}.get(source, f"uuid.{frame.f_code.co_name}")
@@ -138,7 +146,7 @@ class Traps:
             elif arg.__self__ is not random._inst or not self._unseeded():
                 return
         elif source is ENTROPY:
-            if frame.f_locals.get("self") is _GENERATES or frame.f_globals.get("__name__") == "uuid":
+            if isinstance(frame.f_locals.get("self"), ForNumpy) or frame.f_globals.get("__name__") == "uuid":
                 return  # noted as numpy's, or as an identifier
         elif source in (IDENTITY, HEAP) and not direct:
             return
@@ -171,7 +179,7 @@ class Traps:
         own, inside = led
         if inside is not None:
             module = inside.f_globals.get("__name__", "")
-            if kind_of(source) == VARIABLE and module not in ("os", "_collections_abc"):
+            if kind_of(source) == VARIABLE and module not in ("os", "collections.abc"):
                 return  # what subprocess, tempfile and others look up for themselves
             call = f"{module}.{inside.f_code.co_qualname} → {call}"
         self.counts[source, Site(own.f_code.co_filename, own.f_lineno, own.f_code.co_name, call)] += 1

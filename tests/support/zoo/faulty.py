@@ -18,7 +18,6 @@ from dataflow.operator import Param
 from zoo.operators import Hard
 
 SEEN = {"n": 0}
-OFFSET = random.random()
 
 
 class Day(Hard):
@@ -69,13 +68,6 @@ class Reseeded(Hard):
 
     def work(self, x: FeatureVector) -> float:
         return self.mine.gauss(0, 1)
-
-
-class Loaded(Hard):
-    """Adds what its module drew while it was loaded."""
-
-    def work(self, x: FeatureVector) -> float:
-        return OFFSET
 
 
 class Numpy(Hard):
