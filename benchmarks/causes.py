@@ -1,10 +1,11 @@
 """Does `verify --why` find the causes in operators that do not repeat, and none in those that do? Prints a table.
 
-python benchmarks/causes.py [--only WORD ...] [--sound]
+python benchmarks/causes.py [--only OPERATOR ...] [--sound | --wild]
 
 A zoo of faulty operators is recorded by one process and verified by others, where a file and a variable of the
 environment have changed. With `--sound`, the operators of `tests/support/zoo` that repeat are asked about as if they
-did not, and as if they differed alike each time: no cause may be named. Exit code 1 if an answer is wrong.
+did not, and as if they differed alike each time: no cause may be named. With `--wild`, registrations of kiss-icp,
+small_gicp and Open3D are asked about, as far as these are installed. Exit code 1 if an answer is wrong.
 """
 
 from __future__ import annotations
@@ -52,9 +53,15 @@ FAULTY = {
     "ClockAndMemory": {sources.WALL, sources.HEAP},
 }
 """The kinds of causes of each operator of `zoo.faulty`."""
+WILD = {
+    f"{library}{threads}": f"use: 'causes_operators:{library}', params: {{threads: {threads}}}"
+    for library in ("KissIcp", "SmallGicp", "Open3dIcp")
+    for threads in (1, 4)
+}
+"""Registrations by name: class, and number of threads."""
 RUN = """
 import sys
-sys.path.append({support!r})
+sys.path += {folders!r}
 import dataflow
 from dataflow.graph import load_text
 for path, text in {runs!r}.items():
@@ -74,7 +81,7 @@ def recorded(folder: Path, operators: dict[str, str]) -> dict[str, Path]:
         lines = ["graph: zoo", "operators:", "  src: {use: 'zoo.operators:Steps', params: {steps: 12}}"]
         runs[str(paths[name])] = "\n".join([*lines, f"  {name}: {{{use}, inputs: {{x: src/out}}}}"])
     environment = {**os.environ, "PYTHONHASHSEED": "7", "ZOO_GAIN": "2"}
-    program = [sys.executable, "-c", RUN.format(support=str(SUPPORT), runs=runs)]
+    program = [sys.executable, "-c", RUN.format(folders=[str(SUPPORT), str(REPOSITORY / "benchmarks")], runs=runs)]
     subprocess.run(program, check=True, env=environment, timeout=300, cwd=folder)
     return paths
 
@@ -100,6 +107,12 @@ def sound(folder: Path, names: list[str]) -> Iterator[tuple[str, Why]]:
             yield f"{name}, {'repeats' if repeats else 'does not'}", found
 
 
+def wild(folder: Path, names: list[str]) -> Iterator[tuple[str, Why]]:
+    """Records and verifies registrations; asks about each. The answer is not known beforehand."""
+    paths = recorded(folder, {name: WILD[name] for name in names})
+    yield from ((name, why(path, verify(path), name)) for name, path in paths.items())
+
+
 def accused(report: VerifyReport, name: str, repeats: bool) -> VerifyReport:
     """The report of a verification in which an operator differs in its first call."""
     first = Difference(0, "fire", 0, "out", "", "")
@@ -110,24 +123,28 @@ def accused(report: VerifyReport, name: str, repeats: bool) -> VerifyReport:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", default=[], help="operators by name")
-    parser.add_argument("--sound", action="store_true", help="ask about operators that repeat")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--sound", action="store_true", help="ask about operators that repeat")
+    which.add_argument("--wild", action="store_true", help="ask about registrations by other libraries")
     chosen = parser.parse_args()
-    able = [*REPEATS, "Sound"] if chosen.sound else list(FAULTY)
+    ask, able = (wild, list(WILD)) if chosen.wild else (faulty, list(FAULTY))
+    if chosen.sound:
+        ask, able = sound, [*REPEATS, "Sound"]
     names = [name for name in able if not chosen.only or name in chosen.only]
     print("| operator | causes | line | re-runs | seconds |\n| --- | --- | --- | ---: | ---: |")
     wrong = total = 0
     with tempfile.TemporaryDirectory() as folder:
-        for name, found in (sound if chosen.sound else faulty)(Path(folder), names):
-            right = set() if chosen.sound else FAULTY[name]
+        for name, found in ask(Path(folder), names):
+            right = {c.kind for c in found.causes} if chosen.wild else FAULTY.get(name, set())
             lines = [f"{Path(c.sites[0].file).name}:{c.sites[0].line}" for c in found.causes if c.sites]
             pointed = all(c.sites or c.kind in UNTRAPPED for c in found.causes)
-            mistaken = {c.kind for c in found.causes} != right or not pointed or bool(found.refused)
+            mistaken = {c.kind for c in found.causes} != right or not pointed or bool(found.refused and not chosen.wild)
             wrong, total = wrong + mistaken, total + 1
             said = found.refused or ", ".join(c.what for c in found.causes) or "–"
             cells = (f"{'! ' if mistaken else ''}{name}", said.replace(folder, "…"), ", ".join(lines), found.reruns)
             print("|", " | ".join(map(str, cells)), f"| {found.seconds:.1f} |", flush=True)
-            for group in found.open:
-                print(f"open: {group}", file=sys.stderr)
+            if found.open or found.settled is False:
+                print(f"{name}: settled {found.settled}, open {found.open}", file=sys.stderr)
     print(f"\n{total - wrong} of {total} answers are right")
     return int(wrong > 0)
 

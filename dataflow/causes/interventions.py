@@ -14,11 +14,14 @@ import itertools
 import os
 import random
 import sys
+import threading
 import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
 from datetime import date, datetime, tzinfo
+from multiprocessing.pool import ThreadPool
 from typing import Any
 
 import numpy as np
@@ -46,9 +49,11 @@ from dataflow.causes.traps import ForNumpy
 from dataflow.execution.generators import lazy_numpy
 
 TICK_NS = 1_000_000
+TURN = 0.2
+"""Seconds for which a thread is waited for where it starts."""
 LATER_NS = 400 * 86_400 * 10**9 + 3_723 * 10**9
 """By how much the time of day is changed: more than a year, and neither whole days nor whole hours."""
-FILL = 0x5A
+FILL, OTHER_FILL = 0x5A, 0xA7
 
 
 class Interventions:
@@ -56,25 +61,24 @@ class Interventions:
 
     def __init__(self, places: Places, began: int) -> None:
         self._places, self._began = places, began
+        self._fixed: frozenset[str] = frozenset()
         self._drawn = Counter[str]()
 
     def fix(self, sources: Collection[str]) -> None:
-        """Makes sources give the same in every process."""
+        """Makes sources give the same in every process. The others are replaced, too, by what gives their real values:
+        so memory is laid out alike whatever is fixed, and addresses change with their own source alone."""
+        self._fixed = frozenset(sources)
         ForNumpy.install()
-        for source, install in {
-            WALL: lambda: self._set_clock(self._ticking(self._began)),
-            MONOTONIC: self._fix_monotonic,
-            RANDOM: self._fix_random,
-            NUMPY: self._fix_numpy,
-            UUID: self._fix_identifiers,
-            ENTROPY: self._fix_entropy,
-            IDENTITY: self._fix_identities,
-            PROCESS: lambda: self._replace(os, "getpid", lambda: 4242),
-            THREADS: self._take_turns,
-            HEAP: lambda: self._fill(FILL),
-        }.items():
-            if source in sources:
-                install()
+        self._set_clock(self._ticking(self._began), lambda: WALL in self._fixed)
+        self._fix_monotonic()
+        self._fix_random()
+        self._fix_numpy()
+        self._fix_identifiers()
+        self._fix_entropy()
+        self._fix_identities()
+        self._replace(os, "getpid", lambda: 4242, lambda: PROCESS in self._fixed)
+        self._take_turns()
+        self._fill(FILL if HEAP in self._fixed else OTHER_FILL)
 
     def vary(self, sources: Collection[str]) -> None:
         """Makes sources give something else than they do here."""
@@ -86,17 +90,17 @@ class Interventions:
                 os.environ[name_of(source)] = changed(os.environ.get(name_of(source)))
         if WALL in sources:
             real = time.time_ns
-            self._set_clock(lambda: real() + LATER_NS)
-        if HEAP in sources:
-            self._fill(FILL)
+            self._set_clock(lambda: real() + LATER_NS, lambda: True)
+        if HEAP in sources and not self._fixed:
+            self._fill(OTHER_FILL)
 
-    def _replace(self, module: Any, name: str, value: Callable[..., Any]) -> None:
-        """Has all code but the engine and the standard library get `value` from a function."""
+    def _replace(self, module: Any, name: str, value: Callable[..., Any], on: Callable[[], bool]) -> None:
+        """Has all code but the engine and the standard library get `value` from a function, while it is `on`."""
         real = getattr(module, name)
 
         @functools.wraps(real)
         def replaced(*args: Any, **kwargs: Any) -> Any:
-            return (real if self._places.passes(sys._getframe(1)) else value)(*args, **kwargs)
+            return (value if on() and not self._places.passes(sys._getframe(1)) else real)(*args, **kwargs)
 
         setattr(module, name, replaced)
 
@@ -104,31 +108,35 @@ class Interventions:
         count = itertools.count(start, TICK_NS)
         return lambda: next(count)
 
-    def _set_clock(self, now: Callable[[], int]) -> None:
-        real, set_wall = time.clock_gettime_ns, time.CLOCK_REALTIME
-        self._replace(time, "time_ns", now)
-        self._replace(time, "time", lambda: now() / 1e9)
-        for name in ("localtime", "gmtime", "ctime"):
-            self._replace(time, name, _at(getattr(time, name), now))
+    def _set_clock(self, now: Callable[[], int], on: Callable[[], bool]) -> None:
+        real, of_day = time.clock_gettime_ns, time.CLOCK_REALTIME
         strftime, localtime = time.strftime, time.localtime
-        self._replace(time, "strftime", lambda form, at=None: strftime(form, at or localtime(now() / 1e9)))
-        self._replace(time, "clock_gettime_ns", lambda clock: now() if clock == set_wall else real(clock))
-        self._replace(time, "clock_gettime", lambda clock: (now() if clock == set_wall else real(clock)) / 1e9)
-        self._set_dates(now)
+        for name, value in {
+            "time_ns": now,
+            "time": lambda: now() / 1e9,
+            **{name: _at(getattr(time, name), now) for name in ("localtime", "gmtime", "ctime")},
+            "strftime": lambda form, at=None: strftime(form, at or localtime(now() / 1e9)),
+            "clock_gettime_ns": lambda clock: now() if clock == of_day else real(clock),
+            "clock_gettime": lambda clock: (now() if clock == of_day else real(clock)) / 1e9,
+        }.items():
+            self._replace(time, name, value, on)
+        self._set_dates(now, on)
 
-    def _set_dates(self, now: Callable[[], int]) -> None:
+    def _set_dates(self, now: Callable[[], int], on: Callable[[], bool]) -> None:
         """Replaces the methods of `datetime` itself: it may be imported by name, and compared by type."""
-        passes = self._places.passes
-        plain_now, plain_today, plain_utcnow = datetime.now, date.today, datetime.utcnow
+        real_now, real_today, real_utcnow = datetime.now, date.today, datetime.utcnow
+
+        def free() -> bool:
+            return not on() or self._places.passes(sys._getframe(2))
 
         def current(cls: type[datetime], tz: tzinfo | None = None) -> datetime:
-            return plain_now(tz) if passes(sys._getframe(1)) else cls.fromtimestamp(now() / 1e9, tz)
+            return real_now(tz) if free() else cls.fromtimestamp(now() / 1e9, tz)
 
         def today(cls: type[date]) -> date:
-            return plain_today() if passes(sys._getframe(1)) else cls.fromtimestamp(now() / 1e9)
+            return real_today() if free() else cls.fromtimestamp(now() / 1e9)
 
         def utcnow(cls: type[datetime]) -> datetime:
-            return plain_utcnow() if passes(sys._getframe(1)) else cls.utcfromtimestamp(now() / 1e9)
+            return real_utcnow() if free() else cls.utcfromtimestamp(now() / 1e9)
 
         methods = {datetime: {"now": current, "today": today, "utcnow": utcnow}, date: {"today": today}}
         for cls, replaced in methods.items():
@@ -138,37 +146,51 @@ class Interventions:
     def _fix_monotonic(self) -> None:
         now = self._ticking(10**12)
         for name in ("monotonic", "perf_counter", "process_time", "thread_time"):
-            self._replace(time, f"{name}_ns", now)
-            self._replace(time, name, lambda: now() / 1e9)
+            self._replace(time, f"{name}_ns", now, lambda: MONOTONIC in self._fixed)
+            self._replace(time, name, lambda: now() / 1e9, lambda: MONOTONIC in self._fixed)
 
     def _fix_random(self) -> None:
         seed = random.Random.seed
 
         def fixed(self: random.Random, a: Any = None, version: int = 2) -> None:
-            seed(self, 0 if a is None else a, version)
+            seed(self, default if a is None else a, version)
 
+        default = 0 if RANDOM in self._fixed else None
         random.Random.seed = fixed  # type: ignore[method-assign]
         random.seed = functools.partial(fixed, random._inst)
-        random.seed(0)
+        random.seed()
 
     def _fix_numpy(self) -> None:
-        bit_generator.randbits = lambda bits: int.from_bytes(self._bytes(NUMPY, (bits + 7) // 8)) >> -bits % 8
-        lazy_numpy.seed_lazily(0)
+        real = bit_generator.randbits
+
+        def fixed(bits: int) -> int:
+            if NUMPY not in self._fixed:
+                return int(real(bits))
+            return int.from_bytes(self._bytes(NUMPY, (bits + 7) // 8)) >> -bits % 8
+
+        bit_generator.randbits = fixed
+        lazy_numpy.seed_lazily(fixed(32))
 
     def _fix_identifiers(self) -> None:
         for name in ("uuid1", "uuid4"):
-            setattr(uuid, name, lambda *_: uuid.UUID(bytes=self._bytes(UUID, 16), version=4))
+            real = getattr(uuid, name)
+            fixed = functools.partial(self._identifier, real)
+            setattr(uuid, name, fixed)
+
+    def _identifier(self, real: Callable[..., uuid.UUID], *args: Any, **kwargs: Any) -> uuid.UUID:
+        fixed = UUID in self._fixed
+        return uuid.UUID(bytes=self._bytes(UUID, 16), version=4) if fixed else real(*args, **kwargs)
 
     def _fix_entropy(self) -> None:
-        urandom = os.urandom
+        urandom, getrandom = os.urandom, os.getrandom
 
         def fixed(size: int) -> bytes:
             frame = sys._getframe(1)  # identifiers and numpy's generators are sources by themselves
             apart = frame.f_globals.get("__name__") == "uuid" or isinstance(frame.f_locals.get("self"), ForNumpy)
-            return urandom(size) if apart else self._bytes(ENTROPY, size)
+            return urandom(size) if apart or ENTROPY not in self._fixed else self._bytes(ENTROPY, size)
 
         os.urandom = fixed
-        os.getrandom = lambda size, flags=0: self._bytes(ENTROPY, size)
+        os.getrandom = lambda size, flags=0: fixed(size) if ENTROPY in self._fixed else getrandom(size, flags)
         random._urandom = fixed  # type: ignore[attr-defined]
 
     def _bytes(self, source: str, size: int) -> bytes:
@@ -181,18 +203,34 @@ class Interventions:
         real, kept = builtins.id, dict[int, tuple[int, object]]()
 
         def numbered(thing: object) -> int:
-            if self._places.of(sys._getframe(1).f_code) != "own":
+            if IDENTITY not in self._fixed or self._places.of(sys._getframe(1).f_code) != "own":
                 return real(thing)
             return kept.setdefault(real(thing), (4096 + 16 * len(kept), thing))[0]
 
         builtins.id = numbered
 
     def _take_turns(self) -> None:
-        """Lets one thread run until it waits or ends, on one core; sleeps of operators are left out."""
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-        sys.setswitchinterval(1000.0)
-        sleep = time.sleep
-        self._replace(time, "sleep", lambda seconds: sleep(0))
+        """Has one thread run at a time: on one core, pools have one, and others are waited for where they start."""
+        if THREADS in self._fixed:
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+        start, passes = threading.Thread.start, self._places.passes
+
+        def started(thread: threading.Thread) -> None:
+            start(thread)
+            if THREADS in self._fixed and not passes(sys._getframe(1)):
+                thread.join(TURN)
+
+        threading.Thread.start = started  # type: ignore[method-assign]
+        for pool in (ThreadPoolExecutor, ThreadPool):
+            pool.__init__ = self._of_one(pool.__init__)  # type: ignore[misc, method-assign]
+
+    def _of_one(self, make: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(make)
+        def made(pool: Any, workers: int | None = None, *args: Any, **kwargs: Any) -> None:
+            given = [kwargs.pop(name, None) for name in ("max_workers", "processes")]
+            make(pool, 1 if THREADS in self._fixed else workers or given[0] or given[1], *args, **kwargs)
+
+        return made
 
     def _fill(self, pattern: int) -> None:
         for name in ("empty", "empty_like"):
@@ -225,12 +263,12 @@ def _hide(paths: Collection[str]) -> None:
 
 
 def changed(value: str | None) -> str:
-    """Returns another value of an environment variable: another number, another word, or 1 where it has none.
+    """Returns another value of an environment variable: another number, another word, or 7 where it has none.
 
     The path of a file that exists stays: what is in that file matters, and is asked for itself.
     """
     if value is None:
-        return "1"
+        return "7"
     if os.path.exists(value):
         return value
     try:

@@ -31,6 +31,9 @@ from dataflow.supervision.core.report import RunFailed
 MOST = 8
 """Re-runs of one operator."""
 
+_MOVED = frozenset({HEAP, COMPILED})
+"""Sources that are changed where others are left free, since that keeps the addresses of all objects."""
+
 Fire = Callable[[Setting], Rerun]
 
 
@@ -93,7 +96,7 @@ class Ladder:
         trapped = [s for s in CHANCE if s in fixed & seen]
 
         def effect(group: Sequence[str]) -> Rerun | None:
-            made = self._tried(Setting(fixed.difference(group)))
+            made = self._tried(Setting(fixed.difference(group), _MOVED.intersection(group)))
             if made.same(base):
                 found.settled = True
                 return None

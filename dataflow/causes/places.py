@@ -11,7 +11,7 @@ from types import CodeType, FrameType
 
 _ENGINE = str(Path(__file__).parent.parent)
 _PATHS = sysconfig.get_paths()
-_LIBRARIES = tuple({_PATHS["purelib"], _PATHS["platlib"]})
+_LIBRARIES = ("/site-packages/", "/dist-packages/")
 _STANDARD = tuple({_PATHS["stdlib"], _PATHS["platstdlib"]})
 
 
@@ -39,7 +39,7 @@ class Places:
             return "own"
         if file.startswith(_ENGINE):
             return "engine"
-        if file.startswith(_LIBRARIES):
+        if any(folder in file for folder in _LIBRARIES):
             return "library"
         return "standard" if file.startswith((*_STANDARD, "<")) else "own"
 

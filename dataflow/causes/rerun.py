@@ -18,7 +18,7 @@ from typing import Any
 
 from dataflow.causes.interventions import Interventions
 from dataflow.causes.places import Places
-from dataflow.causes.sources import ADDRESSES, COMPILED, HASHES, HEAP, INPUT, LOCALE, MODULE, THREADS
+from dataflow.causes.sources import ADDRESSES, COMPILED, HASHES, HEAP, INPUT, LOCALE, MODULE, SOURCES, THREADS
 from dataflow.causes.traps import Site, Traps
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.judge import Judge
@@ -31,8 +31,10 @@ from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.verification.workers.board import Board
 
-_PATTERN = "90"
+_PATTERN, _OTHER_PATTERN = "90", "85"
 """Of `MALLOC_PERTURB_`: glibc fills fresh memory with its complement."""
+_MOMENT, _OTHER_MOMENT = "2026-01-02 03:04:05", "2027-10-11 12:13:14"
+"""Of libfaketime. Variables of one length keep the addresses of all that follows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +51,10 @@ class Setting:
         """Returns the variables of its process, besides those of every worker."""
         found: dict[str, str] = {}
         if HEAP in self.fixed | self.varied:
-            found["MALLOC_PERTURB_"] = _PATTERN
-        if COMPILED in self.fixed and (library := fake_time()):
-            found |= {"LD_PRELOAD": library, "FAKETIME": "2026-01-02 03:04:05", "DONT_FAKE_MONOTONIC": "1"}
+            found["MALLOC_PERTURB_"] = _PATTERN if HEAP in self.fixed else _OTHER_PATTERN
+        if COMPILED in self.fixed | self.varied and (library := fake_time()):
+            moment = _MOMENT if COMPILED in self.fixed else _OTHER_MOMENT
+            found |= {"LD_PRELOAD": library, "FAKETIME": moment, "DONT_FAKE_MONOTONIC": "1"}
         if HASHES in self.varied:
             found["PYTHONHASHSEED"] = "1"
         if LOCALE in self.varied:
@@ -65,7 +68,18 @@ class Setting:
         return ("setarch", "-R") if ADDRESSES in self.fixed and fixed_addresses() else ()
 
     def to_wire(self) -> dict[str, Any]:
-        return {"fixed": sorted(self.fixed), "varied": sorted(self.varied), "log": self.log, "lines": self.lines}
+        """Returns plain values, of one size whatever is fixed: it must not move the addresses of what follows."""
+        return {
+            "fixed": [source in self.fixed for source in SOURCES],
+            "varied": sorted(self.varied),
+            "log": self.log,
+            "lines": self.lines,
+        }
+
+    @staticmethod
+    def from_wire(values: Mapping[str, Any]) -> Setting:
+        fixed = frozenset(source for source, on in zip(SOURCES, values["fixed"], strict=True) if on)
+        return Setting(fixed, frozenset(values["varied"]), values["log"], values["lines"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +116,11 @@ def run_again(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     asked about), `modules` (of these), `incomplete`, `begin`, `most` calls, `seconds` at most, `began` (ns), `setting`.
     The answer: the fields of `Rerun`.
     """
-    setting = Setting(**{**request["setting"], **{k: frozenset(request["setting"][k]) for k in ("fixed", "varied")}})
+    setting = Setting.from_wire(request["setting"])
     places, passes = Places(request["modules"]), 1 + (MODULE in setting.varied)
     interventions, traps = Interventions(places, request["began"]), Traps(places)
-    interventions.fix(setting.fixed)
+    if setting.fixed:
+        interventions.fix(setting.fixed)
     interventions.vary(setting.varied)
     lines = LineTrap(places)
     if setting.log:

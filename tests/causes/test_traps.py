@@ -129,6 +129,6 @@ def test_what_is_varied_differs() -> None:
     assert (found["date"] - datetime.date.today()).days in (400, 401)
 
 
-@pytest.mark.parametrize(("value", "other"), [(None, "1"), ("3", "4"), ("0.5", "1.5"), ("fast", "fast_"), ("/", "/")])
+@pytest.mark.parametrize(("value", "other"), [(None, "7"), ("3", "4"), ("0.5", "1.5"), ("fast", "fast_"), ("/", "/")])
 def test_a_variable_is_changed_to_another_value_of_its_kind(value: str | None, other: str) -> None:
     assert changed(value) == other
