@@ -30,6 +30,7 @@ from numpy.random import bit_generator
 
 from dataflow.causes.places import Places
 from dataflow.causes.sources import (
+    ADDRESSES,
     ENTROPY,
     FILE,
     HEAP,
@@ -53,6 +54,7 @@ TURN = 0.2
 """Seconds for which a thread is waited for where it starts."""
 LATER_NS = 400 * 86_400 * 10**9 + 3_723 * 10**9
 """By how much the time of day is changed: more than a year, and neither whole days nor whole hours."""
+_ADDRESS_OF = id
 FILL, OTHER_FILL = 0x5A, 0xA7
 
 
@@ -62,11 +64,11 @@ class Interventions:
     def __init__(self, places: Places, began: int) -> None:
         self._places, self._began = places, began
         self._fixed: frozenset[str] = frozenset()
+        self._numbered: dict[str, dict[int, tuple[int, object]]] = {IDENTITY: {}, ADDRESSES: {}}
         self._drawn = Counter[str]()
 
     def fix(self, sources: Collection[str]) -> None:
-        """Makes sources give the same in every process. The others are replaced, too, by what gives their real values:
-        so memory is laid out alike whatever is fixed, and addresses change with their own source alone."""
+        """Makes sources give the same in every process; the others give their real values."""
         self._fixed = frozenset(sources)
         ForNumpy.install()
         self._set_clock(self._ticking(self._began), lambda: WALL in self._fixed)
@@ -200,14 +202,30 @@ class Interventions:
         return b"".join(blocks)[:size]
 
     def _fix_identities(self) -> None:
-        real, kept = builtins.id, dict[int, tuple[int, object]]()
-
         def numbered(thing: object) -> int:
             if IDENTITY not in self._fixed or self._places.of(sys._getframe(1).f_code) != "own":
-                return real(thing)
-            return kept.setdefault(real(thing), (4096 + 16 * len(kept), thing))[0]
+                return _ADDRESS_OF(thing)
+            return 4096 + 16 * self._number(IDENTITY, thing)
 
         builtins.id = numbered
+
+    def _number(self, source: str, thing: object) -> int:
+        """Returns the number of an object, in the order of the calls; it is kept, so no other takes its address."""
+        numbered = self._numbered[source]
+        return numbered.setdefault(_ADDRESS_OF(thing), (len(numbered), thing))[0]
+
+    def number_hashes(self) -> None:
+        """Has objects of own classes hash by a number, where addresses are fixed: sets of them have one order."""
+        if ADDRESSES not in self._fixed:
+            return
+        for module in self._places.modules():
+            for cls in [each for each in vars(module).values() if isinstance(each, type)]:
+                if (
+                    cls.__module__ == module.__name__
+                    and cls.__hash__ is object.__hash__
+                    and cls.__eq__ is object.__eq__
+                ):
+                    cls.__hash__ = lambda thing: self._number(IDENTITY, thing)  # type: ignore[assignment]
 
     def _take_turns(self) -> None:
         """Has one thread run at a time: on one core, pools have one, and others are waited for where they start."""

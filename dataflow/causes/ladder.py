@@ -32,7 +32,7 @@ MOST = 8
 """Re-runs of one operator."""
 
 _MOVED = frozenset({HEAP, COMPILED})
-"""Sources that are changed where others are left free, since that keeps the addresses of all objects."""
+"""Sources that are changed where others are left free: they might give the same by chance."""
 
 Fire = Callable[[Setting], Rerun]
 

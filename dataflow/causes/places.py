@@ -7,7 +7,7 @@ import sys
 import sysconfig
 from collections.abc import Iterable
 from pathlib import Path
-from types import CodeType, FrameType
+from types import CodeType, FrameType, ModuleType
 
 _ENGINE = str(Path(__file__).parent.parent)
 _PATHS = sysconfig.get_paths()
@@ -30,9 +30,10 @@ class Places:
             found = self._known[file] = self._place(file)
         return found
 
-    def holds(self, file: str) -> bool:
-        """Returns whether a file holds own code."""
-        return self._place(file) == "own"
+    def modules(self) -> list[ModuleType]:
+        """Returns the loaded modules of own code."""
+        loaded = [(module, getattr(module, "__file__", None)) for module in list(sys.modules.values())]
+        return [module for module, file in loaded if isinstance(file, str) and self._place(file) == "own"]
 
     def _place(self, file: str) -> str:
         if file.startswith(self._own):

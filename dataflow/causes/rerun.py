@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -18,7 +17,7 @@ from typing import Any
 
 from dataflow.causes.interventions import Interventions
 from dataflow.causes.places import Places
-from dataflow.causes.sources import ADDRESSES, COMPILED, HASHES, HEAP, INPUT, LOCALE, MODULE, SOURCES, THREADS
+from dataflow.causes.sources import COMPILED, HASHES, HEAP, INPUT, LOCALE, MODULE, THREADS
 from dataflow.causes.traps import Site, Traps
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.judge import Judge
@@ -34,7 +33,7 @@ from dataflow.verification.workers.board import Board
 _PATTERN, _OTHER_PATTERN = "90", "85"
 """Of `MALLOC_PERTURB_`: glibc fills fresh memory with its complement."""
 _MOMENT, _OTHER_MOMENT = "2026-01-02 03:04:05", "2027-10-11 12:13:14"
-"""Of libfaketime. Variables of one length keep the addresses of all that follows."""
+"""Of libfaketime."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,23 +62,12 @@ class Setting:
             found["OMP_THREAD_LIMIT"] = "1"
         return found
 
-    def wrapper(self) -> tuple[str, ...]:
-        """Returns the command that starts its process: with fixed addresses, where they can be."""
-        return ("setarch", "-R") if ADDRESSES in self.fixed and fixed_addresses() else ()
-
     def to_wire(self) -> dict[str, Any]:
-        """Returns plain values, of one size whatever is fixed: it must not move the addresses of what follows."""
-        return {
-            "fixed": [source in self.fixed for source in SOURCES],
-            "varied": sorted(self.varied),
-            "log": self.log,
-            "lines": self.lines,
-        }
+        return {"fixed": sorted(self.fixed), "varied": sorted(self.varied), "log": self.log, "lines": self.lines}
 
     @staticmethod
     def from_wire(values: Mapping[str, Any]) -> Setting:
-        fixed = frozenset(source for source, on in zip(SOURCES, values["fixed"], strict=True) if on)
-        return Setting(fixed, frozenset(values["varied"]), values["log"], values["lines"])
+        return Setting(frozenset(values["fixed"]), frozenset(values["varied"]), values["log"], values["lines"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +116,7 @@ def run_again(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     graph, left = Graph.from_json(request["graph"]), dict[str, bytes]()
     for _ in range(passes):
         before = dict(_kept(places)) if MODULE in setting.varied else {}
-        follower, cut = _repeat(request, graph, board, lines if setting.lines else None)
+        follower, cut = _repeat(request, graph, board, interventions, lines if setting.lines else None)
         left = {name: value for name, value in (_kept(places) if before else ()) if before.get(name, value) != value}
     traps.lift()
     sites = [(source, asdict(site), count) for (source, site), count in (traps.counts + lines.counts).items()]
@@ -141,7 +129,9 @@ def run_again(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     }
 
 
-def _repeat(request: Mapping[str, Any], graph: Graph, board: Board, lines: LineTrap | None) -> tuple[Follower, bool]:
+def _repeat(
+    request: Mapping[str, Any], graph: Graph, board: Board, interventions: Interventions, lines: LineTrap | None
+) -> tuple[Follower, bool]:
     """Re-executes the operator once; returns what came out, and whether its time was up."""
     name, deadline = request["operator"], time.monotonic() + request["seconds"]
     with Recording(request["path"], watch=board.goes_on) as recording:
@@ -156,6 +146,7 @@ def _repeat(request: Mapping[str, Any], graph: Graph, board: Board, lines: LineT
             guard=MemoryGuard(keeping=True),
             watcher=board,
         )
+        interventions.number_hashes()
         runner = work.runners[name]
         runner.judge = follower = Follower(runner.judge)
         if lines is not None:
@@ -237,7 +228,7 @@ def _messages(values: Any) -> Iterator[Message]:
 
 def _kept(places: Places) -> Iterator[tuple[str, bytes]]:
     """Yields what own modules and their classes hold, as far as it can be compared."""
-    for module in [m for m in sys.modules.values() if (file := getattr(m, "__file__", None)) and places.holds(file)]:
+    for module in places.modules():
         for name, value in list(vars(module).items()):
             inner = list(vars(value).items()) if isinstance(value, type) and value.__module__ == module.__name__ else ()
             for path, held in ((name, value), *((f"{name}.{key}", each) for key, each in inner)):
@@ -258,12 +249,3 @@ def fake_time() -> str:
         if found := glob(f"{folder}/libfaketime.so.1"):
             return found[0]
     return ""
-
-
-@cache
-def fixed_addresses() -> bool:
-    """Returns whether processes may be started without random addresses here: containers may forbid it."""
-    try:
-        return subprocess.run(["setarch", "-R", "true"], capture_output=True, timeout=10, check=False).returncode == 0
-    except OSError:
-        return False

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.causes.ladder import MOST, Findings, Ladder
-from dataflow.causes.rerun import Rerun, Setting, fake_time, fixed_addresses, run_again
-from dataflow.causes.sources import ADDRESSES, COMPILED, FILE, INPUT, MODULE, SOURCES, kind_of, name_of
+from dataflow.causes.rerun import Rerun, Setting, fake_time, run_again
+from dataflow.causes.sources import COMPILED, FILE, INPUT, MODULE, SOURCES, kind_of, name_of
 from dataflow.causes.traps import Site
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
@@ -209,8 +209,6 @@ class _Alone:
         self.left_out: dict[str, str] = {}
         if not fake_time():
             self.left_out[COMPILED] = "libfaketime is not installed (pip install libfaketime)"
-        if not fixed_addresses():
-            self.left_out[ADDRESSES] = "setarch -R is not allowed here"
 
     def fire(self, setting: Setting) -> Rerun:
         """Re-runs the operator in a new process. Raises `RunFailed`."""
@@ -219,7 +217,6 @@ class _Alone:
             {**self._request, "setting": setting.to_wire()},
             self._operators,
             setting.environment(),
-            setting.wrapper(),
         )
         [answer] = self._workers([call], threads=self._threads, stall_timeout=self._stall_timeout)
         return Rerun.from_wire(answer)

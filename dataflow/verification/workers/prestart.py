@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import IO
 
 from dataflow.execution.threads import THREADS, environment
@@ -39,9 +39,9 @@ class Started:
         """Returns the descriptors that the worker inherits."""
         return self.theirs, self.letter, self.board, self.words.fileno()
 
-    def spawn(self, variables: Mapping[str, str], wrapper: Sequence[str] = ()) -> None:
-        """Starts its process with an environment, by the command `wrapper` if there is one."""
-        self._process = _spawn([self], variables, wrapper)
+    def spawn(self, variables: Mapping[str, str]) -> None:
+        """Starts its process with an environment."""
+        self._process = _spawn([self], variables)
         self.pid = self._process.pid
 
     def hear(self) -> bool:
@@ -78,15 +78,13 @@ def _await_end(pid: int) -> None:
         os.close(handle)
 
 
-def _spawn(
-    workers: list[Started], variables: Mapping[str, str], wrapper: Sequence[str] = ()
-) -> subprocess.Popen[bytes]:
+def _spawn(workers: list[Started], variables: Mapping[str, str]) -> subprocess.Popen[bytes]:
     """Starts the process of one worker; or one that forks itself for each, and ends: they are this process's then."""
     handed = [worker.handed() for worker in workers]
     slots = [",".join(map(str, each)) for each in handed]
     try:
         return subprocess.Popen(
-            [*wrapper, sys.executable, "-P", "-m", "dataflow.verification.workers.worker", *slots],
+            [sys.executable, "-P", "-m", "dataflow.verification.workers.worker", *slots],
             pass_fds=[descriptor for each in handed for descriptor in each],
             env=variables,
             stdin=subprocess.DEVNULL,

@@ -33,14 +33,13 @@ LAST_WORDS = 4000
 class Call:
     """A call for a worker: the function as `module:name`, plain values for it, and the operators it will run.
 
-    `environment`: variables of its process besides those of `execution.threads`; `wrapper`: the command that starts it.
+    `environment`: variables of its process besides those of `execution.threads`.
     """
 
     function: str
     request: Mapping[str, Any]
     operators: tuple[str, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
-    wrapper: tuple[str, ...] = ()
 
 
 Locate = Callable[[Call, str, int], str]
@@ -116,7 +115,7 @@ class _Worker:
         variables = environment(threads) | call.environment
         if started is None:
             started = Started()
-            started.spawn(variables, call.wrapper)
+            started.spawn(variables)
         self.number, self.call, self._locate, self._started = number, call, locate, started
         self.answered, self.answer = False, None
         self._letter, self.channel, self._words = started.letter, started.channel, started.words
