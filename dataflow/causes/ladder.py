@@ -39,7 +39,7 @@ Fire = Callable[[Setting], Rerun]
 
 @dataclass(slots=True)
 class Findings:
-    """What the ladder came to: `causes`, shown by their effect; `cleared` sources, which have none; `open` groups, of
+    """The outcome of the ladder: `causes`, shown by their effect; `cleared` sources, which have none; `open` groups, of
     which one has an effect, but re-runs were used up. `first` is the re-run that logged; `repeats`: whether the
     operator repeats at all; `settled`: whether it does where all sources of chance are fixed (None: not tried).
     `left`: what it leaves in modules and classes."""

@@ -38,7 +38,7 @@ _MOMENT, _OTHER_MOMENT = "2026-01-02 03:04:05", "2027-10-11 12:13:14"
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What a re-run changes: sources that are `fixed`, and `varied`. `log`: it logs what is read; `lines`: it looks for
+    """The changes of a re-run: sources that are `fixed`, and `varied`. `log`: it logs what is read; `lines`: it looks for
     the line that writes into an input."""
 
     fixed: frozenset[str] = frozenset()

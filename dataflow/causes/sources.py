@@ -26,7 +26,7 @@ INPUT = "input written to"
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """What a source is: `meaning` completes "its results depend on", `instead` is what would be right."""
+    """Words for a source: `meaning` completes "its results depend on", `instead` is what would be right."""
 
     meaning: str
     instead: str

@@ -1,7 +1,7 @@
 """Logs the calls by which an operator reads clocks, entropy, addresses, files, variables: in one run, changing nothing.
 
 The interpreter calls the trap for each call of a function, built-in ones included, however their names were imported.
-What compiled code reads without the interpreter is not seen.
+Reads of compiled code, past the interpreter, are not seen.
 """
 
 from __future__ import annotations
