@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 import xxhash
-from numpy.random import bit_generator
 
 from dataflow.causes.places import Places
 from dataflow.causes.sources import (
@@ -46,7 +45,7 @@ from dataflow.causes.sources import (
     kind_of,
     name_of,
 )
-from dataflow.causes.traps import ForNumpy
+from dataflow.causes.traps import BIT_GENERATOR, ForNumpy
 from dataflow.execution.generators import lazy_numpy
 
 TICK_NS = 1_000_000
@@ -113,14 +112,15 @@ class Interventions:
     def _set_clock(self, now: Callable[[], int], on: Callable[[], bool]) -> None:
         real, of_day = time.clock_gettime_ns, time.CLOCK_REALTIME
         strftime, localtime = time.strftime, time.localtime
-        for name, value in {
+        values: dict[str, Callable[..., Any]] = {
             "time_ns": now,
             "time": lambda: now() / 1e9,
             **{name: _at(getattr(time, name), now) for name in ("localtime", "gmtime", "ctime")},
             "strftime": lambda form, at=None: strftime(form, at or localtime(now() / 1e9)),
             "clock_gettime_ns": lambda clock: now() if clock == of_day else real(clock),
             "clock_gettime": lambda clock: (now() if clock == of_day else real(clock)) / 1e9,
-        }.items():
+        }
+        for name, value in values.items():
             self._replace(time, name, value, on)
         self._set_dates(now, on)
 
@@ -140,7 +140,10 @@ class Interventions:
         def utcnow(cls: type[datetime]) -> datetime:
             return real_utcnow() if free() else cls.utcfromtimestamp(now() / 1e9)
 
-        methods = {datetime: {"now": current, "today": today, "utcnow": utcnow}, date: {"today": today}}
+        methods: dict[type, dict[str, Any]] = {
+            datetime: {"now": current, "today": today, "utcnow": utcnow},
+            date: {"today": today},
+        }
         for cls, replaced in methods.items():
             gc.get_referents(vars(cls))[0].update({n: classmethod(f) for n, f in replaced.items()})
             ctypes.pythonapi.PyType_Modified(ctypes.py_object(cls))
@@ -163,14 +166,14 @@ class Interventions:
         random.seed()
 
     def _fix_numpy(self) -> None:
-        real = bit_generator.randbits
+        real = BIT_GENERATOR.randbits
 
         def fixed(bits: int) -> int:
             if NUMPY not in self._fixed:
                 return int(real(bits))
             return int.from_bytes(self._bytes(NUMPY, (bits + 7) // 8)) >> -bits % 8
 
-        bit_generator.randbits = fixed
+        BIT_GENERATOR.randbits = fixed
         lazy_numpy.seed_lazily(fixed(32))
 
     def _fix_identifiers(self) -> None:
@@ -219,13 +222,11 @@ class Interventions:
         if ADDRESSES not in self._fixed:
             return
         for module in self._places.modules():
-            for cls in [each for each in vars(module).values() if isinstance(each, type)]:
-                if (
-                    cls.__module__ == module.__name__
-                    and cls.__hash__ is object.__hash__
-                    and cls.__eq__ is object.__eq__
-                ):
-                    cls.__hash__ = lambda thing: self._number(IDENTITY, thing)  # type: ignore[assignment]
+            classes: list[Any] = [each for each in vars(module).values() if isinstance(each, type)]
+            for cls in classes:
+                by_address = cls.__hash__ is object.__hash__ and cls.__eq__ is object.__eq__
+                if by_address and cls.__module__ == module.__name__:
+                    cls.__hash__ = lambda thing: self._number(ADDRESSES, thing)
 
     def _take_turns(self) -> None:
         """Has one thread run at a time: on one core, pools have one, and others are waited for where they start."""
@@ -238,9 +239,9 @@ class Interventions:
             if THREADS in self._fixed and not passes(sys._getframe(1)):
                 thread.join(TURN)
 
-        threading.Thread.start = started  # type: ignore[method-assign]
+        threading.Thread.start = started  # type: ignore[assignment,method-assign]
         for pool in (ThreadPoolExecutor, ThreadPool):
-            pool.__init__ = self._of_one(pool.__init__)  # type: ignore[misc, method-assign]
+            pool.__init__ = self._of_one(pool.__init__)  # type: ignore[method-assign]
 
     def _of_one(self, make: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(make)

@@ -53,6 +53,11 @@ class Findings:
     open: list[tuple[str, ...]] = field(default_factory=list)
     left: tuple[str, ...] = ()
 
+    @property
+    def hopeless(self) -> bool:
+        """True where it does not repeat with all sources fixed: no effect of one can be seen."""
+        return self.settled is False
+
 
 class Ladder:
     """Climbs with `fire`, which re-runs the operator; `left_out` are sources that cannot be fixed here."""
@@ -107,7 +112,7 @@ class Ladder:
             make the same each time, and yet not the same as one: that is no cause, either."""
             if found.settled is None:
                 found.settled = self._fire(Setting(fixed)).same(base)
-            return found.settled and (source != THREADS or not self._fire(Setting(fixed - {THREADS})).same(made))
+            return bool(found.settled) and (source != THREADS or not self._fire(Setting(fixed - {THREADS})).same(made))
 
         self._search(found, [unseen, *([s] for s in trapped)], effect, confirmed)
 
@@ -130,7 +135,7 @@ class Ladder:
         confirmed: Callable[[str, Rerun], bool],
     ) -> None:
         left = [_Group(group) for group in groups if group]
-        while left and found.settled is not False:
+        while left and not found.hopeless:
             room = self._most - self._fired
             if len(left) > room > 0:  # several at once, where there is not room for each
                 left[room - 1 :] = [_Group([source for group in left[room - 1 :] for source in group.sources])]
@@ -144,7 +149,7 @@ class Ladder:
                     left[1:1] = [_Group(sources[:half]), _Group(sources[half:], tuple(sources[:half]))]
                 elif made is None or confirmed(sources[0], made):
                     found.causes.append(sources[0])
-                elif found.settled is not False:
+                elif not found.hopeless:
                     found.cleared.append(sources[0])
             except _SpentError:
                 found.open = [tuple(group.sources) for group in left]

@@ -38,8 +38,8 @@ _MOMENT, _OTHER_MOMENT = "2026-01-02 03:04:05", "2027-10-11 12:13:14"
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """The changes of a re-run: sources that are `fixed`, and `varied`. `log`: it logs what is read; `lines`: it looks for
-    the line that writes into an input."""
+    """The changes of a re-run: sources that are `fixed`, and `varied`. `log`: it logs what is read; `lines`: it looks
+    for the line that writes into an input."""
 
     fixed: frozenset[str] = frozenset()
     varied: frozenset[str] = frozenset()

@@ -39,6 +39,8 @@ from dataflow.causes.sources import (
 from dataflow.execution.generators import lazy_numpy
 from dataflow.execution.generators.shared_generators import AT_WORK
 
+BIT_GENERATOR: Any = bit_generator
+"""The module of numpy that asks `randbits` for the entropy of generators without a seed."""
 _CLOCKS = {
     WALL: ("time", "time_ns", "localtime", "gmtime", "ctime", "strftime"),
     MONOTONIC: ("monotonic", "perf_counter", "process_time", "thread_time"),
@@ -66,7 +68,7 @@ class ForNumpy(random.SystemRandom):
     @staticmethod
     def install() -> None:
         """Has numpy ask it rather than a generator that it shares with `secrets`."""
-        bit_generator.randbits = ForNumpy().getrandbits
+        BIT_GENERATOR.randbits = ForNumpy().getrandbits
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +111,7 @@ class Traps:
     def lift(self) -> None:
         """Ends the log."""
         sys.setprofile(None)
-        threading.setprofile(None)  # type: ignore[arg-type]
+        threading.setprofile(None)
 
     def threads(self) -> int:
         """Returns how many threads run in this process that did not when the trap was made."""

@@ -29,7 +29,7 @@ def recorded(path: Path, *operators: str) -> Path:
 
 
 def line_of(site: Any) -> str:
-    return LINES[site["line"] - 1].strip()
+    return str(LINES[site["line"] - 1]).strip()
 
 
 def test_the_command_names_two_causes_at_once_with_their_lines(tmp_path: Path) -> None:

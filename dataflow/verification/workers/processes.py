@@ -112,7 +112,7 @@ class _Worker:
 
     def __init__(self, number: int, call: Call, started: Started | None, threads: int, locate: Locate) -> None:
         """`started`: a process that waits already."""
-        variables = environment(threads) | call.environment
+        variables = {**environment(threads), **call.environment}
         if started is None:
             started = Started()
             started.spawn(variables)
