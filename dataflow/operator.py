@@ -45,7 +45,18 @@ from dataflow.ports import (
     SourceError,
     is_tunable,
 )
-from dataflow.state import KEPT, Counts, Remembered, StateOf, fresh_state, plain, reset_state, state_hints, take_over
+from dataflow.state import (
+    KEPT,
+    Counts,
+    Remembered,
+    StateError,
+    StateOf,
+    fresh_state,
+    plain,
+    reset_state,
+    state_hints,
+    take_over,
+)
 
 __all__ = [
     "FINDING",
@@ -192,7 +203,10 @@ class Operator:
             reset_state(old, self.state)
 
     def on_parameter(self, name: str) -> None:
-        """A `tunable` parameter was changed between two firings; `self.<name>` holds the new value."""
+        """A `tunable` parameter was changed between two firings; `self.<name>` holds the new value.
+
+        Raises `ParameterError` for a value that cannot be taken over; then the one before stays.
+        """
 
     def snapshot(self) -> Mapping[str, Any] | None:
         """Returns the state, such that `restore` of it in a fresh operator goes on alike: by default `state` or None.
@@ -209,7 +223,14 @@ class Operator:
         """Takes over a state that `snapshot` gave. Called once, after `setup()`. Raises `StateError`."""
         if self.__state is None:
             raise NotImplementedError(f"{type(self).__name__} gives snapshots but cannot restore them")
-        take_over(self.state, state_hints(self.state), state)
+        try:
+            take_over(self.state, state_hints(self.state), state, self.new_part)
+        except StateError as error:
+            raise StateError(f"snapshot of another version: {error}") from error
+
+    def new_part(self, kind: type[Any]) -> Any:
+        """Returns a part of the state that `restore` finds missing, such as a `Remembered` with settings."""
+        return kind()
 
     def set_parameter(self, name: str, value: Any) -> Any:
         """Changes a `tunable` parameter; returns the value as validated. Raises `ParameterError`."""
@@ -221,9 +242,14 @@ class Operator:
             raise ParameterError(f"{cls.__name__}.{name} cannot change while the graph runs{which}")
         if name not in fields:
             raise ParameterError(f"{cls.__name__} has no parameter {name!r}{which.replace('can', 'can change', 1)}")
-        self.params = validate_parameters(cls, {**self.params.model_dump(), name: value})
+        before, self.params = self.params, validate_parameters(cls, {**self.params.model_dump(), name: value})
         setattr(self, name, getattr(self.params, name))
-        self.on_parameter(name)
+        try:
+            self.on_parameter(name)
+        except ParameterError:
+            self.params = before
+            setattr(self, name, getattr(before, name))
+            raise
         return getattr(self, name)
 
     def summary(self) -> Mapping[str, float | int | str]:

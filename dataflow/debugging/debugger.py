@@ -30,7 +30,7 @@ MOST_BYTES = 2**28
 
 
 class DebugError(ReplayError):
-    """Raised for a call that cannot be gone to; the message says why, and what there is."""
+    """Raised for a call that cannot be gone to; the message has the reason, and what there is."""
 
 
 class Debugger:

@@ -158,8 +158,9 @@ class Recomputation:
         try:
             self.begin()
             began = time.monotonic()
-            while (left := self.turn()) and not until():
-                pass
+            left = self.turn()
+            while left and not until():
+                left = self.turn()
             self.wall = time.monotonic() - began
             if left:
                 return self.results()

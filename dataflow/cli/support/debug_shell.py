@@ -24,11 +24,11 @@ MOST_FIELDS = 8
 
 
 class WrongCommand(ValueError):
-    """A line that cannot be done; the message says what would be right."""
+    """A line that cannot be done; the message has what would be right."""
 
 
 class Shell(cmd.Cmd):
-    """Reads lines, goes where they say, and prints what is there.
+    """Reads lines, goes there, and prints what is there.
 
     `origin`: the stamp of 0 s, ns; `json`: calls are printed as one JSON object a line.
     """
@@ -142,7 +142,7 @@ class Shell(cmd.Cmd):
     # ------------------------------------------------------------------------------------------------- the loop
 
     def onecmd(self, line: str) -> bool:
-        """Does what a line says. An error is printed, and the loop goes on."""
+        """Does the command of a line. An error is printed, and the loop goes on."""
         from dataflow.execution.failure import OperatorFailure
         from dataflow.recording import RecordingError
         from dataflow.reexecution.engine import Stuck
