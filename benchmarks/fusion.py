@@ -95,7 +95,7 @@ def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
         if not out and (since % PERIOD >= 0.2 or since < PERIOD) and since > 3:
             errors.append(error)
         last, was_out = error, out
-    health = operator._filter.health["sensor/fix"]  # type: ignore[union-attr]
+    health = operator.state.filter.health["sensor/fix"]  # type: ignore[union-attr]
     text = f"used {health.used}, refused {health.refused}, unconfirmed {health.unconfirmed}, made room {health.widened}"
     return math.sqrt(float(np.mean(np.square(errors)))), ends, text
 

@@ -20,6 +20,10 @@ BACK = 5_000_000_000
 """A header that goes back by more (ns) means that the clock was set, or that a log was played again."""
 APART = 1_000_000_000
 """Topics whose headers differ from log time by amounts farther apart (ns) have separate clocks."""
+STEP = 100_000_000
+"""A step back of more (ns) means the same if the headers stay as far behind the log after it."""
+STAYS = 10
+"""Messages before and after a step back that show it."""
 SOME = 10
 """A topic of which more than one in so many headers carries no time is stamped by the log, and all others with it."""
 NEAR = 1_000_000_000
@@ -68,9 +72,9 @@ class Clock:
 def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     """Returns the one clock for all topics that are used together.
 
-    Header stamps, unless more than a tenth of a topic's are missing (zero or negative), one goes back by more than 5 s,
-    most of them repeat, or the topics' headers are of different clocks: then log times, for all. Fewer that are missing
-    are placed by the log.
+    Header stamps, unless more than a tenth of a topic's are missing (zero or negative), one goes back by more than 5 s
+    or for good, most of them repeat, or the topics' headers are of different clocks: then log times, for all. Fewer
+    that are missing are placed by the log.
     """
     if wanted == "log":
         return Clock("log", "asked for")
@@ -99,7 +103,7 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
         if not times.shares and count > 2 * (distinct := len(np.unique(set_))):
             return Clock("log", f"{count:,} headers of {times.topic} carry only {distinct:,} different times")
         back = int(-np.diff(set_).min(initial=0))
-        if back > BACK:
+        if back > BACK or (back > STEP and not times.shares and _stays_back(times)):
             return Clock("log", f"the headers of {times.topic} go back by {back * 1e-9:.1f} s")
     if offsets and max(offsets.values()) - min(offsets.values()) > APART:
         late, early = max(offsets, key=lambda t: offsets[t]), min(offsets, key=lambda t: offsets[t])
@@ -109,6 +113,18 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     if shift:
         why += f"; it runs {abs(typical) * 1e-9:.3f} s {'behind' if typical > 0 else 'ahead of'} the recorder's clock"
     return Clock("header", why, shift, notes)
+
+
+def _stays_back(times: Times) -> bool:
+    """Tells whether the headers are later against the log by most of their largest step back from then on, as after a
+    clock that was set; where single messages come late, the others stay where they were."""
+    assert times.header is not None
+    given = times.header > 0
+    header, log = times.header[given], times.log[given]
+    step = int(np.argmin(np.diff(header))) + 1
+    before, after = (log - header)[max(step - STAYS, 0) : step], (log - header)[step : step + STAYS]
+    lost = float(np.median(after) - np.median(before)) if min(len(before), len(after)) == STAYS else 0.0
+    return lost > 0.8 * float(header[step - 1] - header[step])
 
 
 def _offset(times: Times) -> int:

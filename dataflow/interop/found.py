@@ -37,7 +37,7 @@ class Found:
             self.parts.append(part)
             self.logs.append(stored.log_time)
             self.headers.append(stamp)
-            self.digests.append(digest)
+            self.digests.append(digest ^ part)
 
     def times(self, topic: Topic, shares: bool) -> Times:
         """The times among which a clock is chosen."""

@@ -143,6 +143,9 @@ def readable(
     streams = BagStreams(path, played, clock, strict=wishes.strict, accounting=accounting)
     kept = [r for r in readings if r.topic.count and not r.playable and is_known(r.topic)]
     streams.account.notes += [f"topic {r.topic.name} stays as it is, since it cannot be read: {r.reason}" for r in kept]
+    empty = [r.topic.name for r in readings if not r.topic.count and is_known(r.topic)]
+    if empty:
+        streams.account.notes.append(f"declared without a message: {', '.join(empty)}")
     return streams
 
 

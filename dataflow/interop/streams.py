@@ -20,7 +20,7 @@ from dataflow.interop.found import Found
 from dataflow.interop.opening import open_bag
 from dataflow.interop.ranking import Ranking, within
 from dataflow.interop.topics import Reading
-from dataflow.interop.transform_sets import joined, places_of
+from dataflow.interop.transform_sets import joined, other_parents, places_of
 from dataflow.messages import DepthImage, Message, MessageError, Transforms, message_type
 from dataflow.messages.depth_units import MILLIMETRES, DepthSpan
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
@@ -298,6 +298,8 @@ class BagStreams:
                 if pending is not None and (pending.stream, pending.message.stamp) == (stream, stamp):
                     assert isinstance(pending.message, Transforms)
                     assert isinstance(message, Transforms)
+                    if self._accounting and (lost := other_parents(pending.message, message)):
+                        self.account.lose(self.played[stream].topic, lost)
                     pending.message = joined(pending.message, message)
                     continue
                 if pending is not None:

@@ -73,25 +73,35 @@ class RosReader:
 
 
 class TransformSetReader:
-    """Reads tf messages, whose transforms may have several stamps: each stamp is a part."""
+    """Reads tf messages, whose transforms may have several stamps: each stamp is a part, and so is each further parent
+    that a frame has at one."""
 
     def __init__(self, kind: RosType) -> None:
         self._kind = kind
 
     def stamps(self, data: Data) -> tuple[int, ...]:
-        """The times of its transforms, each once."""
-        return _stamps_of(self._kind.parse(data).transforms)
+        """The times of its transforms, each once for every parent that a frame has then."""
+        return tuple(time for time, _ in _sets(self._kind.parse(data).transforms))
 
     def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
-        """The transforms of the part's time."""
-        rows = self._kind.parse(data).transforms
-        times = _stamps_of(rows)
-        chosen = [row for row in rows if time_ns(row.header.stamp) == times[part]] if times else []
+        """The transforms of the part."""
+        sets = _sets(self._kind.parse(data).transforms)
+        chosen = sets[part][1] if sets else []
         return transforms(chosen if losses is None else [Seen(row, losses) for row in chosen], stamp)
 
 
-def _stamps_of(rows: Any) -> tuple[int, ...]:
-    return tuple(sorted({time_ns(row.header.stamp) for row in rows}))
+def _sets(rows: Any) -> list[tuple[int, list[Any]]]:
+    """Transforms by time, in its order; those that give a frame another parent than one before are a set apart."""
+    found: dict[tuple[int, int], list[Any]] = {}
+    parents: dict[tuple[int, str], list[str]] = {}
+    for row in rows:
+        time = time_ns(row.header.stamp)
+        known = parents.setdefault((time, row.child_frame_id), [])
+        parent = row.header.frame_id
+        if parent not in known and parent != row.child_frame_id:
+            known.append(parent)
+        found.setdefault((time, known.index(parent) if parent in known else 0), []).append(row)
+    return [(time, found[time, number]) for time, number in sorted(found)]
 
 
 class MarkerArrayReader:

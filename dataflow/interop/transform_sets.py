@@ -16,6 +16,16 @@ def places_of(message: Transforms) -> Iterator[tuple[str, bytes]]:
         yield child, message.frames[i].encode() + b"\0" + place
 
 
+def other_parents(a: Transforms, b: Transforms) -> list[str]:
+    """Names frames for which two sets have different parents, of which `joined` keeps the later one."""
+    parents = dict(zip(a.child_frames, a.frames, strict=True))
+    return [
+        f"a parent of {child}: {parents[child]} beside {parent}"
+        for child, parent in zip(b.child_frames, b.frames, strict=True)
+        if parents.get(child, parent) != parent
+    ]
+
+
 def joined(a: Transforms, b: Transforms) -> Transforms:
     """The transforms of two sets, stamped like the first; of those that place one frame the later counts."""
     rows = {child: (a, i) for i, child in enumerate(a.child_frames)}

@@ -45,6 +45,8 @@ class BagMaterial:
                 yield Finding("unreadable", name, "warning", reading.reason)
             if reading.losses:
                 yield Finding("no place", name, "note", ", ".join(reading.losses))
+            if not reading.topic.count:
+                yield Finding("empty", name, "note", "it is declared, and holds no message")
         if whole:
             yield from self._read_all()
 
@@ -54,16 +56,20 @@ class BagMaterial:
         places: dict[tuple[str, str], bytes] = {}
         changed: dict[tuple[str, str], tuple[int, int]] = {}
         unread: dict[str, tuple[int, int, str]] = {}
+        unset: dict[str, int] = {}
         for stored in self._bag.messages(list(readable)) if readable else ():
             reading = readable[stored.topic]
             assert reading.reader is not None
             try:
-                parts = range(max(1, len(reading.reader.stamps(stored.data))))
+                stamps = reading.reader.stamps(stored.data)
+                parts = range(max(1, len(stamps)))
                 read = [reading.reader.read(stored.data, part, max(stored.log_time, 0)) for part in parts]
             except (MessageError, RecordingError) as error:
                 number, first, reason = unread.get(stored.topic, (0, stored.log_time, str(error)))
                 unread[stored.topic] = number + 1, first, reason
                 continue
+            if stamps and max(stamps) <= 0 and not reading.topic.latched:
+                unset[stored.topic] = unset.get(stored.topic, 0) + 1
             for message in read if is_static(stored.topic) else ():
                 for child, place in places_of(message) if isinstance(message, Transforms) else ():
                     key = (stored.topic, child)
@@ -73,6 +79,12 @@ class BagMaterial:
         for topic, (number, first, reason) in unread.items():
             text = f"{number:,} messages cannot be read, the first: {reason}"
             yield Finding("unreadable", topic, "error", text, first, {"messages": number})
+        for topic, number in unset.items():
+            text = (
+                f"{number:,} of {self._readings[topic].topic.count:,} headers carry no time: when those were recorded "
+                "is taken for when they were measured"
+            )
+            yield Finding("unstamped", topic, "warning", text, None, {"messages": number})
         for (topic, child), (number, at) in changed.items():
             text = f"the place of {child} changes {number:,} times, and static transforms hold from the beginning"
             yield Finding("static", topic, "warning", text, at)

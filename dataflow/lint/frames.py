@@ -18,6 +18,8 @@ class FrameTree:
     connected: dict[str, set[str]] = field(default_factory=dict)
     used: dict[str, str] = field(default_factory=dict)
     """frame → the first stream whose messages are given in it."""
+    bodies: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """stream of odometry → the frame that it is given in, and the one that it places."""
 
     def see(self, stream: str, message: Message) -> None:
         """Takes in a message."""
@@ -28,6 +30,8 @@ class FrameTree:
             return
         if isinstance(message, (Pose, Odometry)) and message.child_frame:
             self._connect(message.frame, message.child_frame)
+        if isinstance(message, Odometry):
+            self.bodies.setdefault(stream, (message.frame, message.child_frame))
         frame = getattr(message, "frame", "")
         if isinstance(frame, str) and frame:
             self.used.setdefault(frame, stream)
@@ -70,6 +74,10 @@ def check_frames(tree: FrameTree, root: str | None = None, wanted: Iterable[str]
     if circle := _circle(tree):
         text = f"frames lie within each other: {' → '.join(circle)}"
         yield Finding("frames", tree.parents[circle[0]][circle[1]], "error", text)
+    for stream, (frame, body) in tree.bodies.items():
+        if not body or body == frame:
+            text = f"it places {f'frame {body!r} in itself' if body else 'no frame'}: child_frame is that of the robot"
+            yield Finding("frames", stream, "error" if body else "warning", text)
     known = set(tree.connected) | set(tree.used)
     for frame in wanted:
         if frame not in known:

@@ -12,6 +12,8 @@ from dataflow.lint.contract import Contract, StreamTerms, means
 from dataflow.lint.finding import Finding
 from dataflow.lint.frames import FrameTree, check_frames
 from dataflow.lint.material import Material
+from dataflow.lint.motion import check_motion
+from dataflow.lint.publishers import check_publishers
 from dataflow.lint.quantities import check_quantities
 from dataflow.lint.timing import Timing, check_ends, check_gaps, check_order, timing_of
 from dataflow.lint.turning import READERS, Turning, turning_of
@@ -60,7 +62,7 @@ class Report:
 
 
 def lint(material: Material, contract: Contract | None = None, *, clocks: bool = True) -> Report:
-    """Looks at everything. `clocks` False leaves the clocks out, for which images have to be decoded."""
+    """Looks at everything. `clocks` False leaves clocks and motion out, which take all messages."""
     terms = contract or Contract()
     report = Report()
     report.findings += material.file_findings(whole=clocks)
@@ -80,11 +82,13 @@ def lint(material: Material, contract: Contract | None = None, *, clocks: bool =
     report.findings += check_ends(report.timings)
     report.findings += check_quantities(material, report.timings)
     report.findings += check_cameras(material)
+    report.findings += check_publishers(material)
     tree = _frames_of(material)
     report.findings += check_frames(tree, terms.frames.root, terms.frames.required)
     report.root = tree.roots()[0] if tree.parents else None
     report.findings += _kept(material, terms, report.timings)
     if clocks:
+        report.findings += check_motion(material)
         report.reference, report.clocks = compare_clocks(material, report.timings, terms)
         report.findings += check_clocks(report, terms)
     report.findings = [f for f in report.findings if not _accepted(f, terms, material.namespace)]

@@ -12,8 +12,9 @@ import numpy.typing as npt
 from dataflow.lint.finding import Finding
 from dataflow.lint.material import Material
 from dataflow.lint.timing import Timing
-from dataflow.messages import DepthImage, Imu, LaserScan, Message, NavSatFix, PointCloud
+from dataflow.messages import DepthImage, Image16, Imu, LaserScan, Message, NavSatFix, PointCloud
 from dataflow.messages.depth_units import DepthSpan
+from dataflow.recording.streams.pixels import as_millimetres
 
 SAMPLED = 2000
 """Pixels of a depth image that are kept."""
@@ -28,6 +29,12 @@ DEEPEST = 300.0
 """Metres beyond which no depth camera measures."""
 LONGEST_SWEEP = 60.0
 """Seconds that the points of one cloud may take."""
+SWEEPS = 5.0
+"""Times from cloud to cloud that the points of one do not take."""
+WHOLE_TURN = 2 * np.pi
+"""rad, all that a laser scanner sees."""
+SMOOTHER = 0.2
+"""By which factor neighbouring pixels are more alike where their bytes are in the right order."""
 YEARS = 86400.0 * 30
 """Seconds by which the stamps of streams of one recording do not differ."""
 
@@ -45,6 +52,8 @@ class _Seen:
     sweep: float = 0.0
     farthest: float = 0.0
     ranges: list[float] = field(default_factory=list)
+    angle: float = 0.0
+    swapped: list[float] = field(default_factory=list)
     unplaced: int = 0
     looked: int = 0
 
@@ -63,6 +72,7 @@ def check_quantities(material: Material, timings: Mapping[str, Timing]) -> Itera
             if seen.looked >= LOOKED_AT:
                 break
         yield from _findings(name, seen)
+        yield from _of_layout(name, seen, timings.get(name))
     yield from check_spans(timings)
 
 
@@ -78,12 +88,17 @@ def _look(message: Message, seen: _Seen) -> bool:
             seen.negative += int((data < 0).sum())
             seen.returns += int((data > 0).sum())
             seen.deepest = max(seen.deepest, float(np.quantile(data, 0.9)) if data.size else 0.0)
+            if (stored := as_millimetres(message.data)) is not None:
+                seen.swapped.append(_roughness(stored))
+        case Image16():
+            seen.swapped.append(_roughness(message.data))
         case PointCloud():
             if message.time_offsets is not None and len(message.time_offsets):
                 times = message.time_offsets[np.isfinite(message.time_offsets)].astype(np.float64)
                 seen.sweep = max(seen.sweep, float(np.ptp(times)) if times.size else 0.0)
                 seen.farthest = max(seen.farthest, float(np.abs(times).max(initial=0.0)))
         case LaserScan():
+            seen.angle = max(seen.angle, abs(message.angle_increment) * (len(message.ranges) - 1))
             ranges = message.ranges[np.isfinite(message.ranges) & (message.ranges > 0)]
             if ranges.size:
                 seen.ranges.append(float(np.median(ranges)))
@@ -140,6 +155,33 @@ def _findings(name: str, seen: _Seen) -> Iterator[Finding]:
         yield found(text + ": are they in millimetres?", scans=seen.unplaced)
     elif seen.unplaced:
         yield found(f"{seen.unplaced:,} fixes lie at 0° N 0° E: the receiver had none", fixes=seen.unplaced)
+
+
+def _roughness(pixels: npt.NDArray[np.uint16]) -> float:
+    """How rough pixels are with their bytes swapped (the median step between two neighbours), over how they are."""
+    if not (pixels & 0xFF).any():  # 8 bits as the upper ones of 16
+        return 1.0
+    given, other = (
+        float(np.median(np.abs(np.diff(each.astype(np.int32), axis=1)))) if each.shape[1] > 1 else 0.0
+        for each in (pixels, pixels.byteswap())
+    )
+    return other / given if given else 1.0
+
+
+def _of_layout(name: str, seen: _Seen, timing: Timing | None) -> Iterator[Finding]:
+    """Values whose layout was misread: angles, times of points, bytes."""
+    if seen.angle > 1.5 * WHOLE_TURN:
+        text = f"its angles span {seen.angle:.0f} rad, more than a turn: are they in degrees? rad is wanted"
+        yield Finding("quantity", name, "warning", text, None, {"angle": seen.angle})
+    if timing is not None and timing.steady and SWEEPS * timing.period < seen.sweep <= LONGEST_SWEEP:
+        text = (
+            f"the points of a cloud were measured over {seen.sweep:.3g} s, and a cloud comes every "
+            f"{timing.period:.3g} s: are their times in another unit than seconds?"
+        )
+        yield Finding("quantity", name, "warning", text, None, {"seconds": seen.sweep})
+    if seen.swapped and float(np.median(seen.swapped)) < SMOOTHER:
+        text = "its pixels are smooth only with their two bytes swapped: is the other order stated (is_bigendian)?"
+        yield Finding("quantity", name, "warning", text)
 
 
 def _small(seconds: float, unit: str) -> str:

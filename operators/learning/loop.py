@@ -250,7 +250,13 @@ class _Run:
             raise TrainingFileError(f"{file} cannot be resumed with other settings: {', '.join(different)}{hint}")
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["ema"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        try:
+            self.optimizer.load_state_dict(state["optimizer"])
+        except ValueError:
+            raise TrainingFileError(
+                f"{file} cannot be resumed: other layers were frozen; give --from, --backbone-weights and "
+                "--frozen-stride as when it was begun, or --overwrite"
+            ) from None
         self.outcome.best, self.outcome.best_epoch = dict(state["best"]), int(state["best_epoch"])
         self.outcome.history, self.outcome.seconds = list(state["history"]), float(state["seconds"])
         return int(state["epoch"])

@@ -127,14 +127,20 @@ def train_second(second: Second, data: Any, first: Path, options: ImageTraining,
 def add_second(task: Task, first: Path, out: Path, options: ImageTraining) -> Outcome:
     """Trains a second network, and writes the file of the first with it to `out`, which may be the same.
 
-    Beside `out` stays its checkpoint, `.refiner.pt` or `.borders.pt`, from which `resume` goes on where it is there.
+    Beside `out` stays its checkpoint, `.refiner.pt` or `.borders.pt`, from which `resume` goes on where it is there; one
+    of a training that had ended leaves `out` as it is.
     """
     from operators.learning.export import attach_second
+    from operators.learning.files import TrainingFileError
 
     alone = out.with_suffix(f".{task.kind}.onnx")
-    outcome = replace(options, resume=options.resume and alone.with_suffix(".pt").exists()).run(task, alone)
-    attach_second(first, alone, out)
-    alone.unlink()
+    checkpoint = alone.with_suffix(".pt")
+    outcome = replace(options, resume=options.resume and checkpoint.exists()).run(task, alone)
+    if alone.exists():
+        attach_second(first, alone, out)
+        alone.unlink()
+    elif not out.exists():
+        raise TrainingFileError(f"the training of {checkpoint} has ended, and there is no {out}: give --overwrite")
     return outcome
 
 

@@ -1,17 +1,15 @@
-"""Every option that `--help` names is accepted and used once, on a tiny recording; what another test tries is said."""
+"""Every option that `--help` names is accepted and used once, on a tiny recording; what another test tries is said.
+
+Those of commands of other packages: `tests/operators/training/test_command_options.py`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer import Context
-from typer.main import get_command
-
-from dataflow.cli.main import app
-from dataflow.cli.registry import BUILT_IN
+from cli_commands import commands, untried
 
 TRIED: tuple[str, ...] = (
     "demo --to OUT.rrd --seconds 1 --quiet --json",
@@ -91,17 +89,6 @@ ELSEWHERE: dict[str, tuple[str, str]] = {
 """By command, options that are not tried here, and why."""
 
 
-def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Every built-in command with the words that call it."""
-    if not hasattr(group, "list_commands"):
-        yield " ".join(words), group
-        return
-    for name in group.list_commands(Context(group)):
-        found = group.get_command(Context(group), name)
-        if found is not None and (words or name in {each.called for each in BUILT_IN}):
-            yield from commands(found, (*words, name))
-
-
 @pytest.fixture(scope="module")
 def places(small: Path, recorded: tuple[Path, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     folder = tmp_path_factory.mktemp("places")
@@ -149,19 +136,5 @@ def test_a_command_for_a_running_graph_says_that_none_runs(
     assert "none" in said or "no graph" in said
 
 
-def test_every_option_of_every_command_is_tried() -> None:
-    untried = {}
-    for called, command in commands(get_command(app)):
-        words = {w for line in (*TRIED, *UNANSWERED) if f"{line} ".startswith(f"{called} ") for w in line.split()}
-        elsewhere = ELSEWHERE.get(called, ("", ""))[0].split()
-        offered = [set(p.opts) for p in command.params if not p.hidden and p.opts[0].startswith("-")]
-        left = [" or ".join(opts) for opts in offered if not opts & {*words, *elsewhere, "--help"}]
-        if left and elsewhere != ["*"]:
-            untried[called] = left
-        gone = (
-            {*elsewhere, *(w for w in words if w.startswith("--"))}
-            - {"*"}
-            - {o for p in command.params for o in p.opts}
-        )
-        assert not gone, f"{called} has no {gone}"
-    assert not untried
+def test_every_option_of_every_built_in_command_is_tried() -> None:
+    assert untried(commands(built_in=True), (*TRIED, *UNANSWERED), ELSEWHERE) == {}

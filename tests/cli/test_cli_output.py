@@ -17,7 +17,7 @@ from rich.text import Text
 
 from dataflow.cli.support.arguments import chosen_streams, existing, graph_file, output_file, window
 from dataflow.cli.support.output import about_a_file, friendly_errors, jsonable, plural, seconds, size, table
-from dataflow.cli.support.progress import RunDisplay, shown
+from dataflow.cli.support.progress import RunDisplay, shown, waiting_for
 from dataflow.cli.support.report import print_report, report_json
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, RunReport, Status
 
@@ -280,6 +280,22 @@ def test_what_matters_comes_first_and_the_rest_is_asked_for() -> None:
     ]
     scores = {"metrics": {"matched": 120, "path_m": 2.4, "ate_rmse_m": 0.001, "ate_max_m": 0.5}}
     assert "scores  metrics: ate rmse 0.001 m" in printed(replace(report, summaries=scores))
+
+
+def test_scores_of_many_operators_are_one_of_each_and_no_lists() -> None:
+    summary = {"class_iou": "box 0.378, mug 0.394", "iou": 0.5, "accuracy": 0.9}
+    report = replace(lossy_report(), summaries={f"score_{i}": summary for i in range(4)})
+
+    assert printed(report)[1] == "scores  score_0: iou 0.5; score_1: iou 0.5; score_2: iou 0.5; score_3: iou 0.5"
+
+
+def test_parts_of_the_runtime_are_called_what_they_are() -> None:
+    operators = {"@log": OperatorCounts(100, 100, 0, 0, 0)} | dict(lossy_report().operators)
+    report = replace(lossy_report(), operators=operators)
+    status = Status(waiting=("@log", "odometry", "@recorder"))
+
+    assert printed(report)[1].startswith("rates   recording 9.9 Hz, ")
+    assert waiting_for(status) == "waiting for recording, odometry, recorder"
 
 
 def test_a_miss_is_no_loss() -> None:

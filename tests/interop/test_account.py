@@ -103,6 +103,47 @@ def test_what_a_type_has_no_place_for_is_named_with_its_number(tmp_path: Path) -
     assert "/scan: no place for scan_time (in 3 messages)" in account.lines()
 
 
+def test_bytes_behind_the_last_row_of_an_image_are_named(tmp_path: Path) -> None:
+    rows = [("/img", s, image(s, "rgb8", bytes(48 + 16), 4, 4, 12)) for s in STAMPS]
+
+    account = converted(write_ros2(tmp_path / "bag", rows), tmp_path / "o.mcap").account
+
+    assert account.lost["/img"] == {"16 bytes behind the last of 4 rows (is step right?)": 6}
+
+
+def test_transforms_of_a_frame_to_itself_and_further_parents_are_named(tmp_path: Path) -> None:
+    rows = [
+        (
+            "/tf",
+            s,
+            ros("tf2_msgs/TFMessage", transforms=[transform(s, parent, "base") for parent in ("a", "b", "base")]),
+        )
+        for s in STAMPS
+    ]
+
+    account = converted(write_ros2(tmp_path / "bag", rows), tmp_path / "o.mcap").account
+
+    assert account.lost["/tf"] == {"a parent of base: a beside b": 6, "a transform of base to itself": 6}
+    assert account.repaired["/tf"] == {"merged": 6}
+    assert [m.frames for m in read(tmp_path / "o.mcap", "tf")] == [("b",)] * 6
+
+
+def test_a_topic_without_a_message_is_named(tmp_path: Path) -> None:
+    bag = write_ros2(tmp_path / "bag", imus(STAMPS), declared=("/camera",))
+
+    account = converted(bag, tmp_path / "o.mcap").account
+
+    assert "declared without a message: /camera" in account.lines()
+
+
+def test_a_fix_whose_latitude_is_a_longitude_is_named_so(tmp_path: Path) -> None:
+    rows = [("/fix", s, ros("sensor_msgs/NavSatFix", header=header(s), latitude=116.4, longitude=39.9)) for s in STAMPS]
+
+    (line,) = converted(write_ros2(tmp_path / "bag", rows), tmp_path / "o.mcap").account.notes
+
+    assert "a latitude of 116.4 and a longitude of 39.9 degrees: are they swapped?" in line
+
+
 def test_a_field_that_a_newer_definition_has_more_is_named_and_the_rest_is_read(tmp_path: Path) -> None:
     text = "std_msgs/Header header\ngeometry_msgs/Vector3 vector_more\nfloat64 temperature\nfloat64 variance\n"
     types = get_types_from_msg(text, "sensor_msgs/msg/Temperature")

@@ -47,6 +47,15 @@ def test_headers_that_go_far_back_are_not_taken() -> None:
     assert choose_clock([times([*LOG[:5], *(LOG[:5] - 60 * S)])]).why == "the headers of /a go back by 60.4 s"
 
 
+def test_headers_of_a_clock_that_is_set_back_a_little_are_not_taken_and_late_messages_are_put_in_order() -> None:
+    log = np.arange(60) * S // 10 + 1_700_000_000 * S
+    late = log.copy()
+    late[[30, 31]] = late[[28, 27]] - 500_000_000
+
+    assert choose_clock([times([*log[:30], *(log[30:] - 2 * S)], log=log)]).why == "the headers of /a go back by 1.9 s"
+    assert choose_clock([times(late, log=log)]).kind == "header"
+
+
 def test_headers_that_stand_still_are_not_taken() -> None:
     assert choose_clock([times([LOG[0]] * 10)]).why == "10 headers of /a carry only 1 different times"
     assert choose_clock([times([LOG[0]] * 10, shares=True)]).kind == "header"

@@ -61,8 +61,15 @@ def test_times_of_another_clock_are_counted_from_the_first_point_and_named() -> 
     assert "another clock" in odd
 
 
-def test_times_that_make_no_sense_are_not_known_and_named() -> None:
-    offsets, odd = point_times(np.array([0.0, 1e30], "f8"), STAMP)
+@pytest.mark.parametrize(
+    "values",
+    [
+        [0.0, 1e30],
+        [0.0, 0.5, 1.0],  # shares of a sweep
+    ],
+)
+def test_times_that_make_no_sense_are_not_known_and_named(values: list[float]) -> None:
+    offsets, odd = point_times(np.array(values, "f8"), STAMP, period=0.1)
 
     assert offsets is None
     assert "make no sense" in odd

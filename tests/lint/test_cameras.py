@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import re
 
+import cv2
 import numpy as np
 import pytest
 from lint_material import MadeMaterial, every
 
 from dataflow.lint.look import lint
-from dataflow.messages import CameraInfo, Image, Message
+from dataflow.messages import CameraInfo, CompressedImage, Image, Message
 
 STAMPS = every(0.1)
 
 
 def images(frame: str, width: int, height: int) -> list[Message]:
     return [Image(stamp=s, frame=frame, data=np.zeros((height, width, 3), np.uint8)) for s in STAMPS]
+
+
+def files(frame: str, width: int, height: int) -> list[Message]:
+    data = cv2.imencode(".png", np.zeros((height, width, 3), np.uint8))[1]
+    return [CompressedImage(stamp=s, frame=frame, format="png", data=data.ravel()) for s in STAMPS]
 
 
 def info(frame: str, width: int, height: int, cx: float = 30, cy: float = 20) -> list[Message]:
@@ -34,6 +40,12 @@ def info(frame: str, width: int, height: int, cx: float = 30, cy: float = 20) ->
             {"left": images("c", 64, 48), "right": images("c", 80, 60), "info": info("c", 64, 48)},
             "right",
             "80x60 pixels",
+        ),
+        ({"c/image": files("c", 64, 48), "c/info": info("c", 128, 96)}, "c/image", "64x48 pixels, .* c/info of 128x96"),
+        (
+            {"c/image": images("c", 64, 48), "c/camera_info": info("d", 64, 48)},
+            "c/image",
+            "of frame 'c', and c/camera_info is the calibration of frame 'd'",
         ),
     ],
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dataflow.lint.frames import FrameTree, check_frames
-from dataflow.messages import Imu, Message, Pose, Transforms
+from dataflow.messages import Imu, Message, Odometry, Pose, Transforms
 
 
 def transforms(*pairs: tuple[str, str]) -> Transforms:
@@ -48,6 +48,16 @@ def test_two_parents_and_a_circle_are_errors() -> None:
     assert twice == ["frame 'camera' has 2 parents: 'base' (a), 'head' (b)"]
     (circle,) = texts(tree(a=transforms(("x", "y"), ("y", "z"), ("z", "x"))))
     assert circle.startswith("frames lie within each other: ")
+
+
+def test_odometry_that_places_its_own_frame_or_none_is_named() -> None:
+    def odometry(child: str) -> Odometry:
+        still = np.array([0, 0, 0, 1.0])
+        return Odometry(stamp=0, frame="odom", child_frame=child, position=np.zeros(3), orientation=still)
+
+    assert texts(tree(o=odometry("odom"))) == ["it places frame 'odom' in itself: child_frame is that of the robot"]
+    assert texts(tree(o=odometry(""))) == ["it places no frame: child_frame is that of the robot"]
+    assert texts(tree(o=odometry("base"))) == []
 
 
 def test_frames_of_the_contract_must_be_there() -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from made_bags import SECOND, header, ros, write_ros2
+from made_bags import SECOND, Row, header, ros, transform, write_ros2
 from typer.testing import CliRunner
 
 from dataflow.cli.main import app
 from dataflow.interop.opening import open_bag
 from dataflow.lint.bags import BagMaterial
+from dataflow.lint.look import lint
 
 BEGIN = 1_700_000_000 * SECOND
 TENTH = SECOND // 10
@@ -45,3 +46,31 @@ def test_planted_faults_of_a_bag_are_named(tmp_path: Path) -> None:
     assert found["duplicate"]["values"] == {"messages": 1}
     assert found["backward"]["values"]["messages"] == 1
     assert abs(found["gap"]["values"]["longest_s"] - 1.0) < 0.01
+
+
+def told(folder: Path, rows: list[Row], *, declared: tuple[str, ...] = ()) -> list[tuple[str, str, str]]:
+    """(check, stream, text) of what is found in a bag."""
+    opened = open_bag(write_ros2(folder / "bag", rows, declared=declared))
+    report = lint(BagMaterial(opened))
+    opened.close()
+    return [(finding.check, finding.stream, finding.text) for finding in report.findings]
+
+
+def test_headers_without_a_time_and_topics_without_a_message_are_named(tmp_path: Path) -> None:
+    rows = [("/imu", BEGIN + k * TENTH, ros("sensor_msgs/Imu", header=header(0, "imu"))) for k in range(20)]
+
+    found = told(tmp_path, rows, declared=("/camera",))
+
+    assert ("empty", "/camera", "it is declared, and holds no message") in found
+    (text,) = [text for check, _, text in found if check == "unstamped"]
+    assert text.startswith("20 of 20 headers carry no time")
+
+
+def test_two_parents_in_one_message_are_an_error(tmp_path: Path) -> None:
+    stamps = [BEGIN + k * TENTH for k in range(9)]
+    both = {stamp: [transform(stamp, parent, "base") for parent in ("a", "b")] for stamp in stamps}
+    rows = [("/tf", stamp, ros("tf2_msgs/TFMessage", transforms=both[stamp])) for stamp in stamps]
+
+    found = told(tmp_path, rows)
+
+    assert ("frames", "/tf", "frame 'base' has 2 parents: 'a' (/tf), 'b' (/tf)") in found

@@ -7,7 +7,7 @@ import pytest
 from lint_material import MadeMaterial, every
 
 from dataflow.lint.look import lint
-from dataflow.messages import DepthImage, Imu, Message, NavSatFix, PointCloud
+from dataflow.messages import DepthImage, Image16, Imu, LaserScan, Message, NavSatFix, PointCloud
 
 
 def imu(stamp: int, acceleration: float = 9.81, rate: float = 0.1) -> Imu:
@@ -27,6 +27,16 @@ def fix(stamp: int) -> NavSatFix:
     return NavSatFix(stamp=stamp, frame="gps", latitude=0.0, longitude=0.0, altitude=0.0)
 
 
+def scan(stamp: int, turn: float) -> LaserScan:
+    return LaserScan(stamp=stamp, frame="l", angle_min=-turn, angle_max=turn, ranges=np.ones(9, np.float32))
+
+
+def sloping(stamp: int, order: str) -> Image16:
+    """A slope of 1 a pixel, its bytes in one order or the other."""
+    slope = np.arange(1000, 1064, dtype=np.uint16)[None] + np.zeros((4, 1), np.uint16)
+    return Image16(stamp=stamp, frame="camera", data=slope.byteswap() if order == ">" else slope)
+
+
 STAMPS = every(0.1)
 
 
@@ -44,6 +54,10 @@ STAMPS = every(0.1)
         ([depth(s, 0.25) for s in STAMPS], "if its units were millimetres, it is 1.2 to 1.2 m"),
         ([cloud(s, 1e5) for s in STAMPS], "in µs that would be 0.1 s"),
         ([fix(s) for s in STAMPS], "0° N 0° E"),
+        ([cloud(s, 1.0) for s in STAMPS], "measured over 1 s, and a cloud comes every 0.1 s"),
+        ([scan(s, 180.0) for s in STAMPS], "span 360 rad, more than a turn: are they in degrees?"),
+        ([sloping(s, ">") for s in STAMPS], "two bytes swapped"),
+        ([depth(s, 1.0).replace(data=sloping(s, ">").data / np.float32(1000)) for s in STAMPS], "two bytes swapped"),
     ],
 )
 def test_what_cannot_be_is_named_with_the_unit_that_makes_sense(messages: list[Message], told: str) -> None:
@@ -58,6 +72,9 @@ def test_what_can_be_is_not_named() -> None:
         "imu": [imu(s) for s in STAMPS],
         "depth": [depth(s, 2.0) for s in STAMPS],
         "cloud": [cloud(s, 0.1) for s in STAMPS],
+        "scan": [scan(s, np.pi) for s in STAMPS],
+        "grey": [sloping(s, "<") for s in STAMPS],
+        "upper": [sloping(s, "<").replace(data=sloping(s, "<").data << 8) for s in STAMPS],
     }
 
     assert not [f for f in lint(MadeMaterial(sound)).findings if f.check in ("quantity", "clocks")]

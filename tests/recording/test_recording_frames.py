@@ -38,6 +38,10 @@ def test_a_frame_that_transforms_place_is_no_root() -> None:
     assert [t.child_frames for t in tree.transforms("wheels", odometry(1))] == [("base_link",)]
 
 
+def test_odometry_that_places_its_own_frame_is_no_transform() -> None:
+    assert list(FrameTree().transforms("wheels", odometry(1, child="odom"))) == []
+
+
 def test_the_derived_channel_is_there_for_others_and_no_stream_of_ours(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with RecordingWriter(path, metadata={}, namespace="robot1") as writer:

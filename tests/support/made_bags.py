@@ -96,11 +96,13 @@ def transform(stamp: int, frame: str, child: str, x: float = 0.0) -> Any:
     return ros("geometry_msgs/TransformStamped", header=header(stamp, frame), child_frame_id=child, transform=placed)
 
 
-def write_ros2(path: Path, rows: Iterable[Row], storage: str = "mcap") -> Path:
-    """A ROS 2 bag folder with `sqlite3` or `mcap` storage; returns its path."""
+def write_ros2(path: Path, rows: Iterable[Row], storage: str = "mcap", declared: Iterable[str] = ()) -> Path:
+    """A ROS 2 bag folder with `sqlite3` or `mcap` storage; returns its path. `declared`: topics of images, empty."""
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer2(path, version=9, storage_plugin=plugin) as writer:
         known: dict[str, Any] = {}
+        for topic in declared:
+            writer.add_connection(topic, "sensor_msgs/msg/Image", typestore=ROS2)
         for topic, time, message in rows:
             if topic not in known:
                 known[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ROS2)

@@ -11,9 +11,9 @@ import typer
 from rich.padding import Padding
 from rich.text import Text
 
-from dataflow.cli.support.arguments import Json, number, output_file
+from dataflow.cli.support.arguments import Json, number, output_file, span, window
 from dataflow.cli.support.execution import Outputs, execute, plan_options
-from dataflow.cli.support.output import fail, friendly_errors, out, print_json, say
+from dataflow.cli.support.output import fail, friendly_errors, out, print_json, say, seconds
 from dataflow.cli.support.run_options import Quiet
 
 GRAPH, RECORDING = "perception", "demo"
@@ -58,6 +58,8 @@ def demo(
     import dataflow.shipped as shipped
     from dataflow.cli.support.execution import checked_outputs
     from dataflow.graph import load_graph
+    from dataflow.recording import Recording
+    from dataflow.supervision.replay import plan_replay
     from dataflow.supervision.run import replay as replay_recording
 
     with friendly_errors():
@@ -69,13 +71,16 @@ def demo(
         loaded = load_graph(graph.path)
         rate = None if outputs.view_file is not None else 1.0
         options = plan_options(loaded, outputs, False, False, None, rate, False, 120.0)
-        if outputs.live_view is not None:
-            say("the recording plays in real time; Ctrl-C ends it")
+        with Recording(recording) as opened:
+            whole = span(opened, plan_replay(opened, loaded).streams)
+            _, finish = window(whole, None, duration, recording)
+        pace = "as fast as this machine computes it" if rate is None else "in real time; Ctrl-C ends it"
+        say(f"plays {seconds(duration)} of a drive {pace}, once the processes have started, which takes some 10 s")
         execute(
             lambda watch: replay_recording(recording, graph=loaded, end=duration, watch=watch, **options),
             loaded,
             outputs,
-            None,
+            None if whole is None or finish is None else (whole[0], min(whole[1], finish)),
             began=began,
             json=json,
             quiet=quiet,

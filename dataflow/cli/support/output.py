@@ -265,6 +265,14 @@ def count(number: float) -> str:
     return f"{number:,.0f}"
 
 
+_PARTS = {"@log": "recording", "@recorder": "recorder", "@view": "viewer's file"}
+
+
+def called(name: str) -> str:
+    """What an operator or a process is called: by its name, the runtime's own parts by what they are."""
+    return _PARTS.get(name, name)
+
+
 def plural(number: int, word: str) -> str:
     """(1, "stream") → "1 stream"; (2, "stream") → "2 streams"."""
     return f"{number:,} {word}{'' if number == 1 else 's'}"

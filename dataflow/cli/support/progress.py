@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.cli.support.output import count, seconds
+from dataflow.cli.support.output import called, count, seconds
 from dataflow.cli.support.quantities import speed_text
 from dataflow.supervision.core.report import OperatorCounts, Status, Watch
 from dataflow.sync import FOREVER, NEVER
@@ -121,8 +121,8 @@ class RunDisplay:
         for name, counts in status.operators.items():
             rate = self._rates.of(name, counts.firings or counts.emitted, now)
             table.add_row(
-                Text(name),
-                Text(status.process_of.get(name, "")),
+                Text(called(name)),
+                Text(called(status.process_of.get(name, ""))),
                 count(counts.firings) if counts.firings else "",
                 "" if rate is None else f"{rate:.1f}",
                 count(counts.emitted) if counts.emitted else "",
@@ -139,7 +139,7 @@ def waiting_for(status: Status) -> str:
     if not status.waiting:
         return ""
     more = len(status.waiting) - NAMED
-    return f"waiting for {', '.join(status.waiting[:NAMED])}" + (f" and {more} more" if more > 0 else "")
+    return f"waiting for {', '.join(map(called, status.waiting[:NAMED]))}" + (f" and {more} more" if more > 0 else "")
 
 
 def _share(nanoseconds: int, elapsed: float) -> str:

@@ -13,7 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.cli.support.output import count, plural, seconds, size, table
+from dataflow.cli.support.output import called, count, plural, seconds, size, table
 from dataflow.operator import FINDING
 from dataflow.records.figures import figures
 from dataflow.supervision.core.report import RunReport
@@ -27,6 +27,8 @@ _VALUE_WIDTH = 30
 SCORES = ("rmse", "precision", "recall", "f1", "iou", "accuracy", "error")
 """Parts of the names of figures that say how good something is."""
 MOST_SCORES, MOST_LOSSES, MOST_KEPT = 3, 4, 5
+SCORES_IN_ALL = 6
+"""Of all operators, at least one of each."""
 
 
 def print_report(console: Console, report: RunReport, *, total: float | None = None, verbose: bool = True) -> None:
@@ -71,12 +73,15 @@ def _scores(report: RunReport) -> Text | None:
     """The first scores of each operator that sums some up; None where none does."""
     found = []
     for operator, summary in report.summaries.items():
+        numbers = {name: value for name, value in summary.items() if isinstance(value, int | float)}
         scores = [
-            f"{name} {text}" for name, text in figures(summary).items() if any(part in name.split() for part in SCORES)
+            f"{name} {text}" for name, text in figures(numbers).items() if any(part in name.split() for part in SCORES)
         ]
         if scores:
-            found.append(f"{operator}: {', '.join(scores[:MOST_SCORES])}")
-    return Text(f"scores  {'; '.join(found)}") if found else None
+            found.append((operator, scores))
+    most = max(1, min(MOST_SCORES, SCORES_IN_ALL // max(1, len(found))))
+    words = [f"{operator}: {', '.join(scores[:most])}" for operator, scores in found]
+    return Text(f"scores  {'; '.join(words)}") if found else None
 
 
 def _findings(report: RunReport) -> list[Text]:
@@ -88,11 +93,12 @@ def _findings(report: RunReport) -> list[Text]:
 def _rates(report: RunReport) -> Text | None:
     """The rate of every source, and of the slowest operator behind them."""
     rates = {name: rate for name in report.operators if (rate := _rate(report, name)) is not None}
-    sources = {name: rate for name, rate in rates.items() if name in report.sources}
-    others = {name: rate for name, rate in rates.items() if name not in report.sources}
+    given = (*report.sources, "@log")
+    sources = {name: rate for name, rate in rates.items() if name in given}
+    others = {name: rate for name, rate in rates.items() if name not in given}
     if not rates:
         return None
-    words = [f"{name} {rate:.1f} Hz" for name, rate in sources.items()]
+    words = [f"{called(name)} {rate:.1f} Hz" for name, rate in sources.items()]
     if others:
         slowest = min(others, key=lambda name: others[name])
         words.append(f"{'slowest: ' if len(others) > 1 else ''}{slowest} {others[slowest]:.1f} Hz")
@@ -207,7 +213,7 @@ def _operators(report: RunReport) -> Table:
     made.columns[0].min_width = 12
     for name, counts in report.operators.items():
         made.add_row(
-            Text(name),
+            Text(called(name)),
             count(counts.firings) if counts.firings else "",
             count(counts.emitted) if counts.emitted else "",
             "" if (rate := _rate(report, name)) is None else f"{rate:.1f}",

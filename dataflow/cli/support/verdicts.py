@@ -40,7 +40,7 @@ def print_one(console: Console, checked: Checked) -> None:
     """Operators with their verdicts, what there is to say about each, what differs between the machines, the end."""
     report = checked.report
     assert report is not None
-    numbers = ("firings", "repeated", "outputs", "differing")
+    numbers = ("firings", "repeated", "out", "differing")
     verdicts = table("operator", *numbers, "verdict", right=numbers)
     by_name = {v.operator: v for v in report.operators}
     for judged in checked.judged:

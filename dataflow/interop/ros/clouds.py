@@ -140,6 +140,8 @@ _EPOCH = {"ns": 1e17, "µs": 1e14, "ms": 1e11, "s": 1e8}
 """Values beyond are since the epoch, in that unit: 1973 and later."""
 LONGEST = 60.0
 """Seconds that the points of one cloud may lie from its stamp."""
+SHORTEST = 0.03
+"""Of the time from cloud to cloud, the least that a sweep takes."""
 
 
 def point_times(
@@ -187,4 +189,6 @@ def _likeliest(span: float, farthest: float, whole: bool, period: float) -> str 
         possible = [u for u in possible if u != "s"]
         if usual in possible and span * _UNITS[usual] < 0.01 * period and span:
             return possible[0]
+    elif span:  # shares of a sweep, from 0 to 1, are no milliseconds
+        possible = [u for u in possible if u == usual or span * _UNITS[u] > SHORTEST * period]
     return usual if usual in possible else possible[0] if possible else None

@@ -41,6 +41,9 @@ def image(message: Any, stamp: int) -> Image | Image16 | DepthImage:
         big_endian=bool(message.is_bigendian),
     )
     frame = message.header.frame_id
+    rest = len(message.data) - message.height * (int(message.step) or rows[0].nbytes)
+    if rest > 0:
+        lose(message, f"{rest:,} bytes behind the last of {message.height} rows (is step right?)")
     if is_depth(message.encoding):
         if message.encoding == "64FC1" and (rows.astype(np.float32) != rows)[np.isfinite(rows)].any():
             lose(message, "depth beyond 32 bits")

@@ -95,12 +95,13 @@ def transform(message: Any, stamp: int) -> Transforms:
 def transforms(rows: Sequence[Any], stamp: int) -> Transforms:
     """Some geometry_msgs/TransformStamped as one set; of those that place one frame the last counts.
 
-    Frames that begin with a slash, as in early ROS, are named without it. A transform of a frame to itself is left out,
-    and so is one whose rotation is NaN.
+    Frames that begin with a slash, as in early ROS, are named without it. Left out, and lost: a transform of a frame to
+    itself, and one whose rotation is NaN.
     """
     placed = []
     for row in rows:
         if _bare(row.child_frame_id) == _bare(row.header.frame_id):
+            lose(row, f"a transform of {_bare(row.child_frame_id)} to itself")
             continue
         if np.isfinite(orientation(row.transform.rotation)).all():
             placed.append(row)

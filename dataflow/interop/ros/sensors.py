@@ -24,6 +24,7 @@ from dataflow.messages import (
     Text,
 )
 from dataflow.messages.poses import COVARIANCE_TYPES
+from dataflow.recording.errors import RecordingError
 
 _FIX = {-1: "no_fix", 0: "fix", 1: "sbas", 2: "gbas"}
 _LEVELS = {1: "debug", 2: "info", 4: "warning", 8: "error", 16: "fatal"}
@@ -88,6 +89,10 @@ def nav_sat_fix(message: Any, stamp: int) -> NavSatFix:
     """sensor_msgs/NavSatFix; no fix where it has no position."""
     kind = int(message.position_covariance_type)
     placed = bool(np.isfinite([message.latitude, message.longitude]).all())
+    if placed and abs(message.latitude) > 90 >= abs(message.longitude):
+        raise RecordingError(
+            f"a latitude of {message.latitude:g} and a longitude of {message.longitude:g} degrees: are they swapped?"
+        )
     if not placed and int(message.status.status) >= 0:
         lose(message, "a status of a fix without a position")
     errors = covariance(message.position_covariance, 3) if kind else None

@@ -28,7 +28,8 @@ class FrameTree:
         """The transforms to write beside `message`: its own when it is the first stream to place that frame, and the
         link from the viewer's root to a frame that nothing places."""
         if isinstance(message, Odometry):
-            if message.child_frame and self._placed_by.setdefault(message.child_frame, stream) == stream:
+            places_one = message.child_frame not in ("", message.frame)
+            if places_one and self._placed_by.setdefault(message.child_frame, stream) == stream:
                 link = self._root(message.frame)
                 own = Transforms(
                     stamp=message.stamp,

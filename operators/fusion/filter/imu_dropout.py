@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.fusion.filter.error_state import Noise, State
 from operators.fusion.filter.history import Sample
 
@@ -16,16 +14,19 @@ _SEEN = 300_000_000  # ns for which a turning that was seen goes on
 _TURNING = 0.05  # rad/s/√Hz: density of the noise of a turning that another sensor sees
 
 
-class ImuDropout:
+class ImuDropout(Remembered):
     """Makes samples in the inertial sensor's place once it has given none for `patience` (s)."""
+
+    bridged: int
+    _felt: int
+    _seen: int
+    _turning: Array
 
     def __init__(self, patience: float, gravity: float, unknown: Noise) -> None:
         self._patience = round(patience * 1e9)
         self._up = np.array([0.0, 0.0, gravity])
         self._unknown = unknown
-        self._felt = self._seen = -1
-        self._turning = np.zeros(3)
-        self.bridged = 0
+        self._felt, self._seen, self._turning, self.bridged = -1, -1, np.zeros(3), 0
 
     def felt(self, time: int) -> None:
         """Takes note that the inertial sensor gave a sample."""
@@ -49,10 +50,3 @@ class ImuDropout:
         if seen:
             noise = Noise(_TURNING, noise.accel, noise.gyro_walk, noise.accel_walk)
         return Sample(time, turning + state.gyro_bias, state.rotation.T @ self._up + state.accel_bias, noise)
-
-    def snapshot(self) -> dict[str, Any]:
-        return {"times": [self._felt, self._seen], "turning": self._turning, "bridged": self.bridged}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._felt, self._seen = (int(time) for time in state["times"])
-        self._turning, self.bridged = np.array(state["turning"], np.float64), int(state["bridged"])

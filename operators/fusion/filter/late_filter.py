@@ -11,11 +11,11 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import (
     SIZE,
@@ -34,13 +34,8 @@ from operators.fusion.filter.history import (
     Measurement,
     Node,
     Sample,
-    node_of,
-    plain_node,
-    plain_sample,
-    sample_of,
 )
 from operators.fusion.filter.hypotheses import combined, likely, moves, reduced, refuted, with_errors
-from operators.fusion.filter.measurements import from_plain, to_plain
 from operators.fusion.filter.sensor_errors import SensorErrors
 
 Array = NDArray[np.float64]
@@ -75,20 +70,32 @@ class FilterConfig:
     unfelt: float | None = None
 
 
-class LateFilter:
+class LateFilter(Remembered):
     """Takes inertial samples in order and measurements in any; several hypotheses until one has explained the rest."""
+
+    ignored: Counter[str]
+    _base: Node  # the oldest estimate of the window: the rest follows from it and what was given since
+    _entries: list[Entry]
+    _keys: list[tuple[int, int, str, int]]
+    _count: int
 
     def __init__(self, config: FilterConfig, start: Node) -> None:
         self._config = config
         self._down = np.array([0.0, 0.0, -config.gravity])
         self._wander = config.errors.wander
-        self._nodes = [with_errors(start, config.errors.sigmas)]
-        self._entries: list[Entry] = []
-        self._keys: list[tuple[int, int, str, int]] = []
-        self._sample_times: list[int] = []
-        self._samples: list[Sample] = []
-        self._count = 0
-        self.ignored: Counter[str] = Counter()
+        self._base, self._entries, self._keys, self._count = start, [], [], 0
+        self.ignored = Counter()
+        self.restored()
+
+    def prepare_snapshot(self) -> None:
+        self._newest()
+        self._base = self._nodes[0]
+
+    def restored(self) -> None:
+        self._nodes = [with_errors(self._base, self._config.errors.sigmas)]
+        self._samples = [entry for entry in self._entries if isinstance(entry, Sample)]
+        self._sample_times = [sample.time for sample in self._samples]
+        self._advance()
 
     @property
     def time(self) -> int:
@@ -156,47 +163,6 @@ class LateFilter:
         if time > node.time:
             node = self._moved(node, time, node.gyro, node.accel, self._noise())
         return combined(node.hypotheses), node.gyro
-
-    def snapshot(self) -> dict[str, Any]:
-        """The oldest estimate of the window and what was given since: the rest follows from them."""
-        self._newest()
-        first = max(0, bisect_right(self._sample_times, self._nodes[0].time))
-        return {
-            "base": plain_node(self._nodes[0]),
-            "samples": [plain_sample(s) for s in self._samples[first:]],
-            "measurements": [
-                [e.time, e.sensor, to_plain(e.model), e.noise, key[3], e.clock, e.assumed]
-                for e, key in zip(self._entries, self._keys, strict=True)
-                if isinstance(e, Measurement)
-            ],
-            "commands": [
-                [e.time, e.linear, e.angular, e.lag, key[3]]
-                for e, key in zip(self._entries, self._keys, strict=True)
-                if isinstance(e, Command)
-            ],
-            "count": self._count,
-            "ignored": dict(self.ignored),
-        }
-
-    @classmethod
-    def restored(cls, config: FilterConfig, state: Mapping[str, Any]) -> LateFilter:
-        """Goes on where a snapshot was taken."""
-        made = cls(config, node_of(state["base"]))
-        rows = [(sample_of(s), 0, "", 0) for s in state["samples"]]
-        entries: list[tuple[Entry, int, str, int]] = list(rows)
-        for time, sensor, model, noise, number, *clock in state["measurements"]:
-            measurement = Measurement(int(time), sensor, from_plain(model), noise, *clock)
-            entries.append((measurement, 1, sensor, int(number)))
-        for time, linear, angular, lag, number in state.get("commands", ()):
-            entries.append((Command(int(time), linear, angular, float(lag)), 2, "", int(number)))
-        entries.sort(key=lambda row: (row[0].time, *row[1:]))
-        made._samples = [row[0] for row in rows]
-        made._sample_times = [s.time for s in made._samples]
-        made._entries = [row[0] for row in entries]
-        made._keys = [(row[0].time, *row[1:]) for row in entries]
-        made._count, made.ignored = int(state["count"]), Counter(state["ignored"])
-        made._advance()
-        return made
 
     def _noise(self) -> Noise:
         return self._samples[-1].noise if self._samples else self._config.unknown

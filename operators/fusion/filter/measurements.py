@@ -6,9 +6,7 @@ A residual is measurement - prediction, to first order Jacobian @ error. `rate` 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,18 +26,6 @@ from operators.geometry.se3 import skew
 
 Array = NDArray[np.float64]
 _I3 = np.eye(3)
-
-
-class Model(Protocol):
-    """One kind of measurement."""
-
-    def innovation(self, state: State, rate: Array) -> tuple[Array, Array]:
-        """Returns the residual (M,) and its Jacobian (M, 15)."""
-        ...
-
-    def widening(self, residual: Array, seconds: float) -> Array:
-        """Returns variances (15,) that make room for a residual which arose in a time."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,19 +173,9 @@ class Range:
         return _wide(residual, (POSITION, 1.0), (VELOCITY, 1.0 / max(seconds, 0.1)))
 
 
-_KINDS = (Position, Orientation, FullPose, Velocity, AngularRate, RestingForce, MagneticHeading, Range)
-
-
-def to_plain(model: Model) -> dict[str, Any]:
-    """The kind and the numbers of a measurement, as snapshots hold them."""
-    own = {f.name: getattr(model, f.name) for f in fields(model)}  # type: ignore[arg-type]
-    return {"kind": type(model).__name__, **own}
-
-
-def from_plain(content: Mapping[str, Any]) -> Model:
-    """The inverse of `to_plain`."""
-    kind = next(k for k in _KINDS if k.__name__ == content["kind"])
-    return kind(**{name: value for name, value in content.items() if name != "kind"})
+Model = Position | Orientation | FullPose | Velocity | AngularRate | RestingForce | MagneticHeading | Range
+"""One kind of measurement. `innovation(state, rate)` gives the residual (M,) and its Jacobian (M, 15);
+`widening(residual, seconds)` variances (15,) that make room for a residual which arose in a time."""
 
 
 def _left_inverse(w: Array) -> Array:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics
 from dataflow.messages.diagnostics import Level
+from dataflow.operator import Remembered
 from operators.fusion.redundant.combination import contradicts
 from operators.status import Row, status_of_rows
 
@@ -19,19 +20,21 @@ Array = NDArray[np.float64]
 _SMOOTH, _SUDDEN, _LARGEST = 0.05, 20.0, 100.0
 
 
-class Agreement:
+class Agreement(Remembered):
     """Follows how far each sensor is from the others: `noise` is by how much its covariance is too small.
 
     Of three or more sensors one that contradicts the others is left out. Of two it is undecidable which is wrong: both
     stay, and the result's covariance has to hold both. Innovation-based adaptation: Mehra, 1970.
     """
 
+    split: int
+    _noise: dict[str, float]
+    _doubted: Counter[str]
+    _used: Counter[str]
+
     def __init__(self, share: float) -> None:
-        self._share = share
-        self._noise: dict[str, float] = {}
-        self._doubted: Counter[str] = Counter()
-        self._used: Counter[str] = Counter()
-        self.split = 0
+        self._share, self._noise, self.split = share, {}, 0
+        self._doubted, self._used = Counter(), Counter()
 
     def noise(self, sensor: str) -> float:
         """Returns the factor, 1 or more, on a sensor's covariance."""
@@ -100,16 +103,3 @@ class Agreement:
     @property
     def doubted(self) -> bool:
         return bool(self._doubted)
-
-    def snapshot(self) -> dict[str, Any]:
-        return {
-            "noise": dict(self._noise),
-            "doubted": dict(self._doubted),
-            "used": dict(self._used),
-            "split": self.split,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._noise = {sensor: float(value) for sensor, value in state["noise"].items()}
-        self._doubted, self._used = Counter(state["doubted"]), Counter(state["used"])
-        self.split = int(state["split"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,13 @@ from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import skew
 
 Array = NDArray[np.float64]
+
+
+@dataclass
+class State:
+    """Holds what each sensor gave last, and how far the sensors agree."""
+
+    sensors: RedundantSensors[Message]
 
 
 class PoseFusion(Operator):
@@ -45,18 +52,20 @@ class PoseFusion(Operator):
     window: Duration = Param("50ms", doc="how old a sensor's message may be")
     share: float = Param(0.999, gt=0, lt=1, doc="share of true estimates that do not count as a contradiction")
 
-    def setup(self) -> None:
-        self._sensors: RedundantSensors[Message] = RedundantSensors(self.window, self.share)
+    state: State
+
+    def initial_state(self) -> State:
+        return State(RedundantSensors(self.window, self.share))
 
     def process(
         self, estimates: Mapping[str, Message], context: Context, extrinsics: Transforms | None = None
     ) -> dict[str, Any]:
         """Raises ValueError for poses of another frame, and for estimates without covariance."""
         stamp = context.stamp
-        self._sensors.take(estimates)
-        agreement = self._sensors.agreement
+        self.state.sensors.take(estimates)
+        agreement = self.state.sensors.agreement
         seen: dict[str, RigidPose] = {}
-        for name, message in self._sensors.simultaneous(stamp):
+        for name, message in self.state.sensors.simultaneous(stamp):
             if (one := self._of(name, message, extrinsics)) is not None:
                 seen[name] = replace(one, information=one.information / agreement.noise(name))
         result: dict[str, Any] = {}
@@ -73,15 +82,11 @@ class PoseFusion(Operator):
                     covariance=inverted(mean.information) * growth,
                 )
             else:
-                self._sensors.ignored["position or orientation unknown"] += 1
-        return result | {"status": self._sensors.status(stamp)}
-
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew."""
-        self.setup()
+                self.state.sensors.ignored["position or orientation unknown"] += 1
+        return result | {"status": self.state.sensors.status(stamp)}
 
     def summary(self) -> Mapping[str, float | int | str]:
-        return self._sensors.summary()
+        return self.state.sensors.summary()
 
     def _of(self, name: str, message: Message, extrinsics: Transforms | None) -> RigidPose | None:
         """The pose in a message; None where there is none, which is counted."""
@@ -98,7 +103,7 @@ class PoseFusion(Operator):
         if given is None:
             raise ValueError(f"{name}: its messages have no covariance: how good they are must be known")
         if not (np.isfinite(message.position).all() and np.isfinite(message.orientation).all()):
-            self._sensors.ignored[f"{name}: not finite"] += 1
+            self.state.sensors.ignored[f"{name}: not finite"] += 1
             return None
         T_child_base = invert(transform_between(extrinsics, message.child_frame or self.base_frame, self.base_frame))
         T = transform_matrix(message.position, message.orientation) @ T_child_base
@@ -110,10 +115,10 @@ class PoseFusion(Operator):
         self, name: str, position: Array, rotation: Array, covariance: Array, known: slice
     ) -> RigidPose | None:
         if not (np.isfinite(position).all() and np.isfinite(rotation).all() and np.isfinite(covariance).all()):
-            self._sensors.ignored[f"{name}: not finite"] += 1
+            self.state.sensors.ignored[f"{name}: not finite"] += 1
             return None
         if float(np.linalg.eigvalsh(covariance)[0]) <= 0:
-            self._sensors.ignored[f"{name}: covariance not positive"] += 1
+            self.state.sensors.ignored[f"{name}: covariance not positive"] += 1
             return None
         information = np.zeros((6, 6))
         information[known, known] = inverted(covariance)

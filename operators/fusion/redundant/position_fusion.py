@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,13 @@ from operators.geometry.extrinsics import transform_between
 from operators.localization.reading import cartesian
 
 Array = NDArray[np.float64]
+
+
+@dataclass
+class State:
+    """Holds what each sensor gave last, and how far the sensors agree."""
+
+    sensors: RedundantSensors[LandmarkSightings]
 
 
 class PositionFusion(Operator):
@@ -44,8 +52,10 @@ class PositionFusion(Operator):
     share: float = Param(0.999, gt=0, lt=1, doc="share of true sightings that do not count as a contradiction")
     largest: float = Param(2.0, gt=0, doc="places known to no better than this are not given", unit="m")
 
-    def setup(self) -> None:
-        self._sensors: RedundantSensors[LandmarkSightings] = RedundantSensors(self.window, self.share)
+    state: State
+
+    def initial_state(self) -> State:
+        return State(RedundantSensors(self.window, self.share))
 
     def process(
         self,
@@ -55,9 +65,9 @@ class PositionFusion(Operator):
     ) -> dict[str, Any]:
         """Raises ValueError for sightings without covariances or of a frame without place."""
         stamp = context.stamp
-        self._sensors.take(sightings)
+        self.state.sensors.take(sightings)
         seen: dict[int, dict[str, Place | Bearing]] = {}
-        for name, message in self._sensors.simultaneous(stamp):
+        for name, message in self.state.sensors.simultaneous(stamp):
             for identity, one in self._of(name, message, _holding(message.frame, extrinsics or {})):
                 seen.setdefault(identity, {})[name] = one
         found = [(identity, *place) for identity in sorted(seen) if (place := self._place(seen[identity])) is not None]
@@ -68,21 +78,19 @@ class PositionFusion(Operator):
             positions=np.array([point for _, point, _ in found]).reshape(-1, 3),
             covariances=np.array([C for _, _, C in found]).reshape(-1, 3, 3),
         )
-        return {"places": places, "status": self._sensors.status(stamp)}
-
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew."""
-        self.setup()
+        return {"places": places, "status": self.state.sensors.status(stamp)}
 
     def summary(self) -> Mapping[str, float | int | str]:
-        return self._sensors.summary()
+        return self.state.sensors.summary()
 
     def _place(self, seen: Mapping[str, Place | Bearing]) -> tuple[Array, Array] | None:
-        kept, growth = self._sensors.agreement.judge(list(seen), list(seen.values()), place_consistency, place_misfits)
+        kept, growth = self.state.sensors.agreement.judge(
+            list(seen), list(seen.values()), place_consistency, place_misfits
+        )
         try:
             point, covariance = placed(kept, self.largest)
         except Unknown as reason:
-            self._sensors.ignored[str(reason)] += 1
+            self.state.sensors.ignored[str(reason)] += 1
             return None
         return point, covariance * growth
 
@@ -93,7 +101,7 @@ class PositionFusion(Operator):
         if message.covariances is None:
             raise ValueError(f"{name}: sightings have no covariances: how well a thing was seen must be known")
         T = transform_between(extrinsics, message.frame, self.frame)
-        noise = self._sensors.agreement.noise(name)
+        noise = self.state.sensors.agreement.noise(name)
         if message.ranges is None and message.positions is None:
             made: list[Place | Bearing] = list(_bearings(message, T, noise))
         else:
@@ -103,9 +111,9 @@ class PositionFusion(Operator):
         found = []
         for identity, one in zip(message.ids.tolist(), made, strict=True):
             if identity < 0:
-                self._sensors.ignored[f"{name}: no identity"] += 1
+                self.state.sensors.ignored[f"{name}: no identity"] += 1
             elif not _usable(one):
-                self._sensors.ignored[f"{name}: not finite, or covariance not positive"] += 1
+                self.state.sensors.ignored[f"{name}: not finite, or covariance not positive"] += 1
             else:
                 found.append((identity, one))
         return found

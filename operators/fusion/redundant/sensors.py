@@ -7,21 +7,24 @@ from collections.abc import Iterator, Mapping
 from typing import Generic, TypeVar
 
 from dataflow.messages import Diagnostics, Message
+from dataflow.operator import Remembered
 from operators.fusion.redundant.agreement import Agreement
 
 M = TypeVar("M", bound=Message)
 _REPORTED = 1_000_000_000
 
 
-class RedundantSensors(Generic[M]):
+class RedundantSensors(Remembered, Generic[M]):
     """Keeps each sensor's newest message for `window` (ns); `share`: of true ones that count as no contradiction."""
 
+    agreement: Agreement
+    ignored: Counter[str]
+    _newest: dict[str, M]
+    _reported: int
+
     def __init__(self, window: int, share: float) -> None:
-        self._window = window
-        self._newest: dict[str, M] = {}
-        self._reported = -1
-        self.agreement = Agreement(share)
-        self.ignored: Counter[str] = Counter()
+        self._window, self._newest, self._reported = window, {}, -1
+        self.agreement, self.ignored = Agreement(share), Counter()
 
     def take(self, messages: Mapping[str, M]) -> None:
         """Takes messages by stream; one that is not later than the sensor's last is ignored and counted."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.fusion.filter.gate import GateConfig
-from operators.fusion.filter.history import Sample, plain_sample, sample_of
+from operators.fusion.filter.history import Sample
 from operators.fusion.filter.measurements import AngularRate, Model, Velocity
 from operators.fusion.sensors.settings import SensorSettings
 
@@ -27,7 +27,7 @@ _STANDING, _NOT_TURNING = 0.005, 0.002
 """Standard deviations, m/s and rad/s, of a standstill."""
 
 
-class Constraints:
+class Constraints(Remembered):
     """Makes measurements of what need not be measured, from inertial samples, ten times a second at most.
 
     *Standstill*: over half a second the readings stray less than a body that moves lets them. An inertial sensor alone
@@ -40,11 +40,13 @@ class Constraints:
     2001.
     """
 
+    _kept: list[Sample]
+    _last: int
+
     def __init__(self, standstill: float | None, slip: float | None) -> None:
         """`standstill`: RMS (m/s²) by which forces stray less at rest; `slip`: m/s. Neither is used where None."""
         self._standstill, self._slip = standstill, slip
-        self._kept: list[Sample] = []
-        self._last = -_PERIOD
+        self._kept, self._last = [], -_PERIOD
 
     @property
     def gates(self) -> dict[str, GateConfig]:
@@ -75,10 +77,3 @@ class Constraints:
         strays = float(np.sqrt(forces.var(axis=0).mean())), float(np.sqrt(rates.var(axis=0).mean()))
         steady = strays[0] < self._standstill and strays[1] < _TURNS * self._standstill
         return steady and float(np.linalg.norm(rates.mean(axis=0))) < _FASTEST
-
-    def snapshot(self) -> dict[str, Any]:
-        return {"samples": [plain_sample(s) for s in self._kept], "last": self._last}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on where a snapshot was taken."""
-        self._kept, self._last = [sample_of(row) for row in state["samples"]], int(state["last"])

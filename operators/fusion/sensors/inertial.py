@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Imu
+from dataflow.operator import Remembered
 from operators.fusion.filter.error_state import Noise
-from operators.fusion.filter.history import Node, Sample, plain_sample, sample_of
+from operators.fusion.filter.history import Node, Sample
 from operators.fusion.filter.initialisation import Prior, first_node, rests
 from operators.fusion.sensors.covariances import Unusable
 
@@ -36,14 +35,17 @@ class InertialConfig:
     patience: float
 
 
-class InertialSensor:
+class InertialSensor(Remembered):
     """Makes samples of messages, and keeps those of the beginning."""
+
+    _kept: list[Sample]
+    _first: int
+    _last: int
+    _noise: Noise | None
 
     def __init__(self, config: InertialConfig) -> None:
         self._config = config
-        self._kept: list[Sample] = []
-        self._first = self._last = -1
-        self._noise: Noise | None = None
+        self._kept, self._first, self._last, self._noise = [], -1, -1, None
 
     def sample(self, name: str, imu: Imu, time: int) -> Sample:
         """Returns the sample of a message that was measured at a time (ns).
@@ -98,18 +100,3 @@ class InertialSensor:
                     f"{name}: its samples have no covariance above 0, so {word} must say how good they are"
                 )
         return Noise(found[0], found[1], self._config.gyro_walk, self._config.accel_walk)
-
-    def snapshot(self) -> dict[str, Any]:
-        noise = self._noise
-        return {
-            "samples": [plain_sample(s) for s in self._kept],
-            "stamps": [self._first, self._last],
-            "noise": None if noise is None else [noise.gyro, noise.accel],
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on where a snapshot was taken."""
-        self._kept = [sample_of(row) for row in state["samples"]]
-        self._first, self._last = (int(stamp) for stamp in state["stamps"])
-        if (noise := state.get("noise")) is not None:
-            self._noise = Noise(noise[0], noise[1], self._config.gyro_walk, self._config.accel_walk)

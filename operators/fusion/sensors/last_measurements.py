@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 from dataflow.messages import Message, Odometry
+from dataflow.operator import Remembered
 
 
-class LastMeasurements:
+class LastMeasurements(Remembered):
     """Keeps the last stamp and odometry of each sensor, by its name in the settings, and the streams that there are."""
 
+    streams: set[str]
+    """Names without the namespace."""
+    stamps: dict[str, int]
+    _odometry: dict[str, Odometry]
+
     def __init__(self) -> None:
-        self.streams: set[str] = set()
-        """Names without the namespace."""
-        self.stamps: dict[str, int] = {}
-        self._odometry: dict[str, Odometry] = {}
+        self.streams, self.stamps, self._odometry = set(), {}, {}
 
     def hear(self, streams: Iterable[str]) -> None:
         """Notes that these streams have messages."""
@@ -34,16 +36,3 @@ class LastMeasurements:
         if isinstance(message, Odometry):
             self._odometry[name] = message
         return before
-
-    def odometry_state(self) -> dict[str, list[Any]]:
-        """The last odometry of each sensor as plain values."""
-        return {n: [m.stamp, m.frame, m.child_frame, m.position, m.orientation] for n, m in self._odometry.items()}
-
-    def restore(self, streams: Iterable[str], stamps: Mapping[str, int], odometry: Mapping[str, Iterable[Any]]) -> None:
-        """Takes up where a snapshot was."""
-        self.streams = set(streams)
-        self.stamps = {name: int(stamp) for name, stamp in stamps.items()}
-        self._odometry = {
-            name: Odometry(stamp=int(stamp), frame=frame, child_frame=child, position=p, orientation=q)
-            for name, (stamp, frame, child, p, q) in odometry.items()
-        }

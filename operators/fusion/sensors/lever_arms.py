@@ -7,13 +7,16 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Transforms
 from dataflow.messages.geometry import invert
+from dataflow.operator import Remembered
 from operators.geometry.extrinsics import transform_between
 
 Array = NDArray[np.float64]
 
 
-class LeverArms:
+class LeverArms(Remembered):
     """Looks frames up in the extrinsics, once each. `body` is the frame that moves, empty until it is known."""
+
+    body: str
 
     def __init__(self, base: str, body: str = "") -> None:
         self._base, self.body = base, body

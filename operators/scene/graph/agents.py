@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,11 @@ _WALKING, _ROLLING, _DRIVING = 0.25, 0.12, 0.07  # m/s
 _RISING = 0.15  # m/s, of the head
 
 
+@dataclass
 class Motion:
     """The recent past of one agent: when (s), where (3,), and how high its top is."""
 
-    def __init__(self) -> None:
-        self.past: deque[tuple[float, Array, float]] = deque()
+    past: deque[tuple[float, Array, float]] = field(default_factory=deque)
 
     def add(self, time: float, body: Body) -> None:
         self.past.append((time, body.center.copy(), body.top))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Activity, Diagnostics, Odometry, Pose, SceneGraph, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.labels import LabelSpace, labels_file
 from operators.scene.bodies import Body, BodyMemory
@@ -26,6 +25,14 @@ EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
 """Classes of the nodes that are not objects, by id."""
 
 _IN_SIGHT = 1_500_000_000  # nanoseconds since an agent was seen, up to which no answer is an answer
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the graph and the names of its nodes, by id."""
+
+    graph: LayeredGraph
+    names: dict[int, str] = field(default_factory=dict)
 
 
 class SceneGraphBuilder(Operator):
@@ -69,25 +76,23 @@ class SceneGraphBuilder(Operator):
     labels: str = Param("coco", doc="label space: coco, simulator, or a YAML file; gives the roles of classes")
     fresh: float = Param(0.5, ge=0, doc="age up to which a recognised activity counts", unit="s")
 
+    state: State
+
     def setup(self) -> None:
         """Raises ValueError for an end that is not below the beginning, or a bad label space; FileNotFoundError."""
         if self.end >= self.begin:
             raise ValueError(f"end {self.end} must be below begin {self.begin}")
-        self._counts: Counter[str] = Counter()
         self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
-        self._begin()
+        self._bodies = BodyMemory(self._labels)
 
-    def _begin(self) -> None:
+    def initial_state(self) -> State:
         rules = RelationRules(near=self.near, side=self.side)
-        self._graph = LayeredGraph(
-            GraphSettings(
-                begin=self.begin,
-                end=self.end,
-                smoothing=self.smoothing,
-                rules=rules,
-            )
-        )
-        self._names: dict[int, str] = {}
+        settings = GraphSettings(begin=self.begin, end=self.end, smoothing=self.smoothing, rules=rules)
+        return State(graph=LayeredGraph(settings))
+
+    def on_reset(self, input: str) -> None:
+        """The clock behind an input began anew: so does the graph."""
+        super().on_reset(input)
         self._bodies = BodyMemory(self._labels)
 
     def process(
@@ -105,15 +110,15 @@ class SceneGraphBuilder(Operator):
             T = robot.matrix()
             if self.robot_frame is not None:
                 T = T @ transform_between(extrinsics, self.robot_frame, robot.child_frame)
-        if "unknown classes" not in self._counts:
+        if "unknown classes" not in self.state.counts:
             things = [name for name in nodes.class_names if name not in SURFACES]
-            self._counts["unknown classes"] = warn_of_unknown(self, self._labels, things)
+            self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, things)
         usable = _usable(nodes)
         bodies, unusable = self._bodies_of(nodes, usable), nodes.count - len(usable)
-        now = self._graph.update(nodes.stamp, bodies, T)
-        self._names |= {b.id: _name(b) for b in now.bodies}
-        self._counts.update({"graphs": 1, "unusable nodes": unusable, "relations begun": len(now.began)})
-        self._counts["nodes"], self._counts["relations"] = len(now.bodies), len(now.relations)
+        now = self.state.graph.update(nodes.stamp, bodies, T)
+        self.state.names |= {b.id: _name(b) for b in now.bodies}
+        self.state.counts.update({"graphs": 1, "unusable nodes": unusable, "relations begun": len(now.began)})
+        self.state.counts["nodes"], self.state.counts["relations"] = len(now.bodies), len(now.relations)
         out: dict[str, Any] = {
             "graph": self._message(nodes, now),
             "activities": self._activities(nodes, now, recognized),
@@ -121,23 +126,6 @@ class SceneGraphBuilder(Operator):
         if now.began or now.ended or now.appeared or now.vanished:
             out["changes"] = self._changes(nodes.stamp, now)
         return out
-
-    def on_reset(self, input: str) -> None:
-        """The clock behind an input began anew: so does the graph."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        names = [[i, n] for i, n in self._names.items()]
-        return {"graph": self._graph.snapshot(), "names": names, "counts": dict(self._counts)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._graph.restore(state["graph"])
-        self._names = {int(i): str(n) for i, n in state["names"]}
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
     def _bodies_of(self, nodes: SceneGraph, rows: NDArray[np.intp]) -> list[Body]:
         """Returns the nodes in some rows as upright bodies."""
@@ -163,7 +151,7 @@ class SceneGraphBuilder(Operator):
             stamp=nodes.stamp,
             frame=nodes.frame,
             class_names=classes,
-            labels=tuple(self._names[b.id] for b in now.bodies),
+            labels=tuple(self.state.names[b.id] for b in now.bodies),
             predicates=tuple(p for (_, p, _), _ in held),
             ids=np.array([b.id for b in now.bodies], np.int64),
             class_ids=np.array([place[b.label] for b in now.bodies], np.int32),
@@ -196,14 +184,14 @@ class SceneGraphBuilder(Operator):
         )
 
     def _goal(self, act: Act) -> str:
-        return "" if act.goal < 0 else f"{self._names[act.goal]} ({act.goals[act.goal]:.2f})"
+        return "" if act.goal < 0 else f"{self.state.names[act.goal]} ({act.goals[act.goal]:.2f})"
 
     def _changes(self, stamp: int, now: Snapshot) -> Diagnostics:
         rows: list[tuple[str, str, Level]] = []
-        rows += [(self._names[i], "appeared", Level.OK) for i in now.appeared]
-        rows += [(self._names[i], "vanished", Level.WARN) for i in now.vanished]
+        rows += [(self.state.names[i], "appeared", Level.OK) for i in now.appeared]
+        rows += [(self.state.names[i], "vanished", Level.WARN) for i in now.vanished]
         for relations, level, word in ((now.began, Level.OK, "begins"), (now.ended, Level.WARN, "ends")):
-            rows += [(self._names[s], f"{p} {self._names[o]} {word}", level) for s, p, o in relations]
+            rows += [(self.state.names[s], f"{p} {self.state.names[o]} {word}", level) for s, p, o in relations]
         return Diagnostics(
             stamp=stamp,
             names=tuple(name for name, _, _ in rows),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.scene.bodies import Body
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ _NEARNESS = 6.0  # log odds that a goal loses a metre that it is farther than th
 _STEP = 0.15  # metres that an agent is elsewhere before that counts as a step: less is the jitter of its box
 
 
-class GoalInference:
+class GoalInference(Remembered):
     """Infers where an agent is going: a probability for each candidate, and for none of them (id -1).
 
     Each step of the path speaks for the candidates to which it leaves less way: its log likelihood is `trust` times the
@@ -29,9 +29,11 @@ class GoalInference:
     lines for plans.
     """
 
+    _path: deque[tuple[float, float, float]]
+
     def __init__(self, trust: float, memory: float, elsewhere: float) -> None:
         self._trust, self._memory, self._elsewhere = trust, memory, elsewhere
-        self._path: deque[tuple[float, float, float]] = deque()
+        self._path = deque()
 
     def update(self, time: float, body: Body, candidates: Sequence[Body]) -> dict[int, float]:
         """Returns the probability of each candidate's id and of -1 after the agent's next place."""
@@ -58,9 +60,3 @@ class GoalInference:
         if not path or math.hypot(x - path[-1][1], y - path[-1][2]) >= _STEP:
             path.append((time, x, y))
         return walked
-
-    def snapshot(self) -> dict[str, Any]:
-        return {"path": [[*place] for place in self._path]}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._path = deque((float(t), float(x), float(y)) for t, x, y in state["path"])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.scene.bodies import Body, BoxPairs
 from operators.scene.graph.agents import Motion, activity_of
 from operators.scene.graph.goals import GoalInference
@@ -61,21 +62,27 @@ class Snapshot:
     vanished: tuple[int, ...]
 
 
-class LayeredGraph:
+class LayeredGraph(Remembered):
     """Builds the graph of a room: room, surfaces, objects, agents, the robot.
 
     Relations follow from the boxes of the moment and begin and end with hysteresis. Agents have motions, from which
     activities and goals are inferred; `heads_for` is a relation of an agent to each likely goal, with its probability.
     """
 
+    _hysteresis: Hysteresis
+    _motions: dict[int, Motion]
+    _goals: dict[int, GoalInference]
+    _acts: dict[int, tuple[str, int]]
+    _known: set[int]
+
     def __init__(self, settings: GraphSettings) -> None:
-        self._settings = settings
+        self._settings, self._pairs = settings, BoxPairs()
         self._hysteresis = Hysteresis(settings.begin, settings.end, settings.smoothing)
-        self._motions: dict[int, Motion] = {}
-        self._goals: dict[int, GoalInference] = {}
-        self._acts: dict[int, tuple[str, int]] = {}
-        self._known: set[int] = set()
-        self._pairs = BoxPairs()
+        self._motions, self._goals, self._acts, self._known = {}, {}, {}, set()
+
+    def new_part(self, kind: type[Any]) -> GoalInference:
+        s = self._settings
+        return GoalInference(s.trust, s.memory, s.elsewhere)
 
     def update(self, stamp: int, things: Sequence[Body], T_world_robot: Array | None) -> Snapshot:
         """Takes the objects of one time, which may have surfaces among them, and the robot's pose."""
@@ -103,37 +110,11 @@ class LayeredGraph:
         self._known = ids
         return Snapshot(tuple(bodies), held, acts, tuple(began), tuple(ended), appeared, tuple(sorted(vanished)))
 
-    def snapshot(self) -> dict[str, Any]:
-        return {
-            "hysteresis": self._hysteresis.snapshot(),
-            "motions": [[i, [[t, p, top] for t, p, top in m.past]] for i, m in self._motions.items()],
-            "goals": [[i, g.snapshot()] for i, g in self._goals.items()],
-            "acts": [[i, a, since] for i, (a, since) in self._acts.items()],
-            "known": sorted(self._known),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._hysteresis.restore(state["hysteresis"])
-        self._motions, self._goals = {}, {}
-        for i, past in state["motions"]:
-            motion = Motion()
-            motion.past.extend((float(t), np.array(p, np.float64), float(top)) for t, p, top in past)
-            self._motions[int(i)] = motion
-        for i, goals in state["goals"]:
-            self._goals[int(i)] = self._inference()
-            self._goals[int(i)].restore(goals)
-        self._acts = {int(i): (str(a), int(since)) for i, a, since in state["acts"]}
-        self._known = {int(i) for i in state["known"]}
-
-    def _inference(self) -> GoalInference:
-        s = self._settings
-        return GoalInference(s.trust, s.memory, s.elsewhere)
-
     def _goals_of(
         self, time: float, agent: Body, wanted: Sequence[Body], now: Mapping[Relation, float]
     ) -> dict[int, float]:
         free = [b for b in wanted if (agent.id, "sitting_on", b.id) not in now]
-        return self._goals.setdefault(agent.id, self._inference()).update(time, agent, free)
+        return self._goals.setdefault(agent.id, self.new_part(GoalInference)).update(time, agent, free)
 
     def _act(self, stamp: int, agent: Body, held: Mapping[Relation, float], goals: Mapping[int, float]) -> Act:
         activity, score, object = activity_of(agent, self._motions[agent.id], held)

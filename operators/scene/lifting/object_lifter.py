@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,7 +22,7 @@ from dataflow.messages import (
 )
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion, transform_points
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import in_range
 from operators.cloud.gravity import gravity, unit
 from operators.geometry.extrinsics import transform_between
@@ -75,11 +74,12 @@ class ObjectLifter(Operator):
         (0.0, -1.0, 0.0), doc="direction up in the cloud's frame where no pose comes"
     )
 
+    state: Counts
+
     def setup(self) -> None:
         """Raises ValueError for an up of length 0, FileNotFoundError or ValueError for a bad label space."""
         self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._up = unit(self.up)
-        self._counts: Counter[str] = Counter()
 
     def process(
         self,
@@ -123,22 +123,13 @@ class ObjectLifter(Operator):
             "points": len(usable),
             "masks not used": int(segmentation is not None and masks is None),
         }
-        self._counts.update(counts | {"images": 1})
+        self.state.counts.update(counts | {"images": 1})
         return {
             "boxes": _boxes(cloud, detections, rows, found),
             "images": _images(cloud.stamp, detections, rows, found),
             "clusters": _clusters(cloud, labels, found, points),
             "status": _status(cloud.stamp, counts),
         }
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return dict(self._counts)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._counts = Counter({key: int(count) for key, count in state.items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
 
     def _masks(self, detections: Detections2D, segmentation: SegmentationMap | None) -> SegmentationMap | None:
         if segmentation is None or segmentation.stamp != detections.stamp or not segmentation.class_names:

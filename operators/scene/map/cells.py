@@ -191,6 +191,8 @@ class Cells:
         (a, b), (c, d) = self.bounds, other.bounds
         return float((np.maximum(a, c) - np.minimum(b, d)).max())
 
+    # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
+
     def snapshot(self) -> dict[str, Any]:
         return {"keys": self._keys, "points": self.points, "hits": self.hits, "free": self.free, "other": self.other}
 

@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.estimation.kernels import huber
 from operators.labels import SizePrior
 from operators.scene.map.box_images import CORNERS, ELLIPSE, images
 
@@ -139,9 +140,9 @@ def _cost(r: Array) -> Array:
 
 def _influence(r: Array) -> Array:
     """Returns the weights (A, R) of residuals, after Huber: sizes, the last, do not stray as images and points do."""
-    weights = np.minimum(1.0, _BOUND / np.maximum(np.abs(r), 1e-9))
+    weights = huber(r, _BOUND)
     weights[:, -_SIZES:] = 1.0
-    return np.asarray(weights)
+    return weights
 
 
 def _nearest_turn(yaw: float, towards: float) -> float:

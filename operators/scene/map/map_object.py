@@ -175,6 +175,8 @@ class MapObject:
             self.center, self.size = self.center.copy(), self.size.copy()
             self.center[2], self.size[2] = (top + floor) / 2, top - floor
 
+    # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
+
     def snapshot(self) -> dict[str, Any]:
         rows = self.images
         images = [np.stack([getattr(v, name) for v in rows]) for name in ("P", "box", "edges", "eye")] if rows else []

@@ -128,6 +128,8 @@ class MapSurface:
         self.most = max(self.most, len(self.cells))
         self.fit()
 
+    # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
+
     def snapshot(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in (*_PLAIN, *_ARRAYS)} | {"cells": self.cells.snapshot()}
 

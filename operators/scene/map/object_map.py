@@ -290,6 +290,8 @@ class ObjectMap:
                 self.objects[i] = chosen
                 self.moved += 1
 
+    # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
+
     def snapshot(self) -> Mapping[str, Any]:
         return {
             "next": self._next,

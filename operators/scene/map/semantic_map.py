@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from dataflow.messages import (
 )
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_points
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import in_range
 from operators.geometry.extrinsics import transform_between
 from operators.labels import LabelSpace, labels_file
@@ -41,6 +41,16 @@ from operators.scene.map.surface_map import SurfaceMap
 from operators.status import counted_status
 
 _BORDER = 3.0  # pixels; boxes that end nearer to the image's edge may go on beyond it
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the maps, in a frame and with the names of classes that the first view gives."""
+
+    surfaces: SurfaceMap
+    frame: str = ""
+    classes: tuple[str, ...] = ()  # before the map, which is made anew with them
+    map: ObjectMap | None = None
 
 
 class SemanticMap(Operator):
@@ -113,29 +123,31 @@ class SemanticMap(Operator):
         [], doc="files of `dataflow learn object`, or saved maps, whose classes the detector finds: saved with the map"
     )
 
+    state: State
+
     def setup(self) -> None:
         """Raises FileNotFoundError or ValueError for a bad label space or map, or a map with voxels of another size."""
-        self._counts: Counter[str] = Counter()
         self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._known = None if self.map_file is None else SavedMap.read(Path(self.use_file(self.map_file)))
         if self._known is not None and self._known.voxel != self.voxel:
             raise ValueError(f"{self.map_file} has voxels of {self._known.voxel} m, but voxel is {self.voxel}")
         given = [learned_files(Path(self.use_file(name))) for name in self.learned]
         self._learned: tuple[LearnedFile, ...] = together(() if self._known is None else self._known.learned, *given)
-        self._begin()
+
+    def initial_state(self) -> State:
+        return State(surfaces=SurfaceMap(self.surface_views))
+
+    def new_part(self, kind: type[Any]) -> ObjectMap:
+        return self._made()
 
     def finish(self) -> None:
         """Writes the map."""
         if self.save is not None:
-            objects = {} if self._map is None else self._map.snapshot()
-            saved = SavedMap(self._classes, self._frame, self.voxel, objects, self._surfaces.snapshot(), self._learned)
+            objects = {} if self.state.map is None else self.state.map.snapshot()
+            saved = SavedMap(
+                self.state.classes, self.state.frame, self.voxel, objects, self.state.surfaces.snapshot(), self._learned
+            )
             saved.write(Path(self.save).expanduser())
-
-    def _begin(self) -> None:
-        self._map: ObjectMap | None = None
-        self._surfaces = SurfaceMap(self.surface_views)
-        self._classes: tuple[str, ...] = ()
-        self._frame = ""
 
     def process(
         self,
@@ -166,13 +178,13 @@ class SemanticMap(Operator):
             self._observation(boxes, world[ends[k] : ends[k + 1]], None if colors is None else colors[k], k, shown[k])
             for k in range(boxes.count)
         ]
-        known.floor = self._surfaces.floor
+        known.floor = self.state.surfaces.floor
         view = RangeView(points[:: 1 + len(points) // 20_000], T, 0.012)
         joined = known.update(cloud.stamp, [each for each in seen if each is not None], view)
         if surfaces is not None and surfaces.stamp == cloud.stamp:
             parts = seen_surfaces(surfaces, cloud, T, self.max_range)
-            self._surfaces.update(cloud.stamp, parts, view, known.heading)
-        objects, planes = known.confirmed(), self._surfaces.confirmed
+            self.state.surfaces.update(cloud.stamp, parts, view, known.heading)
+        objects, planes = known.confirmed(), self.state.surfaces.confirmed
         scores = [o.score * (1 - known.doubt(o)) for o in objects]
         counts = {
             "objects": len(objects),
@@ -183,13 +195,13 @@ class SemanticMap(Operator):
             "surfaces": len(planes),
             "points": len(points),
         }
-        self._counts["views"] += 1
-        self._counts["views without points"] += not len(points)
-        self._counts["objects"], self._counts["moved"] = len(objects), known.moved
-        self._counts["doubted"], self._counts["surfaces"] = counts["doubted"], len(planes)
+        self.state.counts["views"] += 1
+        self.state.counts["views without points"] += not len(points)
+        self.state.counts["objects"], self.state.counts["moved"] = len(objects), known.moved
+        self.state.counts["doubted"], self.state.counts["surfaces"] = counts["doubted"], len(planes)
         made = {
             "objects": self._boxes(cloud.stamp, objects, scores),
-            "nodes": nodes_of(cloud.stamp, self._frame, self._classes, objects, scores, planes),
+            "nodes": nodes_of(cloud.stamp, self.state.frame, self.state.classes, objects, scores, planes),
             "status": _status(cloud.stamp, counts),
         }
         if images is not None and images.stamp == boxes.stamp and images.count == boxes.count:
@@ -200,63 +212,38 @@ class SemanticMap(Operator):
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes, by id; empty before the first view."""
-        return self._classes
+        return self.state.classes
 
     def entries(self) -> list[MapObject]:
         """Returns all objects, those too that are not surely there."""
-        return [] if self._map is None else list(self._map.objects.values())
-
-    def on_reset(self, input: str) -> None:
-        """The clock behind an input began anew: so does the map, with the saved one if there is one."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "map": None if self._map is None else self._map.snapshot(),
-            "classes": list(self._classes),
-            "frame": self._frame,
-            "surfaces": self._surfaces.snapshot(),
-            "counts": dict(self._counts),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._frame, self._classes = state["frame"], tuple(state["classes"])
-        if state["map"] is not None:
-            self._map = self._made()
-            self._map.restore(state["map"])
-        if "surfaces" in state:  # not in those of earlier versions
-            self._surfaces.restore(state["surfaces"])
-        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        return dict(self._counts)
+        return [] if self.state.map is None else list(self.state.map.objects.values())
 
     def _opened(self, boxes: Boxes3D, pose: Pose | Odometry) -> ObjectMap:
-        if self._map is None:
-            self._classes, self._frame = boxes.class_names, pose.frame
-            self._counts["unknown classes"] = warn_of_unknown(self, self._labels, self._classes)
-            self._map = self._made()
+        if self.state.map is None:
+            self.state.classes, self.state.frame = boxes.class_names, pose.frame
+            self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, self.state.classes)
+            self.state.map = self._made()
             if self._known is not None and self._known.objects:
                 self._take_up(self._known, boxes.stamp)
-        if pose.frame != self._frame:
-            raise ValueError(f"the pose is in {pose.frame!r}, the map in {self._frame!r}")
-        if boxes.class_names != self._classes:
-            if boxes.class_names[: len(self._classes)] != self._classes:
-                raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self._classes}")
-            self._classes = boxes.class_names
-            self._counts["unknown classes"] = warn_of_unknown(self, self._labels, self._classes)
-            self._map.widen(len(self._classes), Kinds.of(self._labels, self._classes))
-        return self._map
+        if pose.frame != self.state.frame:
+            raise ValueError(f"the pose is in {pose.frame!r}, the map in {self.state.frame!r}")
+        known = self.state.classes
+        if boxes.class_names != known:
+            if boxes.class_names[: len(known)] != known:
+                raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {known}")
+            self.state.classes = boxes.class_names
+            self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, boxes.class_names)
+            self.state.map.widen(len(boxes.class_names), Kinds.of(self._labels, boxes.class_names))
+        return self.state.map
 
     def _take_up(self, saved: SavedMap, stamp: int) -> None:
         """Goes on from a saved map. Raises ValueError where its frame or its classes are others."""
-        if saved.frame != self._frame:
-            raise ValueError(f"the pose is in {self._frame!r}, {self.map_file} in {saved.frame!r}")
-        assert self._map is not None
-        objects, surfaces = saved.begun(stamp, self._classes, self._labels)
-        self._map.restore(objects)
-        self._surfaces.restore(surfaces)
+        if saved.frame != self.state.frame:
+            raise ValueError(f"the pose is in {self.state.frame!r}, {self.map_file} in {saved.frame!r}")
+        assert self.state.map is not None
+        objects, surfaces = saved.begun(stamp, self.state.classes, self._labels)
+        self.state.map.restore(objects)
+        self.state.surfaces.restore(surfaces)
 
     def _made(self) -> ObjectMap:
         settings = MapSettings(
@@ -270,7 +257,7 @@ class SemanticMap(Operator):
             mover_memory=self.mover_memory,
             move_memory=self.move_memory,
         )
-        return ObjectMap(max(len(self._classes), 1), Kinds.of(self._labels, self._classes), settings)
+        return ObjectMap(max(len(self.state.classes), 1), Kinds.of(self._labels, self.state.classes), settings)
 
     def _observation(
         self,
@@ -282,14 +269,14 @@ class SemanticMap(Operator):
     ) -> Observation | None:
         if len(points) < 3:
             return None
-        class_id = int(boxes.class_ids[k]) if self._classes else 0
+        class_id = int(boxes.class_ids[k]) if self.state.classes else 0
         return Observation(points, class_id, float(boxes.scores[k]), color, image)
 
     def _boxes(self, stamp: int, objects: list[MapObject], scores: list[float]) -> Boxes3D:
         return Boxes3D(
             stamp=stamp,
-            frame=self._frame,
-            class_names=self._classes,
+            frame=self.state.frame,
+            class_names=self.state.classes,
             centers=np.array([o.center for o in objects]).reshape(-1, 3),
             sizes=np.array([o.size for o in objects]).reshape(-1, 3),
             orientations=quaternion_from_yaw(np.array([o.yaw for o in objects])).reshape(-1, 4),

@@ -117,6 +117,8 @@ class SurfaceMap:
             elif len(surface.cells):
                 surface.fit()
 
+    # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
+
     def snapshot(self) -> dict[str, Any]:
         surfaces = [s.snapshot() for s in self.surfaces.values()]
         return {"next": self._next, "surfaces": surfaces, "confirmed": [s.id for s in self.confirmed]}

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.simulator.textures.painting import SIZE
-from operators.simulator.textures.patterns import draw
+from operators.simulator.textures import prints, stuffs
+from operators.simulator.textures.painting import SIZE, Pixels, Rng
 
 BORDER = 8  # texels repeated around a pattern, so that interpolation never sees its neighbour
 LEVELS = 4  # each half the size of the one before
 _CELL = SIZE + 2 * BORDER
 _PER_ROW = 8
+_PAINTERS: dict[str, Callable[[Rng], Pixels]] = {**stuffs.PAINTERS, **prints.PAINTERS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,3 +62,13 @@ def make_atlas(names: Sequence[str], seed: int) -> Atlas:
         left[k], top[k] = x, y
         row += level.shape[0] if k else 0
     return Atlas(image, tuple(names), origins, left, top)
+
+
+def draw(name: str, seed: int) -> Pixels:
+    """Returns SIZE by SIZE texels that its name and the seed alone decide. Raises ValueError for an unknown name."""
+    kind = name.split(":")[0]
+    painter = _PAINTERS.get(kind)
+    if painter is None:
+        raise ValueError(f"no texture pattern {kind!r}; there are {', '.join(sorted(_PAINTERS))}")
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+    return np.clip(painter(rng), 0, 255).astype(np.float32)

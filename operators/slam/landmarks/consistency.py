@@ -8,8 +8,7 @@ others are in between, the robot is lost.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 _KEPT = 0.995
 """Share of the sums that remains at each message: they are of about 200 messages."""
@@ -70,11 +69,3 @@ class Consistency:
     def look(self, matched: int, strayed: int) -> None:
         """Takes how many landmarks were seen at their places, and how many were not while others were seen."""
         self.strayed = self.strayed + 1 if strayed >= _FEW and strayed > matched else 0
-
-    def snapshot(self) -> list[float]:
-        return list(astuple(self))
-
-    @classmethod
-    def restored(cls, state: Sequence[float]) -> Consistency:
-        nis, freedom, motion, variance, spread, strayed = state
-        return cls(nis, freedom, motion, variance, spread, int(strayed))

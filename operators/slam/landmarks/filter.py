@@ -13,15 +13,15 @@ innovation of a sighting is linear in it, with a constant Jacobian.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from dataflow.messages.diagnostics import Level
+from dataflow.operator import Remembered
 from operators.estimation.chi_square import quantile
 from operators.slam.landmarks.association import (
     Association,
@@ -75,65 +75,44 @@ class Counts:
     dropped: int = 0
 
 
-@dataclass
-class LandmarkFilter:
+class LandmarkFilter(Remembered):
     """The filter. Lengths in metres, angles in radians; the first pose is the origin of the map frame."""
 
-    association: Association = field(default_factory=Association)
-    heading: float = 0.0
-    position: Array = field(default_factory=lambda: np.zeros(2))
-    counts: Counts = field(default_factory=Counts)
-    ids: list[int] = field(default_factory=list)
+    heading: float
+    position: Array
+    counts: Counts
+    ids: list[int]
     """Identity of each landmark, as given or, where none was, numbered from 0."""
+    consistency: Consistency
+    lost_among: int | None
+    _landmarks: Array
+    _P: Array
+    _together: NDArray[np.bool_]
+    _anonymous: NDArray[np.bool_]
+    _seen: NDArray[np.int64]
+    _times: NDArray[np.int64]
+    _moved: Array
+    _moments: int
+    _density: Density
 
-    def __post_init__(self) -> None:
+    def __init__(self, association: Association | None = None) -> None:
+        self.association = association or Association()
+        self.heading, self.position, self.counts, self.ids = 0.0, np.zeros(2), Counts(), []
+        self.consistency, self.lost_among = Consistency(), None
         self._hold(_GROW)
-        self._index = {identity: k for k, identity in enumerate(self.ids)}
-        self._moved = np.zeros((3, 3))
+        self._moved, self._moments, self._density = np.zeros((3, 3)), 0, Density()
         self._step = np.zeros((_FIRST, 3))  # root of what motion added to the covariance before the last sightings
         self._slip = 1.0  # variance of that motion over what it was taken for
-        self._moments = 0
-        self._density = Density()
-        self.consistency = Consistency()
-        self.lost_among: int | None = None
+        self.restored()
 
-    def snapshot(self) -> dict[str, Any]:
-        """Returns the filter's state, as plain values and arrays."""
+    def prepare_snapshot(self) -> None:
         count, size = len(self.ids), _FIRST + 2 * len(self.ids)
-        return {
-            "heading": self.heading,
-            "position": self.position,
-            "ids": np.array(self.ids, np.int64),
-            "landmarks": self.landmarks,
-            "covariance": self._P[:size, :size].copy(),
-            "moved": self._moved,
-            "counts": list(astuple(self.counts)),
-            "together": self._together[:count, :count].copy(),
-            "anonymous": self._anonymous[:count].copy(),
-            "seen": self._seen[:count].copy(),
-            "times": self._times[:count].copy(),
-            "moments": self._moments,
-            "density": [self._density.count, self._density.area],
-            "consistency": self.consistency.snapshot(),
-            "lost among": self.lost_among,
-        }
+        self._landmarks, self._P = self._landmarks[:count], self._P[:size, :size]
+        self._together, self._anonymous = self._together[:count, :count], self._anonymous[:count]
+        self._seen, self._times = self._seen[:count], self._times[:count]
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes over what `snapshot` gave."""
-        self.heading, self.position = float(state["heading"]), np.array(state["position"])
-        self.ids = [int(i) for i in state["ids"]]
-        count, size = len(self.ids), len(state["covariance"])
-        self._hold(max(_GROW, count))
-        self._landmarks[:count], self._P[:size, :size] = state["landmarks"], state["covariance"]
-        self._together[:count, :count], self._anonymous[:count] = state["together"], state["anonymous"]
-        self._seen[:count], self._times[:count] = state["seen"], state["times"]
-        self._moments = int(state["moments"])
-        self._moved = np.array(state["moved"])
+    def restored(self) -> None:
         self._index = {identity: k for k, identity in enumerate(self.ids)}
-        self.counts = Counts(*(int(n) for n in state["counts"]))
-        self._density = Density(int(state["density"][0]), float(state["density"][1]))
-        self.consistency = Consistency.restored(state["consistency"])
-        self.lost_among = None if state["lost among"] is None else int(state["lost among"])
 
     def _hold(self, room: int) -> None:
         """Makes room for so many landmarks, none of them known."""
@@ -483,7 +462,7 @@ class LandmarkFilter:
         size = _FIRST + 2 * index
         if index == len(self._landmarks):
             held = (self._landmarks, self._P, self._together, self._anonymous, self._seen, self._times)
-            self._hold(2 * index)
+            self._hold(max(_GROW, 2 * index))
             self._landmarks[:index], self._P[:size, :size], self._together[:index, :index] = held[:3]
             self._anonymous[:index], self._seen[:index], self._times[:index] = held[3:]
         self._landmarks[index] = self.position + offset

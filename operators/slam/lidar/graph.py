@@ -10,7 +10,7 @@ import numpy as np
 from dataflow.messages.geometry import invert
 from operators.geometry.se3 import Matrix
 from operators.odometry.tracking import moved_covariance
-from operators.slam.keyframe_graph import SAVED, Node
+from operators.slam.keyframe_graph import SAVED, KeyframeGraph, Node
 from operators.slam.lidar.scan_context import likeness
 from operators.slam.lidar.view import LidarEyes, LidarView
 from operators.slam.place_graph import PlaceGraph
@@ -60,6 +60,8 @@ class _Contexts:
 
 class LidarGraph(PlaceGraph[LidarView]):
     """The map that a LiDAR makes."""
+
+    graph: KeyframeGraph[LidarView]
 
     def __init__(self, settings: LidarSettings, eyes: LidarEyes) -> None:
         super().__init__(settings, _Contexts, between)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.geometry.se3 import Matrix
 from operators.odometry.lidar.tracker import State, Tracked
-from operators.slam.graph_memory import graph_from_plain, graph_to_plain, plain
 from operators.slam.lidar.graph import LidarGraph
 from operators.slam.lidar.view import LidarView
 from operators.slam.place import Place, place_of
@@ -29,14 +28,17 @@ class Mapped:
     added: Added
 
 
-class LidarMapper:
+class LidarMapper(Remembered):
     """Puts the scans that an odometry has tracked into a map. Deterministic: the same scans give the same bytes."""
+
+    graph: LidarGraph
+    _segment: int  # the odometry's maps, counted
+    _lost: bool
+    _jumped: bool  # the odometry found its map again, and no keyframe has told the graph
 
     def __init__(self, graph: LidarGraph, view: Callable[[NDArray[np.float32]], LidarView]) -> None:
         self.graph, self._view = graph, view
-        self._segment = 0  # the odometry's maps, counted
-        self._lost = False
-        self._jumped = False  # the odometry found its map again, and no keyframe has told the graph
+        self._segment, self._lost, self._jumped = 0, False, False
 
     def take(self, tracked: Tracked, stamp: int) -> Mapped:
         """Takes what the odometry made of the next scan."""
@@ -59,18 +61,3 @@ class LidarMapper:
             covariance=self.graph.covariance_at(tracked.T, tracked.covariance),
             added=added,
         )
-
-    def snapshot(self) -> Mapping[str, Any]:
-        """Returns all that the next result depends on, as plain values."""
-        return {
-            "graph": graph_to_plain(self.graph, plain),
-            "segment": self._segment,
-            "lost": self._lost,
-            "jumped": self._jumped,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a snapshot of the same settings."""
-        graph_from_plain(self.graph, state["graph"], lambda values: LidarView(**values))
-        self._segment, self._lost = int(state["segment"]), bool(state["lost"])
-        self._jumped = bool(state["jumped"])

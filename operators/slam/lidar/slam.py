@@ -4,23 +4,31 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path as FilePath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Message, Odometry, Path, PointCloud, Transforms
 from dataflow.messages.geometry import invert, transform_points
-from dataflow.operator import Out, Param
+from dataflow.operator import KEPT, Out, Param
 from operators.cloud.registration import Settings
 from operators.geometry.se3 import Matrix, adjoint
-from operators.odometry.lidar.odometry import LidarOdometry
+from operators.odometry.lidar.odometry import LidarOdometry, LidarState
 from operators.slam.emission import corrections, map_poses, path_of, sizes, status_of
 from operators.slam.lidar.graph import LidarGraph, LidarSettings
 from operators.slam.lidar.map_file import points_of, read_lidar_map, write_lidar_map
 from operators.slam.lidar.mapper import LidarMapper, Mapped
 from operators.slam.lidar.view import LidarEyes, LidarView
+
+
+@dataclass(kw_only=True)
+class SlamState(LidarState):
+    """Holds the map beside the odometry, and counts scans by place, and keyframes that were refused."""
+
+    mapper: LidarMapper
+    places: Counter[str] = field(default_factory=Counter, metadata=KEPT)
 
 
 class LidarSlam(LidarOdometry):
@@ -64,20 +72,23 @@ class LidarSlam(LidarOdometry):
     )
     period: int = Param(10, ge=1, tunable=True, doc="keyframes from map to map")
 
+    state: SlamState
+
     def setup(self) -> None:
         """Raises FileNotFoundError or ValueError for a saved map that is none."""
         super().setup()
         self._known = None if self.map_file is None else read_lidar_map(FilePath(self.use_file(self.map_file)))
-        self._places: Counter[str] = Counter()
-        self._mapper = self._new_mapper()
+
+    def initial_state(self) -> SlamState:
+        return SlamState(tracker=self._new(), mapper=self._new_mapper())
 
     def process(self, cloud: PointCloud, extrinsics: Transforms | None = None) -> Mapping[str, Message]:
         """Raises ValueError where no transform relates the cloud's frame to the body's."""
         messages, tracked, T_body_lidar = self._tracked(cloud, extrinsics)
-        mapped = self._mapper.take(tracked, cloud.stamp)
-        graph = self._mapper.graph
-        self._places.update({mapped.place.value: 1})
-        self._places.update(f"refused: {_kind(reason)}" for reason in mapped.added.refused)
+        mapped = self.state.mapper.take(tracked, cloud.stamp)
+        graph = self.state.mapper.graph
+        self.state.places.update({mapped.place.value: 1})
+        self.state.places.update(f"refused: {_kind(reason)}" for reason in mapped.added.refused)
         status, odometry = messages["status"], messages.get("odometry")
         assert isinstance(status, Diagnostics)
         counts = sizes(graph) | {"loops": graph.loops}
@@ -102,34 +113,20 @@ class LidarSlam(LidarOdometry):
     def finish(self) -> None:
         """Writes the map."""
         if self.save is not None:
-            write_lidar_map(self._mapper.graph, FilePath(self.save).expanduser())
-
-    def on_reset(self, input: str) -> None:
-        """Begins a new map, or a new search in the saved one: the clock of a stream began anew."""
-        super().on_reset(input)
-        self._mapper = self._new_mapper()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        """The odometry's memory and the map."""
-        return {**super().snapshot(), "mapper": self._mapper.snapshot(), "places": dict(self._places)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        super().restore(state)
-        self._mapper.restore(state["mapper"])
-        self._places = Counter({key: int(count) for key, count in state["places"].items()})
+            write_lidar_map(self.state.mapper.graph, FilePath(self.save).expanduser())
 
     def summary(self) -> Mapping[str, int]:
         """Returns the number of scans of each state, of loops, and of keyframes that were refused, by reason."""
-        graph = self._mapper.graph
-        return {**super().summary(), **self._places, **sizes(graph), "loops": graph.loops}
+        graph = self.state.mapper.graph
+        return {**super().summary(), **self.state.places, **sizes(graph), "loops": graph.loops}
 
     def _map(self, T_body_lidar: Matrix, stamp: int) -> PointCloud:
-        points = points_of(self._mapper.graph.nodes.values(), self.map_voxel)
+        points = points_of(self.state.mapper.graph.nodes.values(), self.map_voxel)
         placed = transform_points(T_body_lidar, points).astype(np.float32)
         return PointCloud(stamp=stamp, frame=self.map_frame, points=placed)
 
     def _map_due(self, mapped: Mapped) -> bool:
-        return mapped.added.loops > 0 or (mapped.added.node and len(self._mapper.graph.nodes) % self.period == 0)
+        return mapped.added.loops > 0 or (mapped.added.node and len(self.state.mapper.graph.nodes) % self.period == 0)
 
     def _new_mapper(self) -> LidarMapper:
         searched = Settings(self.map_voxel, 1, self.min_overlap, self.min_fitness, self.max_violation)

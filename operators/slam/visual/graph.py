@@ -13,7 +13,7 @@ from operators.odometry.keyframes import view_distance
 from operators.odometry.rgbd.fitting import Fitter
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.tracking import moved_covariance
-from operators.slam.keyframe_graph import Node
+from operators.slam.keyframe_graph import KeyframeGraph, Node
 from operators.slam.place_graph import WINDOW, PlaceGraph
 from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting
 from operators.slam.visual.local_bundle import adjust_newest
@@ -81,6 +81,9 @@ class _Looks:
 
 class VisualGraph(PlaceGraph[View]):
     """The map that a camera makes."""
+
+    graph: KeyframeGraph[View]
+    points: MapPoints
 
     def __init__(self, settings: GraphSettings) -> None:
         super().__init__(settings, _Looks, between)

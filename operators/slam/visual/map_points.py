@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import transform_points
+from dataflow.operator import Remembered
 from operators.geometry.se3 import Matrix
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.slam.keyframe_graph import Node
@@ -60,12 +60,17 @@ class _Cloud:
     rooted: NDArray[np.float32]
 
 
-class MapPoints:
+class MapPoints(Remembered):
     """Points by row and their sightings.
 
     `anchors` (M,) are the nodes that saw them first, which keep their views, and `features` (M,) which of their
     features they are. `local` (M, 3) has them in those nodes' depth cameras, so that they move with them.
     """
+
+    anchors: Indices
+    features: Indices
+    local: Array
+    sightings: Sightings
 
     def __init__(self) -> None:
         self.anchors, self.features, self.local = _nobody(), _nobody(), _none(3)
@@ -113,19 +118,6 @@ class MapPoints:
         for here, k in self._by_anchor(rows):
             T: Matrix = nodes[k].T
             self.local[rows[here]] = (world[here] - T[:3, 3]) @ T[:3, :3]
-
-    def to_plain(self) -> dict[str, Any]:
-        """Returns all of it as plain values; `from_plain` is the inverse."""
-        own = {"anchors": self.anchors, "features": self.features, "local": self.local.copy()}
-        return own | {f.name: getattr(self.sightings, f.name) for f in fields(Sightings)}
-
-    @staticmethod
-    def from_plain(values: Mapping[str, Any]) -> MapPoints:
-        points = MapPoints()
-        points.anchors, points.features = values["anchors"], values["features"]
-        points.local = np.array(values["local"], np.float64)
-        points.sightings = replace(points.sightings, **{f.name: values[f.name] for f in fields(Sightings)})
-        return points
 
     def _by_anchor(self, rows: Indices) -> list[tuple[Indices, int]]:
         anchors = self.anchors[rows]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +10,14 @@ from numpy.typing import NDArray
 from operators.geometry.se3 import Matrix
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fitter
-from operators.odometry.rgbd.memory import from_plain, to_plain
+from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import scaled_intrinsics
-from operators.odometry.rgbd.tracker import RgbdOdometry
+from operators.odometry.rgbd.tracker import RgbdOdometry, RgbdState
 from operators.odometry.tracking import Status, TrackResult
-from operators.slam.graph_memory import graph_from_plain, graph_to_plain
 from operators.slam.place import Place, place_of
 from operators.slam.sensor_model import Added
 from operators.slam.visual.graph import GraphSettings, VisualGraph
-from operators.slam.visual.map_points import MapPoints
-from operators.slam.visual.view import view_from_plain, view_to_plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +32,27 @@ class SlamResult:
     added: Added
 
 
+@dataclass(eq=False)
+class SlamState:
+    """Holds the odometry's memory and the map. `jumped`: the odometry found its map again, and no keyframe has told
+    the graph."""
+
+    odometry: RgbdState
+    graph: VisualGraph
+    jumped: bool = False
+
+    @staticmethod
+    def begun(config: RgbdOdometryConfig, settings: GraphSettings) -> SlamState:
+        """Returns the state before the first frame."""
+        return SlamState(RgbdState(LocalMap(config.keyframes)), VisualGraph(settings))
+
+
 class RgbdSlam:
     """Maps with one camera. Deterministic: the same frames give the same bytes, in every process."""
 
-    def __init__(self, camera: RgbdCamera, config: RgbdOdometryConfig, settings: GraphSettings) -> None:
-        self.camera, self._config = camera, config
-        self._odometry = RgbdOdometry(camera, config)
-        self.graph = VisualGraph(settings)
-        self._jumped = False  # the odometry found its map again, and no keyframe has told the graph
+    def __init__(self, camera: RgbdCamera, config: RgbdOdometryConfig, state: SlamState) -> None:
+        self.camera, self._config, self.state, self.graph = camera, config, state, state.graph
+        self._odometry = RgbdOdometry(camera, config, state.odometry)
 
     def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> SlamResult:
         """Returns the pose of the next frame, as `RgbdOdometry.track` does, and where its odometry lies in the map.
@@ -52,16 +60,16 @@ class RgbdSlam:
         Raises ValueError as that does.
         """
         result = self._odometry.track(image, depth, stamp)
-        self._jumped |= result.status is Status.RELOCALISED
+        self.state.jumped |= result.status is Status.RELOCALISED
         if result.taken_back is not None:
             self.graph.withdraw(result.taken_back)
         added = Added()
         if result.keyframe:
             factor = max(1, image.shape[1] // self._config.image_width)
             working = replace(self.camera, K_color=scaled_intrinsics(self.camera.K_color, 1.0 / factor))
-            state = self._odometry.snapshot()
-            added = self.graph.add(state.keyframes[-1], Fitter(working, self._config, state.noise), self._jumped)
-            self._jumped &= not added.node
+            state = self._odometry.state
+            added = self.graph.add(state.map.newest, Fitter(working, self._config, state.noise), self.state.jumped)
+            self.state.jumped &= not added.node
         missing = result.status in (Status.PREDICTED, Status.LOST)
         adrift = f"odometry {result.status}: {result.reason}" if missing else ""
         place, reason = place_of(self.graph, added, adrift, result.reason)
@@ -74,19 +82,3 @@ class RgbdSlam:
             covariance=self.graph.covariance_at(result.T_world_camera, result.covariance),
             added=added,
         )
-
-    def snapshot(self) -> Mapping[str, Any]:
-        """Returns all that the next result depends on, as plain values."""
-        return {
-            "odometry": to_plain(self._odometry.snapshot()),
-            "graph": graph_to_plain(self.graph, view_to_plain),
-            "points": self.graph.points.to_plain(),
-            "jumped": self._jumped,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a snapshot of the same camera and settings."""
-        self._odometry.restore(from_plain(state["odometry"]))
-        graph_from_plain(self.graph, state["graph"], view_from_plain)
-        self.graph.points = MapPoints.from_plain(state["points"])
-        self._jumped = bool(state["jumped"])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Any
 
 from dataflow.messages import (
     CameraInfo,
@@ -18,7 +17,7 @@ from dataflow.messages import (
     PointCloud,
     Transforms,
 )
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.odometry.emission import LEVELS as ODOMETRY_LEVELS
 from operators.odometry.emission import outputs
@@ -29,9 +28,16 @@ from operators.slam.emission import corrections, map_poses, path_of, sizes, stat
 from operators.slam.visual.cloud import cloud_of
 from operators.slam.visual.graph import GraphSettings
 from operators.slam.visual.map_file import read_visual_map, write_visual_map
-from operators.slam.visual.mapper import RgbdSlam, SlamResult
+from operators.slam.visual.mapper import RgbdSlam, SlamResult, SlamState
 from operators.slam.visual.view import Judge
 from operators.status import counted_status
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the odometry and the map, and counts frames by place, and loops that were refused."""
+
+    slam: SlamState
 
 
 class VisualSlam(Operator):
@@ -85,14 +91,24 @@ class VisualSlam(Operator):
     voxel: float = Param(0.05, gt=0.005, doc="side of the voxels that the map's points are thinned to", unit="m")
     period: int = Param(10, ge=1, tunable=True, doc="keyframes from map to map")
 
+    state: State
     _slam: RgbdSlam | None = None
     _calibration: Calibration | None = None
-    _restored: Mapping[str, Any] | None = None
 
     def setup(self) -> None:
         """Raises FileNotFoundError or ValueError for a saved map that is none."""
-        self._counts: Counter[str] = Counter()
         self._known = None if self.map_file is None else read_visual_map(FilePath(self.use_file(self.map_file)))
+
+    def initial_state(self) -> State:
+        slam = SlamState.begun(self._config(), self._settings())
+        if self._known is not None:
+            slam.graph.begin_in(self._known)
+        return State(slam=slam)
+
+    def on_reset(self, input: str) -> None:
+        """Begins a new map, or a new search in the saved one: the clock of a stream began anew."""
+        super().on_reset(input)
+        self._slam = self._calibration = None
 
     def process(
         self,
@@ -107,8 +123,8 @@ class VisualSlam(Operator):
         check_calibration("depth", depth, depth_info)
         slam = self._running(image_info, depth_info, extrinsics)
         result = slam.track(image.data, depth.data, depth.stamp)
-        self._counts.update({result.place.value: 1})
-        self._counts.update(f"refused: {reason}" for reason in result.added.refused)
+        self.state.counts.update({result.place.value: 1})
+        self.state.counts.update(f"refused: {reason}" for reason in result.added.refused)
         messages: dict[str, Message] = outputs(result.odometry, self.odometry_frame, depth.frame)
         messages["status"] = self._status(result, slam)
         odometry, T = messages["odometry"], result.odometry.T_world_camera
@@ -125,24 +141,10 @@ class VisualSlam(Operator):
         if self.save is not None and self._slam is not None:
             write_visual_map(self._slam.graph, FilePath(self.save).expanduser())
 
-    def on_reset(self, input: str) -> None:
-        """Begins a new map, or a new search in the saved one: the clock of a stream began anew."""
-        self._slam = self._calibration = self._restored = None
-
-    def snapshot(self) -> Mapping[str, Any]:
-        """The odometry's memory and the map."""
-        state = self._restored if self._slam is None else self._slam.snapshot()
-        return {} if state is None else {"slam": state, "counts": dict(self._counts)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Taken up with the first frame, which brings the calibration."""
-        self._restored = state["slam"] if state else None
-        self._counts = Counter({key: int(count) for key, count in state.get("counts", {}).items()})
-
     def summary(self) -> Mapping[str, float | int]:
         """Returns the number of frames of each state, of loops, and of views that were refused, by reason."""
         kept = {} if self._slam is None else sizes(self._slam.graph) | {"loops": self._slam.graph.loops}
-        return dict(self._counts) | kept
+        return dict(self.state.counts) | kept
 
     # -- what is sent ------------------------------------------------------------------------------------
 
@@ -168,12 +170,7 @@ class VisualSlam(Operator):
         """The tracker and its map, made for the first calibration, which later ones must repeat."""
         if self._slam is None:
             camera = camera_of(image_info, depth_info, extrinsics)
-            self._slam = RgbdSlam(camera, self._config(), self._settings())
-            if self._restored is not None:
-                self._slam.restore(self._restored)
-                self._restored = None
-            elif self._known is not None:
-                self._slam.graph.begin_in(self._known)
+            self._slam = RgbdSlam(camera, self._config(), self.state.slam)
         elif not same(self._calibration, (image_info, depth_info, extrinsics)):
             self._slam.camera.check_same(camera_of(image_info, depth_info, extrinsics))
         self._calibration = (image_info, depth_info, extrinsics)

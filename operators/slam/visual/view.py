@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +22,6 @@ from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.relocalizer import rough_points
 from operators.odometry.rgbd.surface import Surface
-from operators.slam.graph_memory import plain
 from operators.slam.visual.guided import guided_pairs
 from operators.slam.visual.place_index import rooted
 
@@ -214,12 +211,3 @@ def _alone(view: View) -> LocalMap:
         )
     )  # fmt: skip
     return known
-
-
-def view_to_plain(view: View) -> dict[str, Any]:
-    """Returns a view as plain values; `view_from_plain` is the inverse."""
-    return plain(view) | {"surface": plain(view.surface)}
-
-
-def view_from_plain(values: Mapping[str, Any]) -> View:
-    return View(**(dict(values) | {"surface": Surface(**values["surface"])}))

@@ -9,6 +9,8 @@ import pytest
 from made_motion import GRAVITY, Motion
 from scipy.spatial.transform import Rotation
 
+from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.state import plain, typed
 from operators.fusion.filter.error_state import (
     POSITION,
     ROTATION,
@@ -35,8 +37,6 @@ from operators.fusion.filter.measurements import (
     Range,
     RestingForce,
     Velocity,
-    from_plain,
-    to_plain,
 )
 
 rng = np.random.default_rng(3)
@@ -84,7 +84,8 @@ def test_a_jacobian_is_the_derivative_of_its_residual(model: Model) -> None:
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda m: type(m).__name__)
 def test_a_measurement_comes_back_from_a_snapshot(model: Model) -> None:
-    again = from_plain(to_plain(model))
+    again = typed(Model, unpack_state(pack_state({"model": plain(model)}))["model"])
+    assert type(again) is type(model)
     one, other = (m.innovation(state(1), np.ones(3)) for m in (model, again))
     np.testing.assert_array_equal(one[0], other[0])
     np.testing.assert_array_equal(one[1], other[1])

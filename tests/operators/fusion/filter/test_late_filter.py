@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_motion import Motion
 
+from dataflow.execution.snapshots import pack_state, unpack_state
 from operators.fusion.filter.error_state import Noise
 from operators.fusion.filter.gate import GateConfig
 from operators.fusion.filter.history import Measurement, Sample
@@ -219,7 +220,8 @@ def test_a_snapshot_goes_on_with_equal_bits(heading: float | None) -> None:
         for fix in made.fixes:
             if made.samples[k - 1].time < fix.time <= made.samples[k].time:
                 one.measure(fix)
-    other = LateFilter.restored(FilterConfig(), one.snapshot())
+    other = made.filter(heading=heading)
+    other.restore(unpack_state(pack_state(one.snapshot())))
     for filter in (one, other):
         for k in range(half, len(made.samples)):
             filter.feel(made.samples[k])

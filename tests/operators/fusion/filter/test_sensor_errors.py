@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made_motion import GRAVITY, Motion
 
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import NavSatFix
 from operators.fusion.filter.error_state import SIZE, Noise, State
 from operators.fusion.filter.history import Measurement, Sample
@@ -22,6 +23,13 @@ MOTION = Motion()
 NOISE = Noise(1e-4, 1e-3, 1e-6, 1e-5)
 RATE = 50
 DRIFT, WHITE = 0.1, 0.05
+
+
+def restored(errors: SensorErrors, filter: LateFilter) -> LateFilter:
+    """Returns a filter with settings of errors that goes on from another's snapshot."""
+    made = LateFilter(FilterConfig(errors=errors), filter._base)
+    made.restore(unpack_state(pack_state(filter.snapshot())))
+    return made
 
 
 def driven(seed: int, errors: SensorErrors, seconds: float = 10.0) -> LateFilter:
@@ -64,7 +72,7 @@ def test_a_position_is_no_surer_than_its_drift_and_comes_back_from_a_snapshot() 
     filter = driven(1, config.errors)
     sigmas = np.sqrt(np.diag(filter.estimate(filter.time)[0].covariance)[:3])
     np.testing.assert_allclose(sigmas, [DRIFT, DRIFT, 2 * DRIFT], rtol=0.15)
-    again = LateFilter.restored(config, filter.snapshot())
+    again = restored(config.errors, filter)
     assert again.estimate(filter.time)[0].covariance.tobytes() == filter.estimate(filter.time)[0].covariance.tobytes()
 
 

@@ -9,6 +9,7 @@ import pytest
 from made_motion import GRAVITY, Motion
 from made_sensors import Robot, errors, fused
 
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Diagnostics
 from dataflow.operator import Context
 from operators.fusion import EkfFusion
@@ -33,6 +34,13 @@ def measured(kind: str, t: float) -> tuple[Model, Array]:
     if kind == "orientation":
         return Orientation(R.as_matrix()), np.eye(3) * 0.005**2
     return Velocity(R.inv().apply(MOTION.velocity(t)), np.eye(3), np.zeros(3)), np.eye(3) * 0.02**2
+
+
+def restored(errors: SensorErrors, filter: LateFilter) -> LateFilter:
+    """Returns a filter with settings of errors that goes on from another's snapshot."""
+    made = LateFilter(FilterConfig(errors=errors), filter._base)
+    made.restore(unpack_state(pack_state(filter.snapshot())))
+    return made
 
 
 def estimated(kind: str, offset: float, seconds: float = 6.0) -> tuple[float, float, LateFilter]:
@@ -78,10 +86,10 @@ def test_an_offset_that_nothing_tells_of_keeps_its_sigma() -> None:
 
 def test_offsets_come_back_from_a_snapshot_and_older_snapshots_get_them() -> None:
     _, _, filter = estimated("position", 0.05, seconds=3.0)
-    again = LateFilter.restored(FilterConfig(errors=SensorErrors(clocks=(("wrong", 0.1),))), filter.snapshot())
+    again = restored(SensorErrors(clocks=(("wrong", 0.1),)), filter)
     assert again.offsets() == filter.offsets()
     two = SensorErrors(clocks=(("wrong", 0.1), ("z", 0.3)))
-    more = LateFilter.restored(FilterConfig(errors=two), filter.snapshot())
+    more = restored(two, filter)
     assert more.offsets()["z"][1] == pytest.approx(0.3, rel=0.01)
 
 

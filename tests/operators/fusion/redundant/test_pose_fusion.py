@@ -154,14 +154,14 @@ def test_what_can_never_be_fused_is_refused_by_name() -> None:
     pose = poses(1, np.random.default_rng(0))[0]
     with pytest.raises(ValueError, match="its poses are in 'odom', the fused one is in 'world'"):
         operator.process({"ns/camera/pose": pose.replace(frame="odom")}, Context(pose.stamp))
-    operator.setup()
+    operator.on_reset("estimates")
     with pytest.raises(ValueError, match="camera/pose: its messages have no covariance"):
         operator.process({"ns/camera/pose": pose.replace(covariance=None)}, Context(pose.stamp))
-    operator.setup()
+    operator.on_reset("estimates")
     told = Odometry(stamp=1, frame="world", child_frame="base_link", position=[0, 0, 0], orientation=[0, 0, 0, 1])
     with pytest.raises(ValueError, match="wheels/odometry: its messages have no covariance"):
         operator.process({"ns/wheels/odometry": told}, Context(1))
-    operator.setup()
+    operator.on_reset("estimates")
     sample = orientations(1, np.random.default_rng(0))[0]
     with pytest.raises(ValueError, match="imu/imu: its samples have no orientation with covariance"):
         operator.process({"ns/imu/imu": sample.replace(orientation=None)}, Context(sample.stamp))

@@ -26,10 +26,11 @@ from operators.geometry import se3
 from operators.odometry import VisualOdometry
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fit, Fitter
+from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import Surface
-from operators.odometry.rgbd.tracker import RgbdOdometry, State
+from operators.odometry.rgbd.tracker import RgbdOdometry, RgbdState
 from operators.odometry.rgbd.trial import Trial, with_trial
 from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
 
@@ -245,7 +246,7 @@ def test_covariance_covers_the_error_and_grows_with_the_way() -> None:
 def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() -> None:
     odometry = RgbdOdometry(camera())
     for i, frame in enumerate(sequence(25, 3.0)[0]):
-        result, keyframes = odometry.track(*frame, i * 100_000_000), odometry.snapshot().keyframes
+        result, keyframes = odometry.track(*frame, i * 100_000_000), odometry.state.map.keyframes
         if i > 0 and not result.keyframe:
             newest = keyframes[-1]
             carried = moved_covariance(newest.covariance, newest.T_world_camera, result.T_world_camera)
@@ -256,7 +257,7 @@ def test_first_frames_of_a_camera_that_tracks_well_count_as_those_after_them() -
     """Nothing is known of the noise then; the doubt would stay in every later pose."""
     odometry, added = RgbdOdometry(camera()), []
     for i, frame in enumerate(sequence(40, 1.0)[0]):
-        known = odometry.snapshot().keyframes[-1] if i else None
+        known = odometry.state.map.keyframes[-1] if i else None
         result = odometry.track(*frame, i * 100_000_000)
         if known is not None:
             carried = moved_covariance(known.covariance, known.T_world_camera, result.T_world_camera)
@@ -356,16 +357,17 @@ def test_old_map_is_found_again_after_a_gap() -> None:
     assert errors(results[50:], poses[45:])[0] < 0.03
 
 
-def at_a_wrong_place(state: State, since: int, T_wrong: NDArray[np.float64]) -> State:
+def at_a_wrong_place(state: RgbdState, since: int, T_wrong: NDArray[np.float64]) -> RgbdState:
     """The state of an odometry that was found again at stamp `since`, and placed wrong by a motion in the world."""
     assert state.motion is not None
     T = state.motion.T_world_camera
-    keyframes = [
-        replace(k, T_world_camera=T_wrong @ k.T_world_camera) if k.stamp >= since else k for k in state.keyframes
+    known = LocalMap(state.map.capacity)
+    known.keyframes = [
+        replace(k, T_world_camera=T_wrong @ k.T_world_camera) if k.stamp >= since else k for k in state.map.keyframes
     ]
     wrong = replace(state.motion, T_world_camera=T_wrong @ T)
     trial = Trial.of(since, state.motion.stamp, T, 1e-2 * np.eye(6), T_wrong @ T)
-    return replace(state, motion=wrong, keyframes=tuple(keyframes), trials=with_trial(state.trials, trial))
+    return replace(state, motion=wrong, map=known, trials=with_trial(state.trials, trial))
 
 
 def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
@@ -374,8 +376,8 @@ def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
     odometry = RgbdOdometry(camera())
     for i in range(25):
         odometry.track(*frames[i], stamps[i])
-    since = odometry.snapshot().keyframes[-1].stamp
-    odometry.restore(at_a_wrong_place(odometry.snapshot(), since, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0]))))
+    since = odometry.state.map.keyframes[-1].stamp
+    odometry.state = at_a_wrong_place(odometry.state, since, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0])))
     results = [odometry.track(*frames[i], stamps[i]) for i in range(25, 60)]
     assert np.linalg.norm((results[0].T_world_camera - poses[25])[:3, 3]) > 0.7
     (taken_back,) = (r for r in results if r.taken_back is not None)
@@ -392,9 +394,9 @@ def test_a_wrong_place_is_taken_back_with_another_that_was_found_meanwhile() -> 
     odometry = RgbdOdometry(camera())
     for i in range(17):
         odometry.track(*frames[i], stamps[i])
-    first, second = (k.stamp for k in odometry.snapshot().keyframes[-2:])
-    state = at_a_wrong_place(odometry.snapshot(), first, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0])))
-    odometry.restore(at_a_wrong_place(state, second, se3.exp(np.array([0.4, -0.4, 0.3, 0, 0, 0.3]))))
+    first, second = (k.stamp for k in odometry.state.map.keyframes[-2:])
+    state = at_a_wrong_place(odometry.state, first, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0])))
+    odometry.state = at_a_wrong_place(state, second, se3.exp(np.array([0.4, -0.4, 0.3, 0, 0, 0.3])))
     results = [odometry.track(*frames[i], stamps[i]) for i in range(17, 60)]
     taken_back = next(k for k, result in enumerate(results) if result.taken_back is not None)
     assert results[taken_back].taken_back == first
@@ -416,7 +418,7 @@ def test_a_right_place_is_not_taken_back() -> None:
     odometry = RgbdOdometry(camera())
     for i in range(25):
         odometry.track(*frames[i], stamps[i])
-    odometry.restore(at_a_wrong_place(odometry.snapshot(), odometry.snapshot().keyframes[-1].stamp, np.eye(4)))
+    odometry.state = at_a_wrong_place(odometry.state, odometry.state.map.keyframes[-1].stamp, np.eye(4))
     results = [odometry.track(*frames[i], stamps[i]) for i in range(25, 60)]
     assert {(r.status, r.taken_back) for r in results} == {(Status.TRACKING, None)}
     assert errors(results, poses[25:])[0] < 0.03
@@ -497,7 +499,7 @@ def test_keyframes_hold_nothing_of_what_moves(monkeypatch: pytest.MonkeyPatch) -
         result = odometry.track(*frame, i * 100_000_000)
         if not result.keyframe or not fits or not fits[-1].movers.tiles.any():
             continue
-        kept = odometry.snapshot().keyframes[-1].surface
+        kept = odometry.state.map.keyframes[-1].surface
         assert not fits[-1].movers.hold(kept.points()).any()
         left_out += 1
     assert left_out > 0
@@ -621,7 +623,7 @@ def test_restored_state_goes_on_alike() -> None:
     one, other = RgbdOdometry(camera()), RgbdOdometry(camera())
     for i in range(20):
         one.track(*frames[i], i * 33_000_000)
-    other.restore(pickle.loads(pickle.dumps(one.snapshot())))
+    other.state = pickle.loads(pickle.dumps(one.state))
     rest = [[o.track(*frames[i], i * 33_000_000) for i in range(20, 30)] for o in (one, other)]
     assert digest(rest[0]) == digest(rest[1])
 
@@ -676,7 +678,7 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
     one, other = VisualOdometry(), VisualOdometry()
     one.setup()
     other.setup()
-    assert one.snapshot() == {}
+    other.restore(unpack_state(pack_state(one.snapshot())))  # of no frame
     for i in range(20):
         one.process(*given(i))
     recorded = pack_state(one.snapshot())

@@ -36,7 +36,7 @@ def view(k: int) -> View:
     odometry = RgbdOdometry(CAMERA)
     depth = seen.depth + 0.0015 * seen.depth**2 * np.random.default_rng(k).standard_normal(seen.depth.shape)
     odometry.track(seen.image, depth.astype(np.float32), 0)
-    return View.of(odometry.snapshot().keyframes[-1], CAMERA)
+    return View.of(odometry.state.map.newest, CAMERA)
 
 
 def node(k: int, T: Matrix) -> Node[View]:
@@ -145,9 +145,10 @@ def test_sightings_of_something_else_are_forgotten() -> None:
 
 def test_points_go_on_alike_from_plain_values() -> None:
     graph, points = graph_of(PATH)
-    again = MapPoints.from_plain(unpack_state(pack_state(points.to_plain())))
+    again = MapPoints()
+    again.restore(unpack_state(pack_state(points.snapshot())))
     adjust_newest(graph, points, FITTER, 3)
     other, _ = graph_of(PATH)
     adjust_newest(other, again, FITTER, 3)
-    assert pack_state(points.to_plain()) == pack_state(again.to_plain())
+    assert pack_state(points.snapshot()) == pack_state(again.snapshot())
     assert all(graph.nodes[k].T.tobytes() == other.nodes[k].T.tobytes() for k in graph.nodes)

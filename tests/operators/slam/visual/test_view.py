@@ -36,7 +36,7 @@ def view(T: Matrix, seed: int = 0, lit: bool = True) -> View:
     rng = np.random.default_rng(int(1e6 * abs(T[0, 3])))
     depth = seen.depth + 0.0015 * seen.depth**2 * rng.standard_normal(seen.depth.shape)
     odometry.track(seen.image if lit else np.zeros_like(seen.image), depth.astype(np.float32), 0)
-    return View.of(odometry.snapshot().keyframes[-1], CAMERA)
+    return View.of(odometry.state.map.newest, CAMERA)
 
 
 FIRST = camera_path(0.0, 36.0)
