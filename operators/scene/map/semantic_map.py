@@ -205,8 +205,8 @@ class SemanticMap(Operator):
             "status": _status(cloud.stamp, counts),
         }
         if images is not None and images.stamp == boxes.stamp and images.count == boxes.count:
-            rows = [k for k, each in enumerate(seen) if each is not None]
-            made["seen"] = _of_nodes(images, dict(zip(rows, joined, strict=True)), {o.id for o in objects})
+            views = [k for k, each in enumerate(seen) if each is not None]
+            made["seen"] = _of_nodes(images, dict(zip(views, joined, strict=True)), {o.id for o in objects})
         return made
 
     @property
