@@ -205,8 +205,8 @@ class SemanticMap(Operator):
             "status": _status(cloud.stamp, counts),
         }
         if images is not None and images.stamp == boxes.stamp and images.count == boxes.count:
-            views = [k for k, each in enumerate(seen) if each is not None]
-            made["seen"] = _of_nodes(images, dict(zip(views, joined, strict=True)), {o.id for o in objects})
+            used = [k for k, each in enumerate(seen) if each is not None]
+            made["seen"] = _of_nodes(images, dict(zip(used, joined, strict=True)), {o.id for o in objects})
         return made
 
     @property
@@ -227,13 +227,12 @@ class SemanticMap(Operator):
                 self._take_up(self._known, boxes.stamp)
         if pose.frame != self.state.frame:
             raise ValueError(f"the pose is in {pose.frame!r}, the map in {self.state.frame!r}")
-        known = self.state.classes
-        if boxes.class_names != known:
-            if boxes.class_names[: len(known)] != known:
-                raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {known}")
+        if boxes.class_names != self.state.classes:
+            if boxes.class_names[: len(self.state.classes)] != self.state.classes:
+                raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self.state.classes}")
             self.state.classes = boxes.class_names
-            self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, boxes.class_names)
-            self.state.map.widen(len(boxes.class_names), Kinds.of(self._labels, boxes.class_names))
+            self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, self.state.classes)
+            self.state.map.widen(len(self.state.classes), Kinds.of(self._labels, self.state.classes))
         return self.state.map
 
     def _take_up(self, saved: SavedMap, stamp: int) -> None:
