@@ -26,7 +26,7 @@ LONG = {
     "dataflow.process.operator_process:OperatorProcess.__init__": 80,
     "dataflow.supervision.plan:process_plans": 69,
     "dataflow.verification.verify:verify": 78,
-    "operators.scene.commands:show": 69,
+    "operators.scene.commands:show": 64,
     "operators.scene.map.cuboid:fit_cuboid": 81,
     "operators.scene.lifting.frustums:lift": 61,
     "operators.training.learning:learn_object": 71,
