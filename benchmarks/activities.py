@@ -32,8 +32,8 @@ from sensed_worlds import KINDS, Mapped, World, ids_in_view, mapped, sensed
 from dataflow.messages import Activity, Boxes3D, Classification, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from operators.recognition import ActivityRecognizer
-from operators.recognition.episodes import Episode
-from operators.recognition.sensed_people import nearest_agents
+from operators.recognition.activity.episodes import Episode
+from operators.recognition.activity.sensed_people import nearest_agents
 from operators.scene import SceneGraphBuilder
 from operators.scene.scoring import match_nodes
 from operators.training.simulated_people import read_episodes, write_episodes

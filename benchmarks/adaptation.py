@@ -32,7 +32,7 @@ from operators.segmentation import Segmenter
 from operators.segmentation.score import confusion, mean_iou
 from operators.simulator import SimulatedRobot
 from operators.simulator.classes import CLASSES, THINGS
-from operators.simulator.worlds import INDOOR
+from operators.simulator.worlds.make import INDOOR
 
 HELD_OUT, EVERY = 41_000, 10
 VISIBLE, PIXELS = 0.6, 50

@@ -30,7 +30,7 @@ from operators.cloud import CloudBuilder, CloudFilter, Clusterer, PlaneSegmenter
 from operators.cloud.plane_search import covered_area
 from operators.depth import DepthFilter
 from operators.simulator import SimulatedRobot
-from operators.simulator.worlds import make_world
+from operators.simulator.worlds.make import make_world
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -52,7 +52,7 @@ def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
     """RMSE outside of outages (m), the error at every outage's end, and what became of the fixes."""
     from dataflow.messages import Pose
     from operators.fusion import EkfFusion
-    from operators.fusion.sensor_settings import SensorSettings
+    from operators.fusion.sensors.settings import SensorSettings
 
     samples, truth = recorded(folder)
     stamps = np.array([t.stamp for t in truth])
@@ -95,7 +95,7 @@ def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
         if not out and (since % PERIOD >= 0.2 or since < PERIOD) and since > 3:
             errors.append(error)
         last, was_out = error, out
-    health = operator._filter.health["sensor/fix"]  # type: ignore[union-attr]
+    health = operator.state.filter.health["sensor/fix"]  # type: ignore[union-attr]
     text = f"used {health.used}, refused {health.refused}, unconfirmed {health.unconfirmed}, made room {health.widened}"
     return math.sqrt(float(np.mean(np.square(errors)))), ends, text
 
@@ -107,7 +107,7 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
     """
     from dataflow.messages import Imu, Pose, Transforms
     from operators.simulator.settings import Gnss, Inertial
-    from operators.simulator.worlds import make_world
+    from operators.simulator.worlds.make import make_world
 
     rng = np.random.default_rng([seed, 7])
     imu, gnss, rate = Inertial(), Gnss(), 100
@@ -178,8 +178,8 @@ def simulator(
     root of the trace of the position's covariance at the ends (m), which is what the filter expects of the errors."""
     from dataflow.messages.geometry import quaternion_to_matrix
     from operators.fusion import EkfFusion
-    from operators.fusion.error_state import log_rotation
-    from operators.fusion.sensor_settings import SensorSettings
+    from operators.fusion.filter.error_state import log_rotation
+    from operators.fusion.sensors.settings import SensorSettings
 
     samples, fixes, truth, extrinsics, heading = driven(seed, seconds)
     operator = EkfFusion(

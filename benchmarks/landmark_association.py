@@ -52,7 +52,7 @@ def drive(seed: int, noise: float) -> tuple[Array, Any, float]:
 
     `noise`: standard deviations of the odometry over what the filter is told.
     """
-    from operators.slam.landmark_filter import LandmarkFilter
+    from operators.slam.landmarks.filter import LandmarkFilter
 
     rng = np.random.default_rng(seed)
     landmarks, made, pose, rows = landmarks_of(rng), LandmarkFilter(), np.zeros(3), []

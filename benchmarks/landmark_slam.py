@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--gtsam", type=Path)
     arguments = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-    from operators.slam.landmark_filter import LandmarkFilter
+    from operators.slam.landmarks.filter import LandmarkFilter
     from operators.sources.victoria_park import read_steps
 
     steps = read_steps(arguments.file)

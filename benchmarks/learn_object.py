@@ -30,14 +30,14 @@ from operators.detection import CustomDetector
 from operators.evaluation.detection_score import ScoredFrame, score_frames
 from operators.recognition import LearnedDetector
 from operators.simulator.classes import THINGS
-from operators.simulator.color import expose
-from operators.simulator.frames import BODY_TO_OPTICAL, mounted
-from operators.simulator.optics import Optics
-from operators.simulator.renderer import Renderer
+from operators.simulator.rendering.optics import Optics
+from operators.simulator.rendering.renderer import Renderer
 from operators.simulator.scene import Thing, World
+from operators.simulator.sensors.color import expose
+from operators.simulator.sensors.frames import BODY_TO_OPTICAL, mounted
 from operators.simulator.shapes import Array, pose
 from operators.simulator.truth import detections
-from operators.simulator.worlds import make_world
+from operators.simulator.worlds.make import make_world
 from operators.training.learning import learn as command
 
 OPTICS = Optics(640, 480, 544.0, 544.0, 319.5, 239.5)

@@ -114,8 +114,8 @@ def make(out: Path, seed: Path, steps: int, rate: float) -> None:
             writer.write_firings(name, EPOCH + steps * period, encode_batch([last], last=True))
 
 
-def verified(path: Path) -> Figures:
-    """Verifies a recording as a whole, and watches the memory of all processes."""
+def verified(path: Path, timeout: float) -> Figures:
+    """Verifies a recording as a whole within `timeout` (s), and watches the memory of all processes."""
     command = [str(Path(sys.executable).with_name("dataflow")), "verify", str(path), "--json"]
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": os.pathsep.join([str(HERE), *filter(None, [TREE])])}
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
@@ -127,6 +127,9 @@ def verified(path: Path) -> Figures:
                 with suppress(psutil.Error):  # it has ended meanwhile
                     sizes.append(process.memory_full_info().pss)
             most = max(most, sizes, key=sum)
+            if time.monotonic() - began > timeout:
+                run.kill()  # its workers end with it
+                raise SystemExit(f"{path}: not verified within {timeout:g} s; peak {sum(most) / 1e6:.0f} MB so far")
             time.sleep(LOOK_EVERY)
         wall, after = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
         said.seek(0)
@@ -141,6 +144,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, nargs="+", default=[1.0, 4.0])
     parser.add_argument("--rate", type=float, default=5.0, help="steps of the source a second")
+    parser.add_argument("--timeout", type=float, default=3600.0, help="seconds that verifying one may take")
     parser.add_argument("--folder", type=Path, help="where the recordings are made, and stay")
     options = parser.parse_args()
     print("| hours | firings | file, MB | wall, s | firings/s | CPU, us a firing | peak memory, MB | by process, MB |")
@@ -153,7 +157,7 @@ def main() -> None:
             path = folder / f"{hours:g}h.mcap"
             if not path.exists():
                 make(path, seed, round(hours * 3600 * options.rate), options.rate)
-            found = verified(path)
+            found = verified(path, options.timeout)
             all_of.append(found)
             each = ", ".join(f"{size / 1e6:.0f}" for size in found.processes)
             print(

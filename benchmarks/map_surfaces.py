@@ -25,9 +25,9 @@ from dataflow.messages.geometry import transform_points
 from operators.geometry.extrinsics import transform_between
 from operators.scene import SceneGraphBuilder
 from operators.scene.box_overlap import shared_volume, upright_iou
-from operators.scene.cells import Cells
+from operators.scene.map.cells import Cells
 from operators.scene.scoring import Box, boxes_of, match_nodes
-from operators.simulator.worlds import make_world
+from operators.simulator.worlds.make import make_world
 
 Array = NDArray[np.float64]
 THICK, IOU, VIEWS, SIDE = 0.3, 0.25, 3, 0.1

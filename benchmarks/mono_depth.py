@@ -23,7 +23,7 @@ from numpy.typing import NDArray  # noqa: E402
 from dataflow.messages import DepthImage  # noqa: E402
 from dataflow.testing import play  # noqa: E402
 from operators.depth import MonoDepth  # noqa: E402
-from operators.evaluation.depth_error import depth_errors  # noqa: E402
+from operators.evaluation.depth_metrics import depth_errors  # noqa: E402
 from operators.geometry.pinhole import project, unproject  # noqa: E402
 from operators.sources import RgbdFolder  # noqa: E402
 

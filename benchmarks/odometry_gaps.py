@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -73,16 +74,15 @@ def gaps(drive: Drive) -> list[Gap]:
 
 
 def _gap(drive: Drive, before: RgbdOdometry, begins: int, length: int) -> Gap:
-    odometry = RgbdOdometry(drive.camera)
-    odometry.restore(before.snapshot())
-    last = before.snapshot().motion
+    odometry = RgbdOdometry(drive.camera, state=copy.deepcopy(before.state))
+    last = before.state.motion
     assert last is not None
     T_world_truth = last.T_world_camera @ invert(drive.truth[begins - 1])
-    segment = odometry.snapshot().keyframes[-1].segment
+    segment = odometry.state.map.newest.segment
     right, wrong = [], []
     for i in range(begins + length, begins + length + AFTER):
         result = odometry.track(drive.image[i], drive.depth[i], int(drive.stamps[i]))
-        claimed = odometry.snapshot().keyframes[-1].segment == segment and result.status in MEASURED
+        claimed = odometry.state.map.newest.segment == segment and result.status in MEASURED
         x = se3.log(invert(T_world_truth @ drive.truth[i]) @ result.T_world_camera)
         off = bool(np.linalg.norm(x[:3]) > WRONG[0] or np.linalg.norm(x[3:]) > WRONG[1])
         right.append(claimed and not off)

@@ -33,7 +33,7 @@ from numpy.typing import NDArray  # noqa: E402
 from dataflow.messages import Image  # noqa: E402
 from operators.recognition import FeatureExtractor  # noqa: E402
 from operators.simulator import SimulatedRobot  # noqa: E402
-from operators.simulator.worlds import INDOOR, make_world  # noqa: E402
+from operators.simulator.worlds.make import INDOOR, make_world  # noqa: E402
 
 Pixels = NDArray[np.uint8]
 Describe = Callable[[Pixels], NDArray[np.float32]]

@@ -21,7 +21,7 @@ from semantic_map import mapped, plainly_seen, seen
 from sensed_worlds import Frame, World, sensed
 
 from dataflow.messages import SceneGraph
-from operators.recognition.tracked_people import simulated_labels
+from operators.recognition.activity.tracked_people import simulated_labels
 from operators.scene import SceneGraphBuilder
 from operators.scene.relations import FLOOR
 from operators.scene.scoring import boxes_of, ordered, score_nodes, triples

@@ -81,7 +81,7 @@ def small_gicp(threads: int) -> bytes:
 
 
 def open3d_icp(threads: int) -> bytes:
-    from operators.simulator.native import open3d
+    from operators.simulator.rendering.native import open3d
 
     o3d = open3d()
     clouds = []

@@ -23,8 +23,8 @@ from semantic_map import mapped, plainly_seen, scored, seen
 from sensed_worlds import Frame, World, ids_in_view, sensed
 
 from dataflow.messages import Activity, SceneGraph
-from operators.recognition import activity_score
-from operators.recognition.tracked_people import simulated_labels
+from operators.recognition.activity import score as activity_score
+from operators.recognition.activity.tracked_people import simulated_labels
 from operators.scene import SceneGraphBuilder
 from operators.scene.scoring import PREDICATES, RelationScore, score_nodes
 

@@ -18,7 +18,7 @@ import numpy as np
 from sensed_worlds import Mapper, World, in_view, sensed
 
 from dataflow.messages import Detections2D, SceneGraph, SegmentationMap
-from operators.recognition.tracked_people import simulated_labels
+from operators.recognition.activity.tracked_people import simulated_labels
 from operators.scene.scoring import NodeScore, PlainlySeen, score_nodes
 
 IOU, VISIBLE, PIXELS, IMAGES = 0.25, 0.6, 200, 5

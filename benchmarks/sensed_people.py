@@ -15,7 +15,7 @@ from pathlib import Path
 from scene_graph import acts
 from sensed_worlds import World, ids_in_view, mapped, sensed
 
-from operators.recognition.sensed_people import SensedTrack, sensed_tracks, write_tracks
+from operators.recognition.activity.sensed_people import SensedTrack, sensed_tracks, write_tracks
 from operators.simulator.classes import ACTIVITIES
 
 

@@ -120,7 +120,7 @@ def _after(
 ) -> list[float | None]:
     """Returns by how many metres each pose after a gap is off, from the last before it; None where none is claimed."""
     odometry = StereoOdometry(drive.rig)
-    odometry.restore(before.snapshot())
+    odometry.state = before.state
     black = np.zeros_like(drive.left[0])
     for k in range(begin, begin + length):
         odometry.track(black, black, k * PERIOD)
@@ -179,7 +179,7 @@ def drifts(steps: list[Any], rig: StereoRig) -> None:
             estimate.append(result.T_world_camera)
             truth.append(step["ground_truth"].matrix())
         end, segments = drift(estimate, truth)
-        offset = odometry.snapshot().offset
+        offset = odometry.state.offset
         cells = f"{end:.2f} | {from_the_end(estimate, truth):.2f} | {segments:.2f} | {tracked}/{len(estimate)}"
         print(f"| {name} | {cells} | {offset:.2f} | {np.median(wall):.0f} | {np.median(cpu):.0f} |")
         whole[name] = estimate

@@ -39,7 +39,7 @@ from operators.odometry.rgbd.camera import RgbdCamera  # noqa: E402
 from operators.odometry.rgbd.settings import RgbdOdometryConfig  # noqa: E402
 from operators.odometry.rgbd.tracker import RgbdOdometry  # noqa: E402
 from operators.odometry.tracking import TrackResult  # noqa: E402
-from operators.simulator.native import open3d  # noqa: E402
+from operators.simulator.rendering.native import open3d  # noqa: E402
 
 Matrix = NDArray[np.float64]
 Track = Callable[[NDArray[np.uint8], NDArray[np.float32], int], Matrix]

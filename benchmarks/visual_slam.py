@@ -35,10 +35,10 @@ from operators.odometry.rgbd.camera import RgbdCamera  # noqa: E402
 from operators.odometry.rgbd.settings import RgbdOdometryConfig  # noqa: E402
 from operators.odometry.rgbd.tracker import RgbdOdometry  # noqa: E402
 from operators.slam.keyframe_graph import Node  # noqa: E402
-from operators.slam.rgbd_slam import RgbdSlam, SlamResult  # noqa: E402
-from operators.slam.visual_graph import GraphSettings  # noqa: E402
-from operators.slam.visual_map_file import read_visual_map, write_visual_map  # noqa: E402
-from operators.slam.visual_view import View  # noqa: E402
+from operators.slam.visual.graph import GraphSettings  # noqa: E402
+from operators.slam.visual.map_file import read_visual_map, write_visual_map  # noqa: E402
+from operators.slam.visual.mapper import RgbdSlam, SlamResult, SlamState  # noqa: E402
+from operators.slam.visual.view import View  # noqa: E402
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ def rendered(cache: Path, world: str, seed: int, seconds: int, mount: str | None
 
 def _render(file: Path, world: str, seed: int, seconds: int, mount: str | None) -> None:
     from operators.simulator import SimulatedRobot
-    from operators.simulator.worlds import make_world
+    from operators.simulator.worlds.make import make_world
 
     color: dict[str, Any] = {"rate": 10}
     speed = 0.8 if mount is None else float(MOUNTS[mount]["speed"])
@@ -108,6 +108,10 @@ def recorded(folder: Path) -> Drive:
     return Drive(np.array(images), np.array(depths), np.array(truth), stamps, RgbdCamera(K_color, K_depth))
 
 
+def slam_of(camera: RgbdCamera, config: RgbdOdometryConfig) -> RgbdSlam:
+    return RgbdSlam(camera, config, SlamState.begun(config, GraphSettings()))
+
+
 def ate(estimate: Array, truth: Array) -> float:
     """RMSE in centimetres after SE(3) alignment."""
     R, t, _ = align(estimate[:, :3, 3], truth[:, :3, 3], scaled=False)
@@ -129,7 +133,7 @@ def drift(estimate: Array, truth: Array) -> float:
 def compare(drive: Drive) -> dict[str, Any]:
     """Runs the odometry and the SLAM in turns, frame by frame."""
     config = RgbdOdometryConfig()
-    plain, slam = RgbdOdometry(drive.camera, config), RgbdSlam(drive.camera, config, GraphSettings())
+    plain, slam = RgbdOdometry(drive.camera, config), slam_of(drive.camera, config)
     odometry, results = [], list[SlamResult]()
     spent: dict[str, list[float]] = {"odometry": [], "slam": []}
     for image, depth, stamp in zip(drive.image, drive.depth, drive.stamps.tolist(), strict=True):
@@ -188,7 +192,7 @@ def show(name: str, row: dict[str, Any]) -> None:
 
 def saved_map(drive: Drive, file: Path) -> tuple[list[Node[View]], Array]:
     """Returns a map of a drive, saved and loaded, and the true pose (4, 4) of its origin."""
-    slam = RgbdSlam(drive.camera, RgbdOdometryConfig(), GraphSettings())
+    slam = slam_of(drive.camera, RgbdOdometryConfig())
     for image, depth, stamp in zip(drive.image, drive.depth, drive.stamps.tolist(), strict=True):
         slam.track(image, depth, stamp)
     write_visual_map(slam.graph, file)
@@ -199,7 +203,7 @@ def tries(known: list[Node[View]], origin: Array | None, drive: Drive, every: in
     """Begins anew at every `every`th frame; `origin` is None where the map is of another place."""
     tally: Counter[str] = Counter()
     for begin in range(0, len(drive.stamps) - TRY, every):
-        slam = RgbdSlam(drive.camera, RgbdOdometryConfig(), GraphSettings())
+        slam = slam_of(drive.camera, RgbdOdometryConfig())
         slam.graph.begin_in(known)
         tally["tries"] += 1
         for k in range(begin, begin + TRY):

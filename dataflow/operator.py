@@ -45,7 +45,18 @@ from dataflow.ports import (
     SourceError,
     is_tunable,
 )
-from dataflow.state import KEPT, Counts, Remembered, StateOf, fresh_state, plain, reset_state, state_hints, take_over
+from dataflow.state import (
+    KEPT,
+    Counts,
+    Remembered,
+    StateError,
+    StateOf,
+    fresh_state,
+    plain,
+    reset_state,
+    state_hints,
+    take_over,
+)
 
 __all__ = [
     "FINDING",
@@ -209,7 +220,14 @@ class Operator:
         """Takes over a state that `snapshot` gave. Called once, after `setup()`. Raises `StateError`."""
         if self.__state is None:
             raise NotImplementedError(f"{type(self).__name__} gives snapshots but cannot restore them")
-        take_over(self.state, state_hints(self.state), state)
+        try:
+            take_over(self.state, state_hints(self.state), state, self.new_part)
+        except StateError as error:
+            raise StateError(f"snapshot of another version: {error}") from error
+
+    def new_part(self, kind: type[Any]) -> Any:
+        """Returns a part of the state that `restore` finds missing, such as a `Remembered` with settings."""
+        return kind()
 
     def set_parameter(self, name: str, value: Any) -> Any:
         """Changes a `tunable` parameter; returns the value as validated. Raises `ParameterError`."""

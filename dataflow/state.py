@@ -18,6 +18,8 @@ from __future__ import annotations
 import collections
 import dataclasses
 import enum
+import functools
+import itertools
 import types
 import typing
 from collections import Counter, defaultdict, deque
@@ -48,6 +50,9 @@ _SEQUENCES: dict[Any, Callable[[Iterable[Any]], Any]] = {
 _MAPPINGS = (dict, collections.abc.Mapping, collections.OrderedDict, Counter, defaultdict)
 
 
+NewPart = Callable[[type[Any]], Any]
+
+
 class StateError(ValueError):
     """A value that a snapshot cannot hold, or a snapshot that does not fit the state it is restored into."""
 
@@ -71,14 +76,22 @@ class Remembered:
     Attributes without an annotation in the class body, and `ClassVar`s, are not part of it.
     """
 
+    def prepare_snapshot(self) -> None:
+        """Brings what is pending, or in memory kept for growth, into the attributes; called before a snapshot."""
+
+    def new_part(self, kind: type[Any]) -> Any:
+        """Returns a part that has `restore()` and is not there yet, with its settings; `kind()` by default."""
+        return kind()
+
     def snapshot(self) -> Any:
         """Returns the annotated attributes as plain values. Raises `StateError` for a value of another type."""
+        self.prepare_snapshot()
         place = type(self).__name__
         return {name: plain(getattr(self, name), f"{place}.{name}") for name in _hints(type(self))}
 
     def restore(self, state: Any) -> None:
         """Takes over the attributes that `snapshot` gave, then calls `restored`. Raises `StateError`."""
-        take_over(self, _hints(type(self)), state)
+        take_over(self, _hints(type(self)), state, self.new_part)
         self.restored()
 
     def restored(self) -> None:
@@ -114,6 +127,10 @@ def reset_state(old: Any, new: Any) -> None:
             setattr(new, each.name, getattr(old, each.name))
 
 
+_AS_IS = frozenset({types.NoneType, bool, int, float, str, bytes, np.ndarray, np.float64, np.int64, np.bool_})
+"""The types of most values, which are asked for first: a state may have thousands."""
+
+
 def plain(value: Any, place: str = "state") -> Any:
     """Returns a value as a snapshot holds it. Raises `StateError` for one of another type, with its place."""
     match value:
@@ -124,14 +141,14 @@ def plain(value: Any, place: str = "state") -> Any:
         case complex():
             return [value.real, value.imag]
         case Message():
-            content = {f.name: plain(getattr(value, f.name), f"{place}.{f.name}") for f in type(value).FIELDS}
-            return {"schema": value.SCHEMA, "stamp": value.stamp, **content}
+            names = [each.name for each in type(value).FIELDS]
+            return {"schema": value.SCHEMA, "stamp": value.stamp, **_plain_attributes(value, names, place)}
         case _ if hasattr(value, "snapshot"):
             return value.snapshot()
         case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            return {f.name: plain(getattr(value, f.name), f"{place}.{f.name}") for f in dataclasses.fields(value)}
+            return _plain_attributes(value, _field_names(type(value)), place)
         case deque():
-            return [value.maxlen, [plain(item, f"{place}[{k}]") for k, item in enumerate(value)]]
+            return [value.maxlen, _plain_items(value, place)]
         case Mapping():
             return [[plain(key, place), plain(item, f"{place}[{key!r}]")] for key, item in value.items()]
         case set() | frozenset():
@@ -141,7 +158,7 @@ def plain(value: Any, place: str = "state") -> Any:
             except TypeError:
                 raise StateError(f"{place} is a set of values that have no order; use a dict or a list") from None
         case list() | tuple():
-            return [plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
+            return _plain_items(value, place)
         case _:
             raise StateError(
                 f"{place} is a {type(value).__name__}; a state holds numbers, strings, bytes, None, numpy arrays, "
@@ -149,47 +166,39 @@ def plain(value: Any, place: str = "state") -> Any:
             )
 
 
-def typed(hint: Any, value: Any, place: str = "state") -> Any:
-    """Returns the value of type `hint` that `plain` turned into `value`. Raises `StateError` where it does not fit."""
-    origin, arguments = typing.get_origin(hint) or hint, typing.get_args(hint)
-    if origin in _SCALARS:
-        return _scalar(origin, value, place)
-    if origin in (typing.Union, types.UnionType):
-        return _one_of(arguments, value, place)
-    if origin is typing.Annotated:
-        return typed(arguments[0], value, place)
-    if origin in (Any, object, typing.Literal):
-        return value
-    if origin in _SEQUENCES:
-        return _SEQUENCES[origin](_items(arguments[:1], value, place))
-    if origin is tuple:
-        return _tuple(arguments, value, place)
-    if origin is deque:
-        longest, items = _listed(value, place, 2)
-        return deque(_items(arguments, items, place), maxlen=longest)
-    if origin in _MAPPINGS:
-        return _mapping(origin, arguments, value, place)
-    if origin is complex:
-        return complex(*_listed(value, place, 2))
-    if isinstance(origin, type):
-        return _object(origin, value, place)
-    raise StateError(f"{place}: a {hint!r} cannot be restored")
+def _plain_attributes(value: Any, names: Iterable[str], place: str) -> dict[str, Any]:
+    return {
+        name: own if type(own := getattr(value, name)) in _AS_IS else plain(own, f"{place}.{name}") for name in names
+    }
 
 
-def take_over(target: Any, hints: Mapping[str, Any], state: Any) -> None:
-    """Sets the attributes `hints` of `target` as `state` holds them; objects with `restore()` are restored in place.
+def _plain_items(value: Iterable[Any], place: str) -> list[Any]:
+    return [item if type(item) in _AS_IS else plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
 
-    Raises `StateError` where `state` lacks one or has others: it is of another version.
+
+@functools.cache
+def _field_names(kind: Any) -> tuple[str, ...]:
+    return tuple(each.name for each in dataclasses.fields(kind))
+
+
+def typed(hint: Any, value: Any, place: str = "state", current: Any = None, new_part: NewPart | None = None) -> Any:
+    """Returns the value of type `hint` that `plain` turned into `value`. Raises `StateError` where it does not fit.
+
+    Objects with `restore()` are those of `current` at the same place, restored; `new_part` makes others.
+    """
+    return _Typing(new_part or (lambda kind: kind())).typed(hint, value, place, current)
+
+
+def take_over(target: Any, hints: Mapping[str, Any], state: Any, new_part: NewPart) -> None:
+    """Sets the attributes `hints` of `target` as `state` holds them, parts with `restore()` as `typed` does.
+
+    Raises `StateError` where `state` lacks one or has others.
     """
     name = type(target).__name__
     _check_names(name, hints, state)
     for attribute, hint in hints.items():
-        current: Any = getattr(target, attribute, None)
-        place = f"{name}.{attribute}"
-        if hasattr(current, "restore") and state[attribute] is not None:
-            current.restore(state[attribute])
-        else:
-            setattr(target, attribute, typed(hint, state[attribute], place))
+        current = getattr(target, attribute, None)
+        setattr(target, attribute, typed(hint, state[attribute], f"{name}.{attribute}", current, new_part))
 
 
 _HINTS: dict[type, dict[str, Any]] = {}
@@ -209,32 +218,22 @@ def state_hints(state: Any) -> dict[str, Any]:
     return {each.name: hints[each.name] for each in dataclasses.fields(state)}
 
 
+def _with_arguments(hint: Any, bound: Mapping[Any, Any]) -> Any:
+    """Returns a type with the arguments of a generic class put in for its type variables."""
+    if isinstance(hint, typing.TypeVar):
+        return bound.get(hint, hint)
+    open_ = () if isinstance(hint, type) else getattr(hint, "__parameters__", ())
+    return hint[tuple(bound.get(each, each) for each in open_)] if open_ else hint
+
+
 def _check_names(name: str, hints: Iterable[str], state: Any) -> None:
     if not isinstance(state, Mapping):
-        raise StateError(f"snapshot of another version: {name} is a {type(state).__name__}, expected its fields")
+        raise StateError(f"{name} is a {type(state).__name__}, expected its fields")
     wanted, given = set(hints), set(state)
     if wanted != given:
         lacks = ", ".join(sorted(wanted - given)) or "nothing"
         more = ", ".join(sorted(given - wanted)) or "nothing"
-        raise StateError(f"snapshot of another version: {name} lacks {lacks} and has {more} besides")
-
-
-def _scalar(kind: type, value: Any, place: str) -> Any:
-    if isinstance(value, np.ndarray) and value.shape == ():
-        value = value.item()
-    if not isinstance(value, _SCALARS[kind]) or (kind is int and isinstance(value, bool)):
-        raise StateError(f"{place}: expected a {kind.__name__}, got a {type(value).__name__}")
-    return None if value is None else kind(value)
-
-
-def _one_of(members: Sequence[Any], value: Any, place: str) -> Any:
-    faults = []
-    for member in members:
-        try:
-            return typed(member, value, place)
-        except StateError as error:
-            faults.append(str(error))
-    raise StateError(faults[0] if len(faults) == 1 else f"{place}: fits none of its types ({'; '.join(faults)})")
+        raise StateError(f"{name} lacks {lacks} and has {more} besides")
 
 
 def _listed(value: Any, place: str, length: int | None = None) -> Any:
@@ -244,51 +243,12 @@ def _listed(value: Any, place: str, length: int | None = None) -> Any:
     return value
 
 
-def _items(arguments: Sequence[Any], value: Any, place: str) -> list[Any]:
-    kind = arguments[0] if arguments else Any
-    return [typed(kind, item, f"{place}[{k}]") for k, item in enumerate(_listed(value, place))]
-
-
-def _tuple(arguments: Sequence[Any], value: Any, place: str) -> tuple[Any, ...]:
-    if not arguments or arguments[-1] is Ellipsis:
-        return tuple(_items(arguments[:1], value, place))
-    items = _listed(value, place, len(arguments))
-    return tuple(typed(kind, item, place) for kind, item in zip(arguments, items, strict=True))
-
-
-def _mapping(origin: Any, arguments: Sequence[Any], value: Any, place: str) -> Any:
-    of_key, of_item = (arguments[0] if arguments else Any), (arguments[1] if len(arguments) > 1 else int)
-    pairs = [_listed(pair, place, 2) for pair in _listed(value, place)]
-    made: Any = Counter() if origin is Counter else {}
-    if origin is defaultdict:
-        made = defaultdict(typing.get_origin(of_item) or of_item)
-    for key, item in pairs:
-        made[typed(of_key, key, place)] = typed(of_item, item, f"{place}[{key!r}]")
-    return made
-
-
-def _object(kind: type, value: Any, place: str) -> Any:
-    """An array, number of numpy, enum, message, dataclass or object with `restore()`."""
-    if issubclass(kind, np.ndarray | np.generic):
-        if not isinstance(value, np.ndarray | np.generic):
-            raise StateError(f"{place}: expected an array, got a {type(value).__name__}")
-        return np.array(value) if issubclass(kind, np.ndarray) else value.dtype.type(value.item())
-    if issubclass(kind, enum.Enum):
-        if value not in kind.__members__:
-            raise StateError(f"{place}: {value!r} is none of {', '.join(kind.__members__)}")
-        return kind[value]
-    if issubclass(kind, Message):
-        return _message(value, place)
-    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
-        hints = _hints(kind)
-        return kind(*_tuple([hints[name] for name in kind._fields], value, place))
-    if hasattr(kind, "restore"):
-        made: Any = kind()
-        made.restore(value)
-        return made
-    if dataclasses.is_dataclass(kind):
-        return _dataclass(kind, value, place)
-    raise StateError(f"{place}: a {kind.__name__} cannot be restored")
+def _scalar(kind: type, value: Any, place: str) -> Any:
+    if isinstance(value, np.ndarray) and value.shape == ():
+        value = value.item()
+    if not isinstance(value, _SCALARS[kind]) or (kind is int and isinstance(value, bool)):
+        raise StateError(f"{place}: expected a {kind.__name__}, got a {type(value).__name__}")
+    return None if value is None else kind(value)
 
 
 def _message(value: Any, place: str) -> Message:
@@ -301,12 +261,112 @@ def _message(value: Any, place: str) -> Message:
         raise StateError(f"{place}: {error}") from error
 
 
-def _dataclass(kind: Any, value: Any, place: str) -> Any:
-    hints, fields = _hints(kind), dataclasses.fields(kind)
-    _check_names(f"{place} ({kind.__name__})", [each.name for each in fields], value)
-    restored = {each.name: typed(hints[each.name], value[each.name], f"{place}.{each.name}") for each in fields}
-    made = kind(**{each.name: restored[each.name] for each in fields if each.init})
-    for each in fields:
-        if not each.init:
-            object.__setattr__(made, each.name, restored[each.name])
-    return made
+@dataclasses.dataclass(frozen=True)
+class _Typing:
+    """Values of annotated types, made of plain ones; `new_part` makes the objects with `restore()` that are new."""
+
+    new_part: NewPart
+
+    def typed(self, hint: Any, value: Any, place: str, current: Any) -> Any:
+        origin, arguments = typing.get_origin(hint) or hint or types.NoneType, typing.get_args(hint)
+        if origin in _SCALARS:
+            return _scalar(origin, value, place)
+        if origin in (typing.Union, types.UnionType):
+            return self._one_of(arguments, value, place, current)
+        if origin is typing.Annotated:
+            return self.typed(arguments[0], value, place, current)
+        if isinstance(origin, typing.TypeVar):
+            return self.typed(origin.__bound__ or Any, value, place, current)
+        if origin in (Any, object, typing.Literal):
+            return value
+        if origin in _SEQUENCES:
+            return _SEQUENCES[origin](self._items(arguments[:1], value, place, current))
+        if origin is tuple:
+            return self._tuple(arguments, value, place, current)
+        if origin is deque:
+            longest, items = _listed(value, place, 2)
+            return deque(self._items(arguments, items, place, current), maxlen=longest)
+        if origin in _MAPPINGS:
+            return self._mapping(origin, arguments, value, place, current)
+        if origin is complex:
+            return complex(*_listed(value, place, 2))
+        if isinstance(origin, type):
+            return self._object(origin, arguments, value, place, current)
+        raise StateError(f"{place}: a {hint!r} cannot be restored")
+
+    def _one_of(self, members: Sequence[Any], value: Any, place: str, current: Any) -> Any:
+        faults = []
+        for member in members:
+            try:
+                return self.typed(member, value, place, current)
+            except StateError as error:
+                faults.append(str(error))
+        raise StateError(faults[0] if len(faults) == 1 else f"{place}: fits none of its types ({'; '.join(faults)})")
+
+    def _items(self, arguments: Sequence[Any], value: Any, place: str, current: Any) -> list[Any]:
+        kind = arguments[0] if arguments else Any
+        there = current if isinstance(current, list | tuple | deque) else ()
+        pairs = itertools.zip_longest(_listed(value, place), itertools.islice(there, len(value)))
+        return [self.typed(kind, item, f"{place}[{k}]", old) for k, (item, old) in enumerate(pairs)]
+
+    def _tuple(self, arguments: Sequence[Any], value: Any, place: str, current: Any) -> tuple[Any, ...]:
+        if not arguments or arguments[-1] is Ellipsis:
+            return tuple(self._items(arguments[:1], value, place, current))
+        items = _listed(value, place, len(arguments))
+        there = current if isinstance(current, tuple) and len(current) == len(items) else (None,) * len(items)
+        each = zip(arguments, items, there, strict=True)
+        return tuple(self.typed(kind, item, place, old) for kind, item, old in each)
+
+    def _mapping(self, origin: Any, arguments: Sequence[Any], value: Any, place: str, current: Any) -> Any:
+        of_key, of_item = (arguments[0] if arguments else Any), (arguments[1] if len(arguments) > 1 else int)
+        pairs = [_listed(pair, place, 2) for pair in _listed(value, place)]
+        made: Any = Counter() if origin is Counter else {}
+        if origin is defaultdict:
+            made = defaultdict(typing.get_origin(of_item) or of_item)
+        there = current if isinstance(current, Mapping) else {}
+        for plain_key, item in pairs:
+            key = self.typed(of_key, plain_key, place, None)
+            made[key] = self.typed(of_item, item, f"{place}[{plain_key!r}]", there.get(key))
+        return made
+
+    def _object(self, kind: type, arguments: Sequence[Any], value: Any, place: str, current: Any) -> Any:
+        """An array, number of numpy, enum, message, dataclass or object with `restore()`."""
+        if issubclass(kind, np.ndarray | np.generic):
+            if not isinstance(value, np.ndarray | np.generic):
+                raise StateError(f"{place}: expected an array, got a {type(value).__name__}")
+            return np.array(value) if issubclass(kind, np.ndarray) else value.dtype.type(value.item())
+        if issubclass(kind, enum.Enum):
+            if value not in kind.__members__:
+                raise StateError(f"{place}: {value!r} is none of {', '.join(kind.__members__)}")
+            return kind[value]
+        if issubclass(kind, Message):
+            return _message(value, place)
+        if issubclass(kind, tuple) and hasattr(kind, "_fields"):
+            hints = _hints(kind)
+            return kind(*self._tuple([hints[name] for name in kind._fields], value, place, current))
+        if hasattr(kind, "restore"):
+            if value is None:  # of a part that may be missing
+                raise StateError(f"{place}: expected a {kind.__name__}, got none")
+            made: Any = current if isinstance(current, kind) else self.new_part(kind)
+            made.restore(value)
+            return made
+        if dataclasses.is_dataclass(kind):
+            return self._dataclass(kind, arguments, value, place, current)
+        raise StateError(f"{place}: a {kind.__name__} cannot be restored")
+
+    def _dataclass(self, kind: Any, arguments: Sequence[Any], value: Any, place: str, current: Any) -> Any:
+        bound = dict(zip(getattr(kind, "__parameters__", ()), arguments, strict=False))
+        hints = {name: _with_arguments(hint, bound) for name, hint in _hints(kind).items()}
+        fields = dataclasses.fields(kind)
+        _check_names(f"{place} ({kind.__name__})", [each.name for each in fields], value)
+        restored = {
+            each.name: self.typed(
+                hints[each.name], value[each.name], f"{place}.{each.name}", getattr(current, each.name, None)
+            )
+            for each in fields
+        }
+        made = kind(**{each.name: restored[each.name] for each in fields if each.init})
+        for each in fields:
+            if not each.init:
+                object.__setattr__(made, each.name, restored[each.name])
+        return made

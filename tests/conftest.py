@@ -44,22 +44,22 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a suite in the backgrou
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="run the long tests too, as those named always are")
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """Divides the whole suite among the cores; tests that are named run in this process.
+    """Divides the whole suite among the cores, without long tests; tests that are named run in this process, all.
 
     Each worker takes a contiguous half and then from the other's end, so that what a module's tests share is made once.
     """
+    if hasattr(config, "workerinput"):  # it would divide its part again, and so on without end
+        return
     whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
-    worker = hasattr(config, "workerinput")  # which would divide its part again, and so on without end
+    config.option.long = config.option.long or not whole or bool(config.option.keyword)
     chosen = config.option.keyword or config.option.usepdb or config.option.collectonly
-    if (
-        whole
-        and not worker
-        and not chosen
-        and config.pluginmanager.hasplugin("xdist")
-        and config.option.numprocesses is None
-    ):
+    if whole and not chosen and config.pluginmanager.hasplugin("xdist") and config.option.numprocesses is None:
         config.option.numprocesses = len(os.sched_getaffinity(0))
         config.option.dist = "worksteal"
 
@@ -84,6 +84,14 @@ def marker_of(path: Path) -> str:
 
 def pytest_itemcollected(item: pytest.Item) -> None:
     item.add_marker(marker_of(item.path))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leaves long tests out of a whole suite without `--long`."""
+    if not config.option.long:
+        left_out = [item for item in items if item.get_closest_marker("long")]
+        items[:] = [item for item in items if not item.get_closest_marker("long")]
+        config.hook.pytest_deselected(items=left_out)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

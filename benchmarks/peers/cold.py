@@ -130,7 +130,7 @@ class Pair:
             one.live.start()
         near, far = made
         with contextlib.suppress(ImportError):  # a checkout in which messages are made elsewhere and copied
-            from dataflow.messages.memory import make_large_arrays_in
+            from dataflow.messages.fields.memory import make_large_arrays_in
 
             make_large_arrays_in(near.outlet.room)  # as its process would; the answers of the other one are small
         self.loops = {"near": self.greenlet(near.run), "far": self.greenlet(far.run)}

@@ -16,10 +16,10 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 
 from dataflow.chaos.kinds import SECOND, TO_OPERATORS, TO_SOURCES
-from dataflow.graph.document import parse
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.problems import Place, Problems, did_you_mean
-from dataflow.graph.tree import at, plain
+from dataflow.graph.yaml.document import parse
+from dataflow.graph.yaml.tree import at, plain
 from dataflow.operator import ParameterError, is_tunable, validate_parameters
 from dataflow.sync.stamps import parse_duration
 

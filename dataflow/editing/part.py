@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from dataflow.editing.key_frames import key_frames
 from dataflow.editing.report import Edited, Watch, unwatched
-from dataflow.editing.spans import Span, SpanRecords, Stamps, records_of_span
+from dataflow.editing.spans import RunRecords, Span, SpanRecords, Stamps
 from dataflow.graph import GraphError
 from dataflow.graph.model import Graph, Node, OperatorImportError
 from dataflow.interop.bag import is_latched
@@ -50,30 +51,51 @@ class Part:
         return self.spans.get(stream, (self.start, self.end))
 
 
+class Firings:
+    """The firing records of a recording and its graph: read when they are needed, once for all parts written of it."""
+
+    def __init__(self, origin: Origin) -> None:
+        self._origin = origin
+
+    @cached_property
+    def read(self) -> tuple[Mapping[str, Sequence[FiringRecord]], Graph | None]:
+        """The records by operator, in memory, and the graph where it is available."""
+        with Recording(self._origin.path) as recording:
+            log = FiringLog.read(recording)
+            return {operator: log.of(operator) for operator in sorted(log.operators)}, graph_of(recording)
+
+    @cached_property
+    def run(self) -> RunRecords:
+        """The records, of which those of spans are chosen."""
+        records, graph = self.read
+        return RunRecords(records, outputs_of(graph))
+
+
 def write_part(
     origin: Origin,
     part: Part,
     out: Path,
     *,
+    firings: Firings | None = None,
     compression: Compression = "zstd",
     overwrite: bool = False,
     watch: Watch = unwatched,
 ) -> Edited:
-    """Writes a part of `origin` into a separate file. Raises `RecordingError`."""
+    """Writes a part of `origin` into a separate file. `firings`: those of `origin`. Raises `RecordingError`."""
     done = Edited(str(out))
     part = decodable([origin], part, done)
-    firings = _firings(origin, part, done)
-    needed = {} if firings is None else firings.needed
+    chosen = _chosen(origin, part, firings or Firings(origin), done)
+    needed = {} if chosen is None else chosen.needed
     kept = masks_of(origin, part, needed)
     _describe(origin, kept, part, done)
     with Copy(out, origin, compression=compression, overwrite=overwrite) as copy:
         for name, values in _metadata(origin, kept, part):
             copy.writer.add_metadata(name, values)
         done.attachments = copy.attachments(origin)
-        if firings is not None:
-            write_firings(copy, [origin], firings.records)
-            done.firings = sum(r.kind in CALLS for records in firings.records.values() for r in records)
-            done.lead = firings.lead
+        if chosen is not None:
+            write_firings(copy, [origin], chosen.records)
+            done.firings = sum(r.kind in CALLS for records in chosen.records.values() for r in records)
+            done.lead = chosen.lead
         copy_messages(copy, origin, kept, watch)
         if origin.own:
             copy.frames(origin.namespace, framing(origin.path, kept_stamps(origin, kept)))
@@ -164,31 +186,28 @@ def keeps_state(node: Node) -> bool:
         return True
 
 
-def _firings(origin: Origin, part: Part, done: Edited) -> SpanRecords | None:
+def _chosen(origin: Origin, part: Part, firings: Firings, done: Edited) -> SpanRecords | None:
     """The firing records of the part; None where there are none, or they cannot be kept."""
     if not origin.own or not origin.of_kind(Kind.FIRINGS):
         return None
     if part.bare:
         done.notes.append("without firing records: it replays with fresh operators, and cannot be verified")
         return None
-    with Recording(origin.path) as recording:
-        log = FiringLog.read(recording)
-        records = {operator: log.of(operator) for operator in sorted(log.operators)}
-        if not part.cuts:
-            return SpanRecords(records, {}, (), None)
-        graph = graph_of(recording)
-        if graph is None:
-            done.notes.append(
-                "its graph is not in it, or its operators cannot be imported: firing records are left out, so it "
-                "cannot be verified"
-            )
-            return None
-        stored = {origin.stream(c) for c in origin.of_kind(Kind.STREAM).values()}
-        if part.streams is not None:
-            stored &= set(part.streams)
-        found = records_of_span(records, outputs_of(graph), stored, part.start, part.end, part.span)
-        done.unknown = tuple(n for n in found.unknown if n not in graph.nodes or keeps_state(graph.nodes[n]))
-        return found
+    records, graph = firings.read
+    if not part.cuts:
+        return SpanRecords(records, {}, (), None)
+    if graph is None:
+        done.notes.append(
+            "its graph is not in it, or its operators cannot be imported: firing records are left out, so it "
+            "cannot be verified"
+        )
+        return None
+    stored = {origin.stream(c) for c in origin.of_kind(Kind.STREAM).values()}
+    if part.streams is not None:
+        stored &= set(part.streams)
+    found = firings.run.of_span(stored, part.start, part.end, part.span)
+    done.unknown = tuple(n for n in found.unknown if n not in graph.nodes or keeps_state(graph.nodes[n]))
+    return found
 
 
 def masks_of(origin: Origin, part: Part, needed: Stamps) -> dict[int, Mask]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from dataflow.editing.part import Part, copy_messages, decodable, kept_stamps, masks_of, outputs_of, write_firings
 from dataflow.editing.report import Edited
-from dataflow.editing.spans import records_of_span
+from dataflow.editing.spans import RunRecords
 from dataflow.graph.model import Graph
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, OUTCOME, Kind
 from dataflow.recording.parts import OWNER_ONLY
@@ -43,7 +43,7 @@ def keep_span(
         origins = [stack.enter_context(Origin(file)) for file in files]
         part = decodable(origins, part, done)
         stored = {origin.stream(c) for origin in origins for c in origin.of_kind(Kind.STREAM).values()}
-        chosen = records_of_span(records, outputs_of(graph), stored, part.start, part.end, part.span)
+        chosen = RunRecords(records, outputs_of(graph)).of_span(stored, part.start, part.end, part.span)
         told = _told(records, outputs_of(graph))
         kept = once(origins, [_until(origin, masks_of(origin, part, chosen.needed), told) for origin in origins])
         written = {name: dict(values) for origin in origins for name, values in origin.metadata.items()}

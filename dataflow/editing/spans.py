@@ -68,28 +68,52 @@ class _Operator:
         return sum(r.kind in CALLS for r in self.records[: self.first])
 
 
-def records_of_span(
-    log: Mapping[str, Iterable[FiringRecord]],
-    outputs: Mapping[str, Sequence[str]],
-    stored: Collection[str],
-    start: int | None,
-    end: int | None,
-    span: Callable[[str], Span],
-) -> SpanRecords:
-    """Chooses the records of the span from `start` to `end` (ns, inclusive; None: not cut there).
+class RunRecords:
+    """The firing records of a run in memory, of which those of spans are chosen.
 
-    `log`: the records of each operator; `outputs`: its streams in the order of its ports; `stored`: the streams that
-    the recording holds. Other streams are made again, so their producers are repeated from where it is needed.
-    `span`: that from which the messages of a stream are taken over.
+    `log`: the records of each operator; `outputs`: its streams in the order of its ports.
     """
 
-    def within(stream: str, stamp: int) -> bool:
-        low, high = span(stream)
-        return (low is None or stamp >= low) and (high is None or stamp <= high)
+    def __init__(self, log: Mapping[str, Iterable[FiringRecord]], outputs: Mapping[str, Sequence[str]]) -> None:
+        self._operators = {name: _operator(records, tuple(outputs.get(name, ()))) for name, records in log.items()}
+        self._makers = {stream: name for name, streams in outputs.items() for stream in streams}
 
-    operators = {name: _operator(records, tuple(outputs.get(name, ())), end) for name, records in log.items()}
-    makers = {stream: name for name, streams in outputs.items() for stream in streams}
-    if start is not None:
+    def of_span(
+        self, stored: Collection[str], start: int | None, end: int | None, span: Callable[[str], Span]
+    ) -> SpanRecords:
+        """Chooses the records of the span from `start` to `end` (ns, inclusive; None: not cut there).
+
+        `stored`: the streams that the recording holds. Other streams are made again, so their producers are repeated
+        from where it is needed. `span`: that from which the messages of a stream are taken over.
+        """
+
+        def within(stream: str, stamp: int) -> bool:
+            low, high = span(stream)
+            return (low is None or stamp >= low) and (high is None or stamp <= high)
+
+        operators = self._operators
+        for operator in operators.values():
+            operator.first, operator.end = 0, _end(operator.records, end)
+        if start is not None:
+            self._choose_first(stored, start)
+        needed = _needed(operators, self._makers, within)
+        records: dict[str, list[FiringRecord]] = {}
+        unknown: list[str] = []
+        for name, operator in operators.items():
+            held = _held(operator, stored, needed, within)
+            records[name] = _with_cut(operator, held)
+            if operator.left_out and not any(map(_takes_up, records[name])):
+                unknown.append(name)
+        lead = min(
+            (r.stamp for o in operators.values() if o.left_out for r in o.kept if r.kind in CALLS),
+            default=None,
+        )
+        before = lead if lead is not None and start is not None and lead < start else None
+        return SpanRecords(records, needed, tuple(sorted(unknown)), before)
+
+    def _choose_first(self, stored: Collection[str], start: int) -> None:
+        """Sets the first record that is kept of each operator."""
+        operators = self._operators
         bounds = dict.fromkeys(operators, start - 1)  # a state at `start` has seen what lies there
         moved = list(operators)
         while moved:
@@ -97,30 +121,16 @@ def records_of_span(
             operator = operators[name]
             operator.first = _first_kept(operator.records, bounds[name], start)
             for stream, place in _taken(operator.kept):
-                maker = makers.get(stream, "")
+                maker = self._makers.get(stream, "")
                 made = operators[maker].made.get(stream, {}).get(place) if maker in operators else None
                 if made is None or stream in stored or made.index >= operators[maker].first:
                     continue
                 if made.held.stamp - 1 < bounds[maker]:
                     bounds[maker] = made.held.stamp - 1
                     moved.append(maker)
-    needed = _needed(operators, makers, within)
-    records: dict[str, list[FiringRecord]] = {}
-    unknown: list[str] = []
-    for name, operator in operators.items():
-        held = _held(operator, stored, needed, within)
-        records[name] = _with_cut(operator, held)
-        if operator.left_out and not any(map(_takes_up, records[name])):
-            unknown.append(name)
-    lead = min(
-        (r.stamp for o in operators.values() if o.left_out for r in o.kept if r.kind in CALLS),
-        default=None,
-    )
-    before = lead if lead is not None and start is not None and lead < start else None
-    return SpanRecords(records, needed, tuple(sorted(unknown)), before)
 
 
-def _operator(records: Iterable[FiringRecord], streams: tuple[str, ...], end: int | None) -> _Operator:
+def _operator(records: Iterable[FiringRecord], streams: tuple[str, ...]) -> _Operator:
     ordered: dict[tuple[int, int], FiringRecord] = {}
     for record in records:
         ordered.setdefault((record.incarnation, record.index), record)
@@ -134,10 +144,14 @@ def _operator(records: Iterable[FiringRecord], streams: tuple[str, ...], end: in
         for held in held_by(record):
             if held.stream in made:
                 made[held.stream].setdefault(held.place, _Made(held, -1))
-    last = len(listed)
-    if end is not None:
-        last = next((k for k, r in enumerate(listed) if r.kind in CALLS and r.stamp > end), last)
-    return _Operator(listed, streams, 0, last, made)
+    return _Operator(listed, streams, made=made)
+
+
+def _end(records: Sequence[FiringRecord], end: int | None) -> int:
+    """The place of the first record that is left out again."""
+    if end is None:
+        return len(records)
+    return next((k for k, r in enumerate(records) if r.kind in CALLS and r.stamp > end), len(records))
 
 
 def _first_kept(records: Sequence[FiringRecord], bound: int, start: int) -> int:

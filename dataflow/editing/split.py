@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dataflow.editing.key_frames import key_frames
-from dataflow.editing.part import Part, write_part
+from dataflow.editing.part import Firings, Part, write_part
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.mcap.packing import Compression
@@ -41,8 +41,9 @@ def split(
     if not overwrite and (there := [name for name in names if name.exists()]):
         raise RecordingError(f"{there[0]} exists already; choose another folder or ask to overwrite it")
     folder.mkdir(parents=True, exist_ok=True)
+    firings = Firings(origin)
     for name, part in zip(names, parts, strict=True):
-        yield write_part(origin, part, name, compression=compression, overwrite=overwrite, watch=watch)
+        yield write_part(origin, part, name, firings=firings, compression=compression, overwrite=overwrite, watch=watch)
 
 
 def _parts(origin: Origin, spans: list[tuple[int, int]]) -> list[Part]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from dataflow.state import StateError
 
 _ARRAY = 1
+_AS_IS = frozenset({type(None), bool, int, float, str, bytes})
 
 
 def pack_state(state: Mapping[str, Any]) -> bytes:
@@ -34,30 +36,48 @@ def differing_fields(recorded: bytes, here: bytes) -> str:
     before, now = unpack_state(recorded), unpack_state(here)
     if not (isinstance(before, Mapping) and isinstance(now, Mapping)):
         return "another kind of value"
-    if before.keys() != now.keys():
-        lacks, more = (
-            ", ".join(sorted(names)) or "none" for names in (now.keys() - before.keys(), before.keys() - now.keys())
-        )
-        return f"of another version of the operator: the recorded one lacks {lacks} and has {more} besides"
+    if (other := _other_version(before, now)) is not None:
+        return f"of another version of the operator: {other}"
     return "in " + ", ".join(
         name for name in sorted(now) if pack_state({"": before[name]}) != pack_state({"": now[name]})
     )
 
 
+def _other_version(before: Any, now: Any, place: str = "") -> str | None:
+    """Returns in words where two states are of two versions: mappings, messages aside, have other keys."""
+    if not (isinstance(before, Mapping) and isinstance(now, Mapping)):
+        forms = {type(each) if isinstance(each, list | Mapping) else None for each in (before, now)}
+        other = len(forms) > 1 and before is not None and now is not None
+        return f"the recorded one holds {place} in another form" if other else None
+    if "schema" in before or "schema" in now:
+        return None
+    if before.keys() != now.keys():
+        lacks, more = (
+            ", ".join(sorted(names)) or "none" for names in (now.keys() - before.keys(), before.keys() - now.keys())
+        )
+        return f"the recorded one lacks {lacks} and has {more} besides{f' in {place}' if place else ''}"
+    found = (_other_version(before[name], now[name], f"{place}.{name}".lstrip(".")) for name in sorted(now))
+    return next((each for each in found if each), None)
+
+
 def _plain(value: Any, place: str) -> Any:
     match value:
         case np.ndarray() if value.dtype != object:
-            header = msgpack.packb([value.dtype.str, list(value.shape)])
-            return msgpack.ExtType(_ARRAY, header + np.ascontiguousarray(value).tobytes())
+            return msgpack.ExtType(
+                _ARRAY, _header(value.dtype.str, value.shape) + np.ascontiguousarray(value).tobytes()
+            )
         case np.generic():
             return _plain(np.asarray(value), place)
-        case Mapping():
+        case dict() | Mapping():
             for key in value:
                 if not isinstance(key, str):
                     raise StateError(f"{place}: key {key!r} is no string")
-            return {key: _plain(value[key], f"{place}.{key}") for key in sorted(value)}
+            return {
+                key: own if type(own := value[key]) in _AS_IS else _plain(own, f"{place}.{key}")
+                for key in sorted(value)
+            }
         case list() | tuple():
-            return [_plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
+            return [item if type(item) in _AS_IS else _plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
         case None | bool() | int() | float() | str() | bytes():
             return value
         case _:
@@ -65,6 +85,12 @@ def _plain(value: Any, place: str) -> Any:
                 f"{place} is a {type(value).__name__}; a state holds numbers, strings, bytes, None, numpy arrays, "
                 "lists and mappings"
             )
+
+
+@functools.lru_cache(4096)
+def _header(dtype: str, shape: tuple[int, ...]) -> bytes:
+    packed: bytes = msgpack.packb([dtype, list(shape)])
+    return packed
 
 
 def _array(code: int, data: bytes) -> Any:

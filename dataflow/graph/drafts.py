@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dataflow.graph.problems import Place
-from dataflow.graph.tree import Leaf, Table, Tree
+from dataflow.graph.yaml.tree import Leaf, Table, Tree
 from dataflow.messages.base import Message
 from dataflow.operator import Operator
 

@@ -8,13 +8,13 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from dataflow.graph.expand import Expander
-from dataflow.graph.limits import MAX_BUNDLE, MAX_TEXT
+from dataflow.graph.expansion.expand import Expander
 from dataflow.graph.model import Bundle, Graph
-from dataflow.graph.presence import Presence
 from dataflow.graph.problems import Place, Problems
-from dataflow.graph.resolve import Resolver
+from dataflow.graph.resolution.presence import Presence
+from dataflow.graph.resolution.resolve import Resolver
 from dataflow.graph.search import add_folder
+from dataflow.graph.yaml.limits import MAX_BUNDLE, MAX_TEXT
 
 BUNDLE_FORMAT = "dataflow-graph/1"
 

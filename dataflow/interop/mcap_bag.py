@@ -13,6 +13,7 @@ from mcap.records import Channel
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
 from dataflow.interop.channels import join
 from dataflow.recording.layout import Kind
+from dataflow.recording.mcap.cache import ChunkCache
 from dataflow.recording.mcap.index import NO_END, McapFile
 from dataflow.recording.streams.codecs import SchemaText
 from dataflow.recording.streams.ordering import in_file_order
@@ -28,10 +29,11 @@ class McapBag:
         self.path = path
         self.promised: Mapping[str, int] = {}
         self.files: list[McapFile] = []
+        cache = ChunkCache()
         self._decompress = zstandard.ZstdDecompressor().decompress if compressed else None
         try:
             for file in files:
-                self.files.append(McapFile(file))
+                self.files.append(McapFile(file, cache=cache))
             joined = join(
                 ((number, channel.id), self._topic(opened, channel, sizes.get(channel.id, 0)))
                 for number, opened in enumerate(self.files)

@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Self, dataclass_transform
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.messages.compiled import Compiled, compile_class
-from dataflow.messages.fields import (
+from dataflow.messages.fields.compiled import Compiled, compile_class
+from dataflow.messages.fields.declared import (
     MISSING,
     SYMBOL,
     TAKEN,
@@ -304,7 +304,7 @@ class Message(_Declared):
 
     def _repr_html_(self) -> str:
         """HTML for notebooks."""
-        from dataflow.messages.display import message_html
+        from dataflow.messages.display.text import message_html
 
         return message_html(self.SCHEMA, self.items(), self._picture())
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, F64, I32, I64, U8, U16
 from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import within_length
-from dataflow.messages.pictures import Picture
+from dataflow.messages.display import pictures
+from dataflow.messages.display.pictures import Picture
 
 
 class PointCloud(Message):

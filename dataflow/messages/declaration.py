@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import Any, ClassVar
 
 from dataflow.messages.base import Message, registered_type, type_path
-from dataflow.messages.fields import (
+from dataflow.messages.fields.declared import (
     MISSING,
     SYMBOL,
     TAKEN,

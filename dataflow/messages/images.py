@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, U8, U16
 from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import finite, not_empty, positive
-from dataflow.messages.pictures import Picture
+from dataflow.messages.display import pictures
+from dataflow.messages.display.pictures import Picture
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 FORMATS = ("jpeg", "png", "webp")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, F64, I8, I32, I64, U8, U32
 from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import (
@@ -13,8 +12,9 @@ from dataflow.messages.checks import (
     within,
     within_length,
 )
+from dataflow.messages.display import pictures
+from dataflow.messages.display.pictures import Picture
 from dataflow.messages.geometry import transform_matrix
-from dataflow.messages.pictures import Picture
 
 
 class OccupancyGrid(Message):

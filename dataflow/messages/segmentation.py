@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, I32, U8, U16
 from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import not_empty, within
-from dataflow.messages.pictures import Picture
+from dataflow.messages.display import pictures
+from dataflow.messages.display.pictures import Picture
 
 
 class SegmentationMap(Message):

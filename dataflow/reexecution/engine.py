@@ -160,8 +160,9 @@ class Recomputation:
             self._driver.set_up()
             self._feed.setup()
             began = time.monotonic()
-            while (left := self._driver.turn()) and not until():
-                pass
+            left = self._driver.turn()
+            while left and not until():
+                left = self._driver.turn()
             self.wall = time.monotonic() - began
             if left:
                 return self.results()

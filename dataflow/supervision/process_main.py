@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dataflow.execution.failure import MOST_OF_A_TRACEBACK, cut
-from dataflow.messages.memory import make_large_arrays_in
+from dataflow.messages.fields.memory import make_large_arrays_in
 from dataflow.process.awake import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.descriptors import Descriptors, take_descriptors

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.base import ArrayField, Message, MessageError, message_type
-from dataflow.messages.compiled import Compiled
+from dataflow.messages.fields.compiled import Compiled
 from dataflow.transport.body import Body, short, where
 from dataflow.transport.envelope import (
     ALIGNMENT,

@@ -46,6 +46,11 @@ class Places:
             self._pages[self._life, page] = self._pages.get((self._life, page), 0) | bits
             self._begin = end
 
+    def __contains__(self, place: Place) -> bool:
+        self._settle()
+        incarnation, seq = place
+        return bool(self._pages.get((incarnation, seq >> _BITS), 0) >> (seq & _LAST) & 1)
+
     def counts(self) -> Mapping[int, int]:
         """Returns the number of messages by incarnation."""
         self._settle()
@@ -199,5 +204,5 @@ class Books:
     def of(self, name: str) -> Book:
         """The book of a node. Raises `RecordingError` for records that cannot be read."""
         if name in self._errors:
-            raise self._errors[name]
+            raise self._errors[name].with_traceback(None)  # each raise adds to it
         return self._books[name]

@@ -28,7 +28,7 @@ from dataflow.sinks.recorder import RecorderSink
 from dataflow.supervision.core.report import Watch
 from dataflow.supervision.replay import plan_replay
 from dataflow.sync import Entry
-from dataflow.verification.books import Books
+from dataflow.verification.books import Books, Places
 from dataflow.verification.choice import require_records
 from dataflow.verification.ledger import read_ledger
 from dataflow.verification.workers.board import Board
@@ -182,7 +182,7 @@ class _Store:
             for place in origin.file.attachments:
                 self.sink.writer.add_attachment(origin.file.attachment(place))
         self._copied = 0
-        self._taken: dict[str, set[tuple[int, int]]] = {stream: set() for stream in self.streams}
+        self._taken = {stream: Places() for stream in self.streams}
         for stream in sorted(recording.streams.keys() - graph.streams.keys()):
             self._copy(recording, stream)
 
@@ -198,14 +198,14 @@ class _Store:
             self._copied += 1
 
     def take(self, stream: str, entry: Entry) -> None:
-        self._taken[stream].add((entry.incarnation, entry.seq))
+        self._taken[stream].add(entry.incarnation, entry.seq)
         self.sink.message(stream, entry.value, entry.seq, entry.incarnation)
 
     def keep(self, recording: Recording) -> int:
         """Takes over the recorded messages that were not made again; how many."""
         kept = 0
         for stream, taken in self._taken.items():
-            if sum(recording.counts(stream).values()) <= len(taken):
+            if sum(recording.counts(stream).values()) <= sum(taken.counts().values()):
                 continue
             for found in recording.messages([stream]):
                 if (found.incarnation, found.seq) not in taken:

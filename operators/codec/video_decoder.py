@@ -32,6 +32,8 @@ class VideoDecoder(Operator):
 
     max_pixels: int = Param(64_000_000, ge=1, doc="a stream with more pixels a picture is refused")
 
+    # snapshot and restore are written out: the state is in FFmpeg, which takes it up from packets and may lack it
+
     def setup(self) -> None:
         self._decoder: PacketDecoder | None = None
         self._counts = Counter(decoded=0, lost=0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.messages.geometry import quaternion_to_matrix
 from operators.estimation.chi_square import quantile
-from operators.fusion.error_state import log_rotation
+from operators.fusion.filter.error_state import log_rotation
 
 Array = NDArray[np.float64]
 Innovations = dict[str, tuple[float, int]]

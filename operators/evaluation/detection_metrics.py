@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from dataflow.messages import Detections2D
 from dataflow.operator import Batch, Duration, In, Operator, Param
 from operators.evaluation.detection_score import ClassScore, DetectionScore, ScoredFrame, precision, recall
-from operators.evaluation.objects import Objects, objects_of
 from operators.evaluation.pairing import Pairing
 from operators.evaluation.views import check_names, check_view, listed
 
@@ -155,3 +154,25 @@ def _view(message: Detections2D) -> tuple[str, int, int]:
 def _scored(found: Objects, truth: Objects) -> ScoredFrame:
     boxes = found.boxes * np.tile(truth.size / found.size, 2)
     return ScoredFrame(truth.boxes, truth.labels, truth.ignored, boxes, found.labels, found.scores)
+
+
+@dataclass(frozen=True, eq=False)
+class Objects:
+    """Holds size (width, height) of an image, boxes (N, 4) in its pixels, class names, scores, which are ignored."""
+
+    size: NDArray[np.float64]
+    boxes: NDArray[np.float64]
+    labels: tuple[str, ...]
+    scores: NDArray[np.float32]
+    ignored: NDArray[np.bool_]
+
+
+def objects_of(message: Detections2D, ignored: NDArray[np.bool_] | None = None) -> Objects:
+    """Returns the objects of one image; `ignored`: those that do not count, none if not given."""
+    return Objects(
+        np.array([message.width, message.height], np.float64),
+        message.boxes.astype(np.float64),
+        message.labels(),
+        message.scores,
+        np.zeros(message.count, np.bool_) if ignored is None else ignored,
+    )

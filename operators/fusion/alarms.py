@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
-from operators.fusion.gate import GateConfig, Health
-from operators.fusion.late_filter import TOO_LATE
-from operators.fusion.sensor_settings import never_yields
+from dataflow.operator import Remembered
+from operators.fusion.filter.gate import GateConfig, Health
+from operators.fusion.filter.late_filter import TOO_LATE
+from operators.fusion.sensors.settings import never_yields
 
 _ANY = GateConfig()
 _RECENT = 2_000_000_000
 """Nanoseconds for which an alarm stands after its cause."""
 
 
-class Alarms:
+class Alarms(Remembered):
     """Decides when a status is due: every second, and at once where there is a new alarm."""
 
+    _reported: int
+    _raised: set[str]
+    _late: dict[str, tuple[int, int]]
+
     def __init__(self) -> None:
-        self._reported = -1
-        self._raised: set[str] = set()
-        self._late: dict[str, tuple[int, int]] = {}
+        self._reported, self._raised, self._late = -1, set(), {}
 
     def due(
         self,
@@ -64,15 +66,3 @@ class Alarms:
                 if stamp - since <= _RECENT:
                     found[key.removesuffix(TOO_LATE)] = f"too late: {count} came after the window"
         return found
-
-    def snapshot(self) -> dict[str, Any]:
-        return {
-            "reported": self._reported,
-            "raised": sorted(self._raised),
-            "late": {key: list(row) for key, row in self._late.items()},
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on where a snapshot was taken."""
-        self._reported, self._raised = int(state["reported"]), set(state.get("raised", ()))
-        self._late = {key: (int(n), int(at)) for key, (n, at) in state.get("late", {}).items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -24,23 +25,41 @@ from dataflow.messages import (
 )
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
 from operators.fusion.alarms import Alarms
-from operators.fusion.constraints import Constraints
-from operators.fusion.control import Command
-from operators.fusion.covariances import Unusable
-from operators.fusion.error_state import Noise
-from operators.fusion.filter_history import Measurement
-from operators.fusion.imu_dropout import ImuDropout
-from operators.fusion.inertial import InertialConfig, InertialSensor
-from operators.fusion.initialisation import Prior, coasting_node, prior_of
-from operators.fusion.last_measurements import LastMeasurements
-from operators.fusion.late_filter import FilterConfig, LateFilter
-from operators.fusion.lever_arms import LeverArms
+from operators.fusion.filter.control import Command
+from operators.fusion.filter.error_state import Noise
+from operators.fusion.filter.gate import GateConfig
+from operators.fusion.filter.history import Measurement
+from operators.fusion.filter.imu_dropout import ImuDropout
+from operators.fusion.filter.initialisation import Prior, coasting_node, prior_of
+from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.output import diagnostics, figures, odometry_of, unmeasured, well_known
-from operators.fusion.sensor_settings import SensorSettings, errors_of, name_of, never_yields, unheard, use_of
-from operators.fusion.sensors import Surroundings, measurements, turning
+from operators.fusion.sensors.constraints import Constraints
+from operators.fusion.sensors.covariances import Unusable
+from operators.fusion.sensors.inertial import InertialConfig, InertialSensor
+from operators.fusion.sensors.interpretation import Surroundings, measurements, turning
+from operators.fusion.sensors.last_measurements import LastMeasurements
+from operators.fusion.sensors.lever_arms import LeverArms
+from operators.fusion.sensors.settings import SensorSettings, errors_of, name_of, never_yields, unheard, use_of
 
 Array = NDArray[np.float64]
 _DEFAULT = SensorSettings()
+
+
+@dataclass(kw_only=True)
+class State:
+    """Holds the filter, what is known of each sensor, and the names of those whose gate never yields."""
+
+    inertial: InertialSensor
+    dropout: ImuDropout
+    constraints: Constraints
+    lever_arms: LeverArms
+    origin: tuple[float, float, float] | None
+    strict: set[str] = field(default_factory=set)  # before the filter, which is made anew with their gates
+    filter: LateFilter | None = None
+    alarms: Alarms = field(default_factory=Alarms)
+    last: LastMeasurements = field(default_factory=LastMeasurements)
+    sure: bool = False
+    ignored: Counter[str] = field(default_factory=Counter)
 
 
 class EkfFusion(Operator):
@@ -117,22 +136,25 @@ class EkfFusion(Operator):
     standstill: float | None = Param(None, gt=0, doc="forces straying less for half a second are rest", unit="m/s²")
     slip: float | None = Param(None, gt=0, doc="deviation of the velocity aside and upwards of what rolls", unit="m/s")
 
-    def setup(self) -> None:
-        self._begin()
+    state: State
 
-    def _begin(self) -> None:
-        self._filter: LateFilter | None = None
-        self._inertial = InertialSensor(
-            InertialConfig(self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rest, self.patience)
+    def setup(self) -> None:
+        self._gates: dict[str, GateConfig] = {}
+
+    def initial_state(self) -> State:
+        inertial = InertialConfig(
+            self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rest, self.patience
         )
-        self._dropout = ImuDropout(self.max_gap, self.gravity, self._unknown())
-        self._alarms = Alarms()
-        self._origin, self._sure = self.origin, False
-        self._ignored: Counter[str] = Counter()
-        self._last = LastMeasurements()
-        self._constraints = Constraints(self.standstill, self.slip)
-        self._gates = self._constraints.gates | {name: s.gate(s.use) for name, s in self.sensors.items()}
-        self._lever_arms = LeverArms(self.base_frame, "" if self.motion == "inertial" else self.base_frame)
+        return State(
+            inertial=InertialSensor(inertial),
+            dropout=ImuDropout(self.max_gap, self.gravity, self._unknown()),
+            constraints=Constraints(self.standstill, self.slip),
+            lever_arms=LeverArms(self.base_frame, "" if self.motion == "inertial" else self.base_frame),
+            origin=self.origin,
+        )
+
+    def new_part(self, kind: type[Any]) -> LateFilter:
+        return LateFilter(self._config(), coasting_node(0, self._prior(), self.gravity))
 
     def process(
         self,
@@ -142,8 +164,8 @@ class EkfFusion(Operator):
         landmark_map: LandmarkSightings | None = None,
     ) -> dict[str, Any] | None:
         """Raises ValueError for a message that its settings do not fit, or that has no place on the robot."""
-        self._lever_arms.given(extrinsics)
-        self._last.hear(measurements)
+        self.state.lever_arms.given(extrinsics)
+        self.state.last.hear(measurements)
         named = {
             name: m
             for stream, m in measurements.items()
@@ -154,72 +176,33 @@ class EkfFusion(Operator):
             settings = self._settings(name)
             if isinstance(message, Imu) and use_of(name, message, settings) == "inertial":
                 felt = self._feel(name, message, settings)
-        around = Surroundings(self._lever_arms.of, self.world_frame, self._origin, landmark_map, self._ignored)
+        around = Surroundings(
+            self.state.lever_arms.of, self.world_frame, self.state.origin, landmark_map, self.state.ignored
+        )
         for name, message in named.items():
             if not (isinstance(message, Imu) and use_of(name, message, self._settings(name)) == "inertial"):
                 self._measure(name, message, around)
-        self._origin = around.origin
-        if self._filter is None or not (felt or self.motion == "constant_velocity" or self._bridge(context.stamp)):
+        self.state.origin = around.origin
+        if self.state.filter is None or not (felt or self.motion == "constant_velocity" or self._bridge(context.stamp)):
             return None
         return {"odometry": self._odometry(context.stamp), "status": self._status(context.stamp)}
 
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew: so does the filter."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "filter": None if self._filter is None else self._filter.snapshot(),
-            "inertial": self._inertial.snapshot(),
-            "silence": self._dropout.snapshot(),
-            "constraints": self._constraints.snapshot(),
-            "alarms": self._alarms.snapshot(),
-            "stamps": dict(self._last.stamps),
-            "before": self._last.odometry_state(),
-            "origin": None if self._origin is None else list(self._origin),
-            "body": self._lever_arms.body,
-            "sure": int(self._sure),
-            "ignored": dict(self._ignored),
-            "heard": sorted(self._last.streams),
-            "strict": sorted(name for name, gate in self._gates.items() if never_yields(gate)),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        for name in state.get("strict", ()):
-            self._gates[name] = self._settings(name).gate("range")
-        if state["filter"] is not None:
-            self._filter = LateFilter.restored(self._config(), state["filter"])
-        if "inertial" in state:
-            self._inertial.restore(state["inertial"])
-            self._alarms.restore(state.get("alarms", state))
-        else:  # as snapshots were before the sensor kept its own part
-            self._alarms.restore({"reported": state["stamps"][-1]})
-            self._inertial.restore({"samples": state["samples"], "stamps": state["stamps"][:-1]})
-        for name, part in (("silence", self._dropout), ("constraints", self._constraints)):
-            if name in state:
-                part.restore(state[name])
-        last = state["stamps"] if "inertial" in state else {}
-        self._last.restore(state.get("heard", ()), last, state["before"])
-        self._origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1], state["origin"][2])
-        self._lever_arms.body, self._sure, self._ignored = state["body"], bool(state["sure"]), Counter(state["ignored"])
-
     def summary(self) -> Mapping[str, float | int | str]:
-        fused = self._filter
+        fused = self.state.filter
         health = {} if fused is None else fused.health
-        ignored = self._ignored + (Counter() if fused is None else fused.ignored)
+        ignored = self.state.ignored + (Counter() if fused is None else fused.ignored)
         return figures(health, self._offsets(), dict(self._unheard()), ignored)
 
     def _follows(self, name: str, stamp: int) -> bool:
         """Returns whether a message comes after the sensor's last; one that does not is counted."""
-        if self._last.follows(name, stamp):
+        if self.state.last.follows(name, stamp):
             return True
-        self._ignored[f"{name}: stamp not later than the last"] += 1
+        self.state.ignored[f"{name}: stamp not later than the last"] += 1
         return False
 
     def _offsets(self) -> dict[str, tuple[float, float]]:
         """The time offset of each sensor that has it estimated, in all, and its standard deviation, s."""
-        found = {} if self._filter is None else self._filter.offsets()
+        found = {} if self.state.filter is None else self.state.filter.offsets()
         return {name: (self._settings(name).offset + at, sigma) for name, (at, sigma) in found.items()}
 
     def _settings(self, name: str) -> SensorSettings:
@@ -227,6 +210,8 @@ class EkfFusion(Operator):
 
     def _config(self) -> FilterConfig:
         inertial = self.motion == "inertial"
+        strict = {name: self._settings(name).gate("range") for name in sorted(self.state.strict)}
+        self._gates = self.state.constraints.gates | {name: s.gate(s.use) for name, s in self.sensors.items()} | strict
         return FilterConfig(
             window=self.window,
             gravity=self.gravity,
@@ -246,10 +231,10 @@ class EkfFusion(Operator):
 
     def _bridge(self, stamp: int) -> bool:
         """Takes the inertial sensor's place where it is silent; False where it is not."""
-        assert self._filter is not None
-        if not self._dropout.lasts(stamp):
+        assert self.state.filter is not None
+        if not self.state.dropout.lasts(stamp):
             return False
-        self._filter.feel(self._dropout.sample(stamp, self._filter.estimate(stamp)[0]))
+        self.state.filter.feel(self.state.dropout.sample(stamp, self.state.filter.estimate(stamp)[0]))
         return True
 
     def _prior(self) -> Prior:
@@ -259,97 +244,101 @@ class EkfFusion(Operator):
     def _feel(self, name: str, imu: Imu, settings: SensorSettings) -> bool:
         """Takes an inertial sample; False where it is ignored."""
         if self.motion == "constant_velocity":
-            self._ignored[f"{name}: motion is constant_velocity"] += 1
+            self.state.ignored[f"{name}: motion is constant_velocity"] += 1
             return False
-        if self._lever_arms.body not in ("", imu.frame):
+        if self.state.lever_arms.body not in ("", imu.frame):
             raise ValueError(
-                f"{name}: a second inertial sensor, {imu.frame!r} beside {self._lever_arms.body!r}: only one can move"
+                f"{name}: a second inertial sensor, {imu.frame!r} beside "
+                f"{self.state.lever_arms.body!r}: only one can move"
             )
         if settings.offset_sigma:
             raise ValueError(f"{name}: its clock is the one that offsets are related to: it has no offset_sigma")
         try:
-            sample = self._inertial.sample(name, imu, imu.stamp - round(settings.offset * 1e9))
+            sample = self.state.inertial.sample(name, imu, imu.stamp - round(settings.offset * 1e9))
         except Unusable as reason:
-            self._ignored[f"{name}: {reason}"] += 1
+            self.state.ignored[f"{name}: {reason}"] += 1
             return False
-        self._lever_arms.body = imu.frame
-        self._dropout.felt(sample.time)
-        if self._filter is not None:
-            self._filter.feel(sample)
-            for sensor, model, noise in self._constraints.after(sample, self._lever_arms.of(self.base_frame)):
-                self._filter.measure(Measurement(sample.time, sensor, model, noise))
+        self.state.lever_arms.body = imu.frame
+        self.state.dropout.felt(sample.time)
+        if self.state.filter is not None:
+            self.state.filter.feel(sample)
+            for sensor, model, noise in self.state.constraints.after(sample, self.state.lever_arms.of(self.base_frame)):
+                self.state.filter.measure(Measurement(sample.time, sensor, model, noise))
             return True
-        begun = self._inertial.begun(sample, self._prior(), self.gravity, self._lever_arms.of(self.base_frame))
+        begun = self.state.inertial.begun(
+            sample, self._prior(), self.gravity, self.state.lever_arms.of(self.base_frame)
+        )
         if begun is None:
             return False
-        self._filter = LateFilter(self._config(), begun[0])
-        self._ignored["begun in motion"] += int(not begun[1])
+        self.state.filter = LateFilter(self._config(), begun[0])
+        self.state.ignored["begun in motion"] += int(not begun[1])
         return True
 
     def _measure(self, name: str, message: Message, around: Surroundings) -> None:
-        if self._filter is None and self.motion == "constant_velocity":
-            self._filter = LateFilter(self._config(), coasting_node(message.stamp, self._prior(), self.gravity))
+        if self.state.filter is None and self.motion == "constant_velocity":
+            self.state.filter = LateFilter(self._config(), coasting_node(message.stamp, self._prior(), self.gravity))
         settings = self._settings(name)
         if never_yields(gate := settings.gate(use_of(name, message, settings))):  # by the setting, or by its type
+            self.state.strict.add(name)
             self._gates[name] = gate
-        before = self._last.before(name, message)
-        if self._filter is None:
-            self._ignored[f"{name}: before the beginning"] += 1
+        before = self.state.last.before(name, message)
+        if self.state.filter is None:
+            self.state.ignored[f"{name}: before the beginning"] += 1
             return
         if settings.use == "control":
             self._command(name, message, settings, around)
             return
         clock, assumed = self._clock(name)
         if (seen := turning(message, before, around)) is not None:
-            self._dropout.saw(message.stamp, seen)
+            self.state.dropout.saw(message.stamp, seen)
         try:
             for time, sensor, model, noise in measurements(name, message, before, settings, around):
-                self._filter.measure(Measurement(time - assumed, sensor, model, noise, clock, assumed * 1e-9))
+                self.state.filter.measure(Measurement(time - assumed, sensor, model, noise, clock, assumed * 1e-9))
         except Unusable as reason:
-            self._ignored[f"{name}: {reason}"] += 1
+            self.state.ignored[f"{name}: {reason}"] += 1
 
     def _clock(self, name: str) -> tuple[int, int]:
         """Returns a sensor's clock in the filter, -1 for none, and the offset (ns) that it is believed to have."""
-        assert self._filter is not None
-        offsets = self._filter.offsets()
+        assert self.state.filter is not None
+        offsets = self.state.filter.offsets()
         return (list(offsets).index(name), round(offsets[name][0] * 1e9)) if name in offsets else (-1, 0)
 
     def _command(self, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> None:
-        assert self._filter is not None
+        assert self.state.filter is not None
         assert isinstance(message, Twist)
         if self.motion == "inertial":
-            self._ignored[f"{name}: a control input beside inertial samples"] += 1
+            self.state.ignored[f"{name}: a control input beside inertial samples"] += 1
         elif not (np.isfinite(message.linear).all() and np.isfinite(message.angular).all()):
-            self._ignored[f"{name}: not finite"] += 1
+            self.state.ignored[f"{name}: not finite"] += 1
         else:
             turn = around.place(message.frame)[:3, :3]
             time = message.stamp - round(settings.offset * 1e9)
-            self._filter.command(Command(time, turn @ message.linear, turn @ message.angular, settings.lag))
+            self.state.filter.command(Command(time, turn @ message.linear, turn @ message.angular, settings.lag))
 
     def _odometry(self, stamp: int) -> Odometry | None:
-        assert self._filter is not None
-        state, rate = self._filter.estimate(stamp)
-        self._sure = self._sure or well_known(state.covariance, self.sure)
-        if not self._sure:
+        assert self.state.filter is not None
+        state, rate = self.state.filter.estimate(stamp)
+        self.state.sure = self.state.sure or well_known(state.covariance, self.sure)
+        if not self.state.sure:
             return None
-        T_body_base = self._lever_arms.of(self.base_frame)
+        T_body_base = self.state.lever_arms.of(self.base_frame)
         return odometry_of(state, rate, T_body_base, stamp, self.world_frame, self.base_frame)
 
     def _status(self, stamp: int) -> Diagnostics | None:
-        assert self._filter is not None
-        health, ignored = self._filter.health, self._ignored + self._filter.ignored
+        assert self.state.filter is not None
+        health, ignored = self.state.filter.health, self.state.ignored + self.state.filter.ignored
         others = {}
-        if (count := self._filter.hypotheses) > 1:
+        if (count := self.state.filter.hypotheses) > 1:
             others["filter"] = f"{count} headings in question"
-        if self._filter.refuted_heading:
+        if self.state.filter.refuted_heading:
             others["heading"] = "the first heading that was told is wrong: measurements contradict it"
-        if self._dropout.lasts(stamp):
+        if self.state.dropout.lasts(stamp):
             others["inertial sensor"] = "silent: the motion is bridged by what others see"
-        if (warnings := self._alarms.due(stamp, health, self._filter.ignored, self._gates, others)) is None:
+        if (warnings := self.state.alarms.due(stamp, health, self.state.filter.ignored, self._gates, others)) is None:
             return None
         warnings |= {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
-        warnings |= unmeasured(self._filter.estimate(stamp)[0].covariance)
+        warnings |= unmeasured(self.state.filter.estimate(stamp)[0].covariance)
         return diagnostics(stamp, health, ignored, self._offsets(), warnings)
 
     def _unheard(self) -> list[tuple[str, str]]:
-        return list(unheard(tuple(self.sensors), sorted(self._last.streams)).items())
+        return list(unheard(tuple(self.sensors), sorted(self.state.last.streams)).items())

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from vqf import VQF
+
+from dataflow.operator import Remembered
 
 Array = NDArray[np.float64]
 
@@ -25,21 +26,35 @@ class OrientationConfig:
     field_rate: float | None = None
 
 
-class Orientation:
+class Orientation(Remembered):
     """Takes samples with stamps (ns). vqf wants them equally spaced, so steps are divided into whole periods.
 
     A step of n periods is made of n samples on the straight line from the last reading to the new one; what it is
     longer or shorter than n periods scales their angular velocity, so that the angle turned is right.
     """
 
+    stamp: int
+    fields: int
+    _period: float
+    _last: tuple[Array, Array] | None
+    _vqf_state: dict[str, Any]
+
     def __init__(self, config: OrientationConfig, period: float) -> None:
         """`period`: seconds between samples."""
+        self._config, self._period = config, period
+        self._last, self.stamp, self.fields, self._vqf_state = None, -1, 0, {}
+        self.restored()
+
+    def prepare_snapshot(self) -> None:
+        self._vqf_state = self._vqf.state
+
+    def restored(self) -> None:
+        config, period = self._config, self._period
         field_period = period if config.field_rate is None else 1 / config.field_rate
         self._vqf = VQF(period, magTs=field_period, tauAcc=config.tau_acc, tauMag=config.tau_mag)
-        self._period = period
-        self._last: tuple[Array, Array] | None = None
-        self.stamp = -1
-        self.fields = 0
+        kinds = self._vqf.state
+        if self._vqf_state:
+            self._vqf.state = {name: type(kinds[name])(_plain(value)) for name, value in self._vqf_state.items()}
 
     def feel(self, stamp: int, gyro: Array, accel: Array) -> None:
         """Takes angular velocity (rad/s) and specific force (m/s²); the stamp is later than the last."""
@@ -75,20 +90,6 @@ class Orientation:
     def disturbed(self) -> bool:
         """The magnetic field is not that of the earth as known so far."""
         return bool(self._vqf.getMagDistDetected())
-
-    def snapshot(self) -> dict[str, Any]:
-        last = None if self._last is None else list(self._last)
-        state = {name: _plain(value) for name, value in self._vqf.state.items()}
-        return {"period": self._period, "stamp": self.stamp, "fields": self.fields, "last": last, "vqf": state}
-
-    @classmethod
-    def restored(cls, config: OrientationConfig, state: Mapping[str, Any]) -> Orientation:
-        made = cls(config, float(state["period"]))
-        made.stamp, made.fields = int(state["stamp"]), int(state["fields"])
-        made._last = None if state["last"] is None else (state["last"][0], state["last"][1])
-        kinds = made._vqf.state
-        made._vqf.state = {name: type(kinds[name])(_plain(value)) for name, value in state["vqf"].items()}
-        return made
 
 
 def _plain(value: Any) -> Any:

@@ -4,15 +4,32 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Imu, MagneticField
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import KEPT, In, Operator, Out, Param, Sampled
 from operators.fusion.orientation import Orientation, OrientationConfig
 
+Array = NDArray[np.float64]
 _WARM_UP = 16
+
+
+@dataclass
+class State:
+    """Holds the filter, and the first samples (stamp, rad/s, m/s²) until it is made."""
+
+    filter: Orientation | None = None
+    waiting: list[tuple[int, Array, Array]] = field(default_factory=list)
+    last_field: int = -1
+    last_stamp: int = -1
+    word: str = ""
+    ignored: Counter[str] = field(default_factory=Counter, metadata=KEPT)
+    samples: int = field(default=0, metadata=KEPT)
+    rested: int = field(default=0, metadata=KEPT)
 
 
 class OrientationFilter(Operator):
@@ -45,38 +62,32 @@ class OrientationFilter(Operator):
     )
     max_gap: float = Param(0.5, gt=0, doc="longest time without a sample that is bridged", unit="s")
 
-    def setup(self) -> None:
-        self._ignored: Counter[str] = Counter()
-        self._rested = self._samples = 0
-        self._begin()
+    state: State
 
-    def _begin(self) -> None:
-        self._filter: Orientation | None = None
-        self._waiting: list[tuple[int, np.ndarray, np.ndarray]] = []
-        self._last_field = self._last_stamp = -1
-        self._state = ""
+    def new_part(self, kind: type[Any]) -> Orientation:
+        return Orientation(self._config(), 1.0)  # it restores the period
 
     def process(self, imu: Imu, magnetic_field: MagneticField | None = None) -> dict[str, Any] | None:
         """Raises ValueError where the magnetic field is in another frame."""
         gyro, accel = imu.angular_velocity, imu.linear_acceleration
         if not (np.isfinite(gyro).all() and np.isfinite(accel).all()):
-            self._ignored["sample not finite"] += 1
+            self.state.ignored["sample not finite"] += 1
             return None
-        if self._last_stamp >= 0 and imu.stamp - self._last_stamp > self.max_gap * 1e9:
-            self._ignored["gap, begun anew"] += 1
-            self._begin()
-        self._last_stamp = imu.stamp
+        if self.state.last_stamp >= 0 and imu.stamp - self.state.last_stamp > self.max_gap * 1e9:
+            self.state.ignored["gap, begun anew"] += 1
+            self.on_reset("imu")
+        self.state.last_stamp = imu.stamp
         field = self._new_field(imu, magnetic_field)
-        if self._filter is None and not self._warm(imu):
+        if self.state.filter is None and not self._warm(imu):
             return None
-        assert self._filter is not None
-        if imu.stamp > self._filter.stamp:
-            self._filter.feel(imu.stamp, gyro, accel)
+        assert self.state.filter is not None
+        if imu.stamp > self.state.filter.stamp:
+            self.state.filter.feel(imu.stamp, gyro, accel)
         if field is not None:
-            self._filter.see(field)
-        self._samples += 1
-        self._rested += self._filter.at_rest
-        q = self._filter.orientation(magnetic=self.heading == "magnetic")
+            self.state.filter.see(field)
+        self.state.samples += 1
+        self.state.rested += self.state.filter.at_rest
+        q = self.state.filter.orientation(magnetic=self.heading == "magnetic")
         oriented = Imu(
             stamp=imu.stamp,
             frame=imu.frame,
@@ -89,65 +100,43 @@ class OrientationFilter(Operator):
         )
         return {"oriented": oriented, "status": self._status(imu.stamp)}
 
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew: so does the filter."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {
-            "filter": None if self._filter is None else self._filter.snapshot(),
-            "waiting": [list(sample) for sample in self._waiting],
-            "last": [self._last_field, self._last_stamp],
-            "state": self._state,
-            "counts": [self._samples, self._rested],
-            "ignored": dict(self._ignored),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        if state["filter"] is not None:
-            self._filter = Orientation.restored(self._config(), state["filter"])
-        self._waiting = [(int(stamp), gyro, accel) for stamp, gyro, accel in state["waiting"]]
-        self._last_field, self._last_stamp = state["last"]
-        self._samples, self._rested = state["counts"]
-        self._state, self._ignored = state["state"], Counter(state["ignored"])
-
     def summary(self) -> Mapping[str, float | int | str]:
-        figures: dict[str, float | int | str] = {"samples": self._samples, "at rest": self._rested}
-        return figures | {f"ignored, {reason}": count for reason, count in sorted(self._ignored.items())}
+        figures: dict[str, float | int | str] = {"samples": self.state.samples, "at rest": self.state.rested}
+        return figures | {f"ignored, {reason}": count for reason, count in sorted(self.state.ignored.items())}
 
     def _config(self) -> OrientationConfig:
         return OrientationConfig(self.tau_acc, self.tau_mag, self.field_rate)
 
     def _new_field(self, imu: Imu, field: MagneticField | None) -> np.ndarray | None:
         """The field (3,) where it is one that was not used before, and usable."""
-        if field is None or self.heading == "relative" or field.stamp == self._last_field:
+        if field is None or self.heading == "relative" or field.stamp == self.state.last_field:
             return None
         if field.frame != imu.frame:
             raise ValueError(
                 f"the magnetic field is in the frame {field.frame!r} but the inertial samples in {imu.frame!r}: the "
                 "filter needs both in one"
             )
-        self._last_field = field.stamp
+        self.state.last_field = field.stamp
         if not np.isfinite(field.field).all() or not field.field.any():
-            self._ignored["field not finite or zero"] += 1
+            self.state.ignored["field not finite or zero"] += 1
             return None
         return field.field
 
     def _warm(self, imu: Imu) -> bool:
         """Collects the first samples; makes the filter, and gives them to it, when their rate is known."""
-        self._waiting.append((imu.stamp, imu.angular_velocity, imu.linear_acceleration))
-        if len(self._waiting) < _WARM_UP:
+        self.state.waiting.append((imu.stamp, imu.angular_velocity, imu.linear_acceleration))
+        if len(self.state.waiting) < _WARM_UP:
             return False
-        stamps = [stamp for stamp, _, _ in self._waiting]
-        self._filter = Orientation(self._config(), float(np.median(np.diff(stamps))) * 1e-9)
-        for stamp, gyro, accel in self._waiting:
-            self._filter.feel(stamp, gyro, accel)
-        self._waiting = []
+        stamps = [stamp for stamp, _, _ in self.state.waiting]
+        self.state.filter = Orientation(self._config(), float(np.median(np.diff(stamps))) * 1e-9)
+        for stamp, gyro, accel in self.state.waiting:
+            self.state.filter.feel(stamp, gyro, accel)
+        self.state.waiting = []
         return True
 
     def _status(self, stamp: int) -> Diagnostics | None:
         """The status, where it differs from the last one that was given."""
-        made = self._filter
+        made = self.state.filter
         assert made is not None
         rest = "at rest" if made.at_rest else "in motion"
         if self.heading == "relative":
@@ -159,15 +148,15 @@ class OrientationFilter(Operator):
         else:
             field, level = "heading from the magnetic field", 0
         state = f"{rest}; {field}"
-        if state == self._state:
+        if state == self.state.word:
             return None
-        self._state = state
+        self.state.word = state
         return Diagnostics(
             stamp=stamp,
             names=("orientation",),
             messages=(state,),
             levels=np.array([level], np.uint8),
-            keys=tuple(self._ignored),
-            values=tuple(str(count) for count in self._ignored.values()),
-            owners=np.zeros(len(self._ignored), np.int32) if self._ignored else None,
+            keys=tuple(self.state.ignored),
+            values=tuple(str(count) for count in self.state.ignored.values()),
+            owners=np.zeros(len(self.state.ignored), np.int32) if self.state.ignored else None,
         )

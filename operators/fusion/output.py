@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Odometry
 from dataflow.messages.diagnostics import Level
-from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, cross
-from operators.fusion.far import UNMEASURED
-from operators.fusion.gate import Health
+from operators.fusion.filter.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, cross
+from operators.fusion.filter.far import UNMEASURED
+from operators.fusion.filter.gate import Health
 from operators.geometry.se3 import skew
 from operators.status import Row, status_of_rows
 

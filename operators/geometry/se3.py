@@ -75,11 +75,15 @@ def adjoint(T: Matrix) -> Matrix:
 
 def orthonormalised(T: Matrix) -> Matrix:
     """Returns the nearest rigid motion to a nearly rigid matrix: products of many motions drift off SO(3)."""
-    u, _, vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
-    out[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    out[:3, 3] = T[:3, 3]
+    out[:3, :3], out[:3, 3] = nearest_rotation(T[:3, :3]), T[:3, 3]
     return out
+
+
+def nearest_rotation(M: Matrix) -> Matrix:
+    """Returns the rotation (3, 3) nearest to M (3, 3) in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(M)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
 def about_fixed_axes(covariance: Matrix, T_world_body: Matrix) -> Matrix:

@@ -10,13 +10,12 @@ localization for a mobile robot using multiple hypothesis tracking", 2001.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.estimation.particles import effective_size, evidence_of, moments, normalised, systematic, wrapped
 from operators.localization.motion import composed, moved
 from operators.localization.observations import Observation
@@ -60,14 +59,17 @@ class _Other:
         return evidence
 
 
-class CompetingHypothesis:
+class CompetingHypothesis(Remembered):
     """Looks for another place until a few searches found none, and follows the one that it found."""
 
+    _other: _Other | None
+    _searched: int
+    _since: int
+    _expected: Array | None
+    _refuted: Array  # (N, 3) places that were decided against
+
     def __init__(self) -> None:
-        self._other: _Other | None = None
-        self._searched = self._since = 0
-        self._expected: Array | None = None
-        self._refuted = np.zeros((0, 3))  # places that were decided against
+        self.forget()
 
     @property
     def decided(self) -> bool:
@@ -159,26 +161,6 @@ class CompetingHypothesis:
         poses = tried[best] + np.array(_NEAR) * rng.standard_normal((_FOLLOWED, 3))
         poses[:, 2] = wrapped(poses[:, 2])
         self._other, self._searched = _Other(poses, np.zeros(_FOLLOWED)), 0
-
-    def snapshot(self) -> dict[str, Any]:
-        other = self._other
-        return {
-            "other": None if other is None else [other.poses, other.logarithms, other.lead],
-            "searched": self._searched,
-            "since": self._since,
-            "expected": self._expected,
-            "refuted": self._refuted,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on where a snapshot was taken; one without this state begins anew."""
-        self.forget()
-        if state.get("other") is not None:
-            poses, logarithms, lead = state["other"]
-            self._other = _Other(poses, logarithms, float(lead))
-        self._searched, self._since = int(state.get("searched", 0)), int(state.get("since", 0))
-        self._expected = state.get("expected")
-        self._refuted = np.asarray(state.get("refuted", np.zeros((0, 3))), np.float64).reshape(-1, 3)
 
 
 def apart(one: Array, other: Array) -> bool:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Imu, Odometry
 from dataflow.messages.geometry import yaw_of
+from dataflow.operator import Remembered
 from operators.estimation.particles import wrapped
 from operators.localization.motion import DriveNoise
 
@@ -21,20 +20,22 @@ _MEMORY = 0.95
 """Share of a difference between wheels and gyroscope that is left after another step."""
 
 
-class DeadReckoning:
+class DeadReckoning(Remembered):
     """Gives steps (x, y, turn) and their covariances; learns the gyroscope's bias while the wheels stand.
 
     Where wheels and gyroscope disagree about the last turns by more than three standard deviations, one of them is
     wrong (a slipping wheel): a step's heading is then only as good as they agree.
     """
 
+    bias: float
+    disagreements: int
+    _last: tuple[int, Array] | None
+    _rates: list[tuple[int, float]]
+    _apart: Array
+
     def __init__(self, noise: DriveNoise) -> None:
-        self._noise = noise
-        self._last: tuple[int, Array] | None = None
-        self._rates: list[tuple[int, float]] = []
-        self._apart = np.zeros(2)
-        self.bias = 0.0
-        self.disagreements = 0
+        self._noise, self.bias, self.disagreements = noise, 0.0, 0
+        self._last, self._rates, self._apart = None, [], np.zeros(2)
 
     def feel(self, stamp: int, rate: float) -> None:
         """Takes a rate about the robot's vertical axis: its time (ns), rad/s."""
@@ -78,21 +79,6 @@ class DeadReckoning:
         within = [rate for stamp, rate in self._rates if begin < stamp <= end]
         self._rates = [(stamp, rate) for stamp, rate in self._rates if stamp > end]
         return sum(within) / len(within) if within else None
-
-    def snapshot(self) -> dict[str, Any]:
-        return {
-            "last": None if self._last is None else [self._last[0], self._last[1]],
-            "rates": [list(sample) for sample in self._rates],
-            "apart": self._apart,
-            "bias": self.bias,
-            "disagreements": self.disagreements,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._last = None if state["last"] is None else (int(state["last"][0]), state["last"][1])
-        self._rates = [(int(stamp), float(rate)) for stamp, rate in state["rates"]]
-        self._apart = np.asarray(state["apart"])
-        self.bias, self.disagreements = float(state["bias"]), int(state["disagreements"])
 
 
 def vertical_rate(imu: Imu, T_base_imu: Array) -> float:

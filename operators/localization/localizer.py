@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,21 @@ from operators.localization.status import status_of
 from operators.localization.weighted_cloud import WeightedCloud
 
 Array = NDArray[np.float64]
+
+
+@dataclass(kw_only=True)
+class State:
+    """Holds the clouds, and the messages (stamp, stream) that wait for the next odometry: their time comes then."""
+
+    fused: WeightedCloud
+    modalities: dict[str, WeightedCloud]
+    reckoning: DeadReckoning
+    pending: list[tuple[int, str, Message]] = field(default_factory=list)
+    ignored: Counter[str] = field(default_factory=Counter)
+    states: Counter[str] = field(default_factory=Counter)
+    reported: int = -1
+    shown: int = -1
+    word: str = ""
 
 
 class ParticleFilterLocalizer(Operator, merge=True):
@@ -106,6 +122,8 @@ class ParticleFilterLocalizer(Operator, merge=True):
     noise: DriveNoise = Param(DriveNoise(), doc="what the odometry is worth")
     cloud_every: Duration = Param("200ms", doc="time between two messages of the cloud")
 
+    state: State
+
     def setup(self) -> None:
         """Reads the saved map. Raises ValueError for parameters that contradict each other or a file that is no map."""
         if self.min_particles > self.max_particles:
@@ -115,21 +133,13 @@ class ParticleFilterLocalizer(Operator, merge=True):
         if self.map_file is not None:
             path = self.use_file(self.map_file)
             self._take_map(read_map(Path(path), self.map_frame))
-        self._begin()
 
-    def _begin(self) -> None:
+    def initial_state(self) -> State:
         config = CloudConfig(least=self.min_particles, most=self.max_particles, error=self.kld_error)
-        self._fused = WeightedCloud(config)
         own = CloudConfig(least=self.modality_particles, most=self.modality_particles)
-        self._modalities = (
-            {m: WeightedCloud(own) for m in sorted(set(MODALITIES.values()))} if self.modality_particles else {}
-        )
-        self._reckoning = DeadReckoning(self.noise)
-        self._pending: list[tuple[int, str, Message]] = []
-        self._ignored: Counter[str] = Counter()
-        self._states: Counter[str] = Counter()
-        self._reported = self._shown = -1
-        self._word = ""
+        kinds = sorted(set(MODALITIES.values())) if self.modality_particles else []
+        modalities = {kind: WeightedCloud(own) for kind in kinds}
+        return State(fused=WeightedCloud(config), modalities=modalities, reckoning=DeadReckoning(self.noise))
 
     def process(
         self,
@@ -148,11 +158,11 @@ class ParticleFilterLocalizer(Operator, merge=True):
                 T = transform_between(extrinsics, message.frame, self.base_frame)
                 rate = vertical_rate(message, T)
                 if math.isfinite(rate):
-                    self._reckoning.feel(message.stamp, rate)
+                    self.state.reckoning.feel(message.stamp, rate)
                 else:
-                    self._ignored[f"{name.partition('/')[2]}: not finite"] += 1
+                    self.state.ignored[f"{name.partition('/')[2]}: not finite"] += 1
             else:
-                self._pending.append((message.stamp, name.partition("/")[2], message))
+                self.state.pending.append((message.stamp, name.partition("/")[2], message))
         if odometry is None or not self._moves(odometry):
             return None
         around = Surroundings(
@@ -172,38 +182,11 @@ class ParticleFilterLocalizer(Operator, merge=True):
         self._advance(odometry, around)
         return self._outputs(odometry)
 
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew: the robot is looked for again."""
-        self._begin()
-
-    def snapshot(self) -> Mapping[str, Any] | None:
-        if self._pending:  # messages wait for the next odometry: their time comes then
-            return None
-        return {
-            "fused": self._fused.snapshot(),
-            "votes": {name: vote.snapshot() for name, vote in self._modalities.items()},
-            "reckoning": self._reckoning.snapshot(),
-            "ignored": dict(self._ignored),
-            "states": dict(self._states),
-            "stamps": [self._reported, self._shown],
-            "word": self._word,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._fused.restore(state["fused"])
-        for name, vote in self._modalities.items():
-            vote.restore(state["votes"][name])
-        self._reckoning.restore(state["reckoning"])
-        self._ignored, self._states = Counter(state["ignored"]), Counter(state["states"])
-        self._reported, self._shown = (int(stamp) for stamp in state["stamps"])
-        self._word = state["word"]
-
     def summary(self) -> Mapping[str, float | int | str]:
-        figures: dict[str, float | int | str] = {f"poses {word}": n for word, n in sorted(self._states.items())}
-        figures["particles injected"] = self._fused.injected
-        figures["turns on which wheels and gyroscope disagree"] = self._reckoning.disagreements
-        return figures | {f"ignored, {reason}": count for reason, count in sorted(self._ignored.items())}
+        figures: dict[str, float | int | str] = {f"poses {word}": n for word, n in sorted(self.state.states.items())}
+        figures["particles injected"] = self.state.fused.injected
+        figures["turns on which wheels and gyroscope disagree"] = self.state.reckoning.disagreements
+        return figures | {f"ignored, {reason}": count for reason, count in sorted(self.state.ignored.items())}
 
     def _take_map(self, grid: OccupancyGrid) -> None:
         if grid.frame != self.map_frame:
@@ -215,20 +198,20 @@ class ParticleFilterLocalizer(Operator, merge=True):
     def _moves(self, odometry: Odometry) -> bool:
         """Returns whether odometry can be used; if not, it is counted, and the next one covers both steps."""
         if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
-            self._ignored["odometry: not finite"] += 1
+            self.state.ignored["odometry: not finite"] += 1
             return False
-        if self._reckoning.stamp is not None and odometry.stamp <= self._reckoning.stamp:
-            self._ignored["odometry: stamp not later than the last"] += 1
+        if self.state.reckoning.stamp is not None and odometry.stamp <= self.state.reckoning.stamp:
+            self.state.ignored["odometry: stamp not later than the last"] += 1
             return False
         return True
 
     def _advance(self, odometry: Odometry, around: Surroundings) -> None:
         """Moves to an odometry message, with the measurements on the way."""
-        if self.start is not None and not self._fused.begun:
-            for vote in (self._fused, *self._modalities.values()):
+        if self.start is not None and not self.state.fused.begun:
+            for vote in (self.state.fused, *self.state.modalities.values()):
                 vote.begin_at(np.array(self.start), self.start_sigma, self.rng)
-        due, self._pending = self._pending, []
-        stepped = self._reckoning.step(odometry)
+        due, self.state.pending = self.state.pending, []
+        stepped = self.state.reckoning.step(odometry)
         done = 0.0
         for stamp, name, message in due:
             if stepped is not None:
@@ -242,23 +225,23 @@ class ParticleFilterLocalizer(Operator, merge=True):
 
     def _move(self, step: Array, covariance: Array, share: float) -> None:
         if share > 0:
-            for vote in (self._fused, *self._modalities.values()):
+            for vote in (self.state.fused, *self.state.modalities.values()):
                 vote.move(step * share, covariance * share, self.rng)
 
     def _observe(self, stamp: int, name: str, message: Message, around: Surroundings) -> None:
         try:
             seen = observation(name, message, around)
         except Unusable as reason:
-            self._ignored[f"{name}: {reason}"] += 1
+            self.state.ignored[f"{name}: {reason}"] += 1
             return
-        self._fused.update(name, stamp, seen, self.rng)
-        if self._modalities:
-            self._modalities[MODALITIES[type(message)]].update(name, stamp, seen, self.rng)
+        self.state.fused.update(name, stamp, seen, self.rng)
+        if self.state.modalities:
+            self.state.modalities[MODALITIES[type(message)]].update(name, stamp, seen, self.rng)
 
     def _outputs(self, odometry: Odometry) -> dict[str, Any]:
         stamp = odometry.stamp
-        fused = self._fused.estimate()
-        self._states[fused.word] += 1
+        fused = self.state.fused.estimate()
+        self.state.states[fused.word] += 1
         result: dict[str, Any] = {}
         if fused.word == "localised":
             result["pose"] = self._odometry(fused, odometry)
@@ -269,17 +252,17 @@ class ParticleFilterLocalizer(Operator, merge=True):
                 child_frame=odometry.frame,
             )
         for modality, port in (("lidar", "lidar_pose"), ("landmarks", "landmark_pose"), ("positions", "position_pose")):
-            if modality in self._modalities:
-                own = self._modalities[modality].estimate()
+            if modality in self.state.modalities:
+                own = self.state.modalities[modality].estimate()
                 if own.word == "localised":
                     result[port] = self._odometry(own, odometry)
-        if self._fused.begun and (self._shown < 0 or stamp - self._shown >= self.cloud_every):
-            self._shown = stamp
-            poses, weights = self._fused.cloud()
+        if self.state.fused.begun and (self.state.shown < 0 or stamp - self.state.shown >= self.cloud_every):
+            self.state.shown = stamp
+            poses, weights = self.state.fused.cloud()
             result["particles"] = ParticleSet(stamp=stamp, frame=self.map_frame, poses=poses, weights=weights)
-        if self._reported < 0 or stamp - self._reported >= 10**9 or fused.word != self._word:
-            self._reported, self._word = stamp, fused.word
-            result["status"] = status_of(stamp, fused, self._fused, self._modalities, self._ignored)
+        if self.state.reported < 0 or stamp - self.state.reported >= 10**9 or fused.word != self.state.word:
+            self.state.reported, self.state.word = stamp, fused.word
+            result["status"] = status_of(stamp, fused, self.state.fused, self.state.modalities, self.state.ignored)
         return result
 
     def _odometry(self, estimate: Estimate, odometry: Odometry) -> Odometry:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.estimation.particles import (
     bins_of,
     effective_size,
@@ -72,15 +72,18 @@ class Fit:
         return max(0.0, 1.0 - self.fast / max(_TOLERATED * self.slow, 1e-6))
 
 
-class MonteCarlo:
+class MonteCarlo(Remembered):
     """A cloud of poses (N, 3) with logarithms of their weights, and how well each sensor fits it."""
 
+    poses: Array
+    logarithms: Array
+    fits: dict[str, Fit]
+    injected: int
+    _heard: dict[str, int]
+
     def __init__(self, config: CloudConfig, poses: Array) -> None:
-        self.config, self.poses = config, poses
-        self.logarithms = np.zeros(len(poses))
-        self.fits: dict[str, Fit] = {}
-        self._heard: dict[str, int] = {}
-        self.injected = 0
+        self.config, self.poses, self.logarithms = config, poses, np.zeros(len(poses))
+        self.fits, self.injected, self._heard = {}, 0, {}
 
     @property
     def weights(self) -> Array:
@@ -149,21 +152,3 @@ class MonteCarlo:
             self.injected += fresh
             poses = np.vstack([poses, observation.propose(fresh, rng)])
         self.replace(poses)
-
-    def snapshot(self) -> dict[str, Any]:
-        return {
-            "poses": self.poses,
-            "logarithms": self.logarithms,
-            "fits": {sensor: [fit.fast, fit.slow] for sensor, fit in self.fits.items()},
-            "heard": dict(self._heard),
-            "injected": self.injected,
-        }
-
-    @classmethod
-    def restored(cls, config: CloudConfig, state: Mapping[str, Any]) -> MonteCarlo:
-        """Goes on where a snapshot was taken."""
-        made = cls(config, state["poses"])
-        made.logarithms, made.injected = state["logarithms"], int(state["injected"])
-        made._heard = {sensor: int(count) for sensor, count in state["heard"].items()}
-        made.fits = {sensor: Fit(*values) for sensor, values in state["fits"].items()}
-        return made

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+
+from dataflow.operator import Remembered
 
 CONSISTENT, LARGEST = 3.0, 100.0
 """Squared innovations up to so many times the usual ones are consistent; none is taken for more than `LARGEST`."""
@@ -33,15 +33,17 @@ class _Innovations:
         return _Innovations(stamp, min(lately, LARGEST), usual)
 
 
-class SensorWeights:
+class SensorWeights(Remembered):
     """Follows the innovations of several sensors: each counts less the larger they are, but only where another agrees.
 
     Where no sensor is consistent it is the pose that is wrong, and all count in full. Innovation-based adaptation:
     Mehra, "On the identification of variances and adaptive Kalman filtering", 1970.
     """
 
+    _heard: dict[str, _Innovations]
+
     def __init__(self) -> None:
-        self._heard: dict[str, _Innovations] = {}
+        self._heard = {}
 
     def update(self, sensor: str, stamp: int, misfit: float) -> float:
         """Takes the squared innovation over the one explained; returns what the sensor counts now, (0, 1]."""
@@ -65,12 +67,3 @@ class SensorWeights:
             if name != sensor
         )
         return 1.0 / ratio if ratio > CONSISTENT and agreed else 1.0
-
-    def snapshot(self) -> dict[str, Any]:
-        return {sensor: [heard.stamp, heard.lately, heard.usual] for sensor, heard in self._heard.items()}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._heard = {
-            sensor: _Innovations(int(stamp), float(lately), float(usual))
-            for sensor, (stamp, lately, usual) in state.items()
-        }

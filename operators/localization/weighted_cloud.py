@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.localization.competing_hypothesis import CompetingHypothesis
 from operators.localization.estimate import Estimate
 from operators.localization.monte_carlo import DOUBTFUL, CloudConfig, MonteCarlo
@@ -21,15 +21,20 @@ _LOST = 0.25
 """Doubt above which the robot is lost."""
 
 
-class WeightedCloud:
+class WeightedCloud(Remembered):
     """A cloud that begins where the first observation puts it, and heeds sensors by their innovations."""
 
+    sensor_weights: SensorWeights
+    competing: CompetingHypothesis
+    stamp: int
+    _cloud: MonteCarlo | None
+
     def __init__(self, config: CloudConfig) -> None:
-        self._config = config
-        self._cloud: MonteCarlo | None = None
-        self.sensor_weights = SensorWeights()
-        self.competing = CompetingHypothesis()
-        self.stamp = -1
+        self._config, self._cloud, self.stamp = config, None, -1
+        self.sensor_weights, self.competing = SensorWeights(), CompetingHypothesis()
+
+    def new_part(self, kind: type[Any]) -> MonteCarlo:
+        return MonteCarlo(self._config, np.zeros((0, 3)))
 
     @property
     def begun(self) -> bool:
@@ -102,18 +107,3 @@ class WeightedCloud:
     def fits(self) -> dict[str, float]:
         """Returns how well each sensor fits lately, [0, 1]."""
         return {} if self._cloud is None else {sensor: fit.fast for sensor, fit in self._cloud.fits.items()}
-
-    def snapshot(self) -> dict[str, Any]:
-        cloud = None if self._cloud is None else self._cloud.snapshot()
-        return {
-            "cloud": cloud,
-            "says": self.sensor_weights.snapshot(),
-            "rival": self.competing.snapshot(),
-            "stamp": self.stamp,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._cloud = None if state["cloud"] is None else MonteCarlo.restored(self._config, state["cloud"])
-        self.sensor_weights.restore(state["says"])
-        self.competing.restore(state.get("rival", {}))
-        self.stamp = int(state["stamp"])

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from dataflow.operator import Remembered
 from operators.geometry.se3 import Matrix
 
 Array = NDArray[np.float64]
 Keys = NDArray[np.int64]
 Rows = NDArray[np.intp]
+Values = NDArray[np.float32]
 
 SIDE = 8  # voxels along the side of a block
 _OFFSET = 1 << 20  # blocks along one axis on either side of the origin; three such numbers fit one int64
+_VALUES = ("_distance", "_weight", "_color")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def blocks_of(keys: Keys) -> NDArray[np.int64]:
     return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - _OFFSET
 
 
-class DistanceField:
+class DistanceField(Remembered):
     """Distances from surfaces, positive on the sensors' side, as weighted means at the corners of voxels.
 
     Voxel (i, j, k) of a block is the point (block * 8 + (i, j, k)) * voxel in the map frame. Blocks are made where
@@ -54,10 +55,15 @@ class DistanceField:
     reconstruction at scale using voxel hashing", 2013, kept sorted instead of hashed.
     """
 
+    _keys: Keys  # sorted
+    _rows: Rows  # of each key
+    _distance: Values
+    _weight: Values
+    _color: Values
+
     def __init__(self, settings: FieldSettings) -> None:
         self._settings = settings
-        self._keys: Keys = np.zeros(0, np.int64)  # sorted
-        self._rows: Rows = np.zeros(0, np.intp)  # of each key
+        self._keys, self._rows = np.zeros(0, np.int64), np.zeros(0, np.intp)
         self._distance = np.zeros((64, SIDE**3), np.float32)
         self._weight = np.zeros((64, SIDE**3), np.float32)
         self._color = np.zeros((64, SIDE**3, 3), np.float32)
@@ -115,18 +121,9 @@ class DistanceField:
         rows = self._rows
         return blocks_of(self._keys), self._distance[rows], self._weight[rows], self._color[rows]
 
-    def snapshot(self) -> dict[str, Any]:
-        """Returns all that the field holds."""
-        rows = self._rows
-        return {"keys": self._keys, "distance": self._distance[rows], "weight": self._weight[rows],
-                "color": self._color[rows]}  # fmt: skip
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes what `snapshot` of a field with the same settings gave."""
-        self._keys = np.array(state["keys"], np.int64)
-        self._rows = np.arange(len(self._keys))
-        self._distance, self._weight = np.array(state["distance"]), np.array(state["weight"])
-        self._color = np.array(state["color"])
+    def prepare_snapshot(self) -> None:
+        for name in _VALUES:
+            setattr(self, name, getattr(self, name)[: len(self._keys)])
 
     def _touched(self, z: NDArray[np.float32], K: Matrix, T_map_camera: Matrix) -> Keys:
         """Returns the sorted numbers of the blocks within the truncation of the depth image's ends."""
@@ -166,7 +163,7 @@ class DistanceField:
             raise ValueError(f"the surface needs {count} blocks of voxels, more than most_blocks")
         if count > len(self._distance):
             room = max(count, 2 * len(self._distance)) - len(self._distance)
-            for name in ("_distance", "_weight", "_color"):
+            for name in _VALUES:
                 values = getattr(self, name)
                 setattr(self, name, np.concatenate([values, np.zeros((room, *values.shape[1:]), np.float32)]))
         rows = np.concatenate([self._rows, np.arange(len(self._keys), count)])

@@ -1,9 +1,9 @@
 """Operators that say what an image or an object is, describe it by a vector, or say what an agent does."""
 
-from operators.recognition.activity_recognizer import ActivityRecognizer
+from operators.recognition.activity.recognizer import ActivityRecognizer
 from operators.recognition.feature_extractor import FeatureExtractor
 from operators.recognition.image_classifier import ImageClassifier
-from operators.recognition.learned_detector import LearnedDetector
-from operators.recognition.posture_recognizer import PostureRecognizer
+from operators.recognition.objects.learned_detector import LearnedDetector
+from operators.recognition.posture.recognizer import PostureRecognizer
 
 __all__ = ["ActivityRecognizer", "FeatureExtractor", "ImageClassifier", "LearnedDetector", "PostureRecognizer"]

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING
 from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
-    from operators.scene.object_lifter import ObjectLifter
-    from operators.scene.scene_graph_builder import SceneGraphBuilder
-    from operators.scene.semantic_map import SemanticMap
+    from operators.scene.graph.builder import SceneGraphBuilder
+    from operators.scene.lifting.object_lifter import ObjectLifter
+    from operators.scene.map.semantic_map import SemanticMap
 else:
     __getattr__, __dir__ = lazily(
         __name__,
         {
-            "object_lifter": ("ObjectLifter",),
-            "scene_graph_builder": ("SceneGraphBuilder",),
-            "semantic_map": ("SemanticMap",),
+            "lifting.object_lifter": ("ObjectLifter",),
+            "graph.builder": ("SceneGraphBuilder",),
+            "map.semantic_map": ("SemanticMap",),
         },
     )
 

@@ -19,9 +19,9 @@ from dataflow.messages.scene_summary import (
     summarize,
 )
 from dataflow.recording import Recording, RecordingError
-from operators.scene.history import Event, history
-from operators.scene.query import QueryError, as_json, ask
-from operators.scene.spark import as_spark_dsg
+from operators.scene.graph.history import Event, history
+from operators.scene.graph.query import QueryError, as_json, ask
+from operators.scene.graph.spark import as_spark_dsg
 
 _OLD = 1.0
 """Seconds by which a graph may be older than what is asked for, without a word."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
 from operators.scene.bodies import Body, BoxPairs
 
 Array = NDArray[np.float64]
@@ -288,18 +289,23 @@ def _moving(found: dict[Relation, float], agent: Body, other: Body, rules: Relat
         found[agent.id, "approaching", other.id] = cosine * min(1.0, closing / 0.4)
 
 
-class Hysteresis:
+class Hysteresis(Remembered):
     """Smooths scores over time: a relation begins where its mean reaches `begin` and ends where it falls to `end`.
 
     Those of `AT_ONCE` do so by the score of the moment.
     """
 
+    _means: dict[Relation, float]
+    _held: dict[Relation, None]
+    _stamp: int | None
+
     def __init__(self, begin: float, end: float, seconds: float) -> None:
         self._begin, self._end, self._seconds = begin, end, seconds
-        self._means: dict[Relation, float] = {}
-        self._held: dict[Relation, None] = {}
+        self._means, self._held, self._stamp = {}, {}, None
+        self.restored()
+
+    def restored(self) -> None:
         self._ordered: list[Relation] | None = None  # what is held; None where that has to be sorted anew
-        self._stamp: int | None = None
 
     def update(
         self, stamp: int, now: dict[Relation, float]
@@ -331,20 +337,3 @@ class Hysteresis:
         self._means = {r: m for r, m in self._means.items() if not {r[0], r[2]} & ids}
         self._held = {r: None for r in self._held if not {r[0], r[2]} & ids}
         self._ordered = None
-
-    def snapshot(self) -> dict[str, object]:
-        return {
-            "means": [[*r, m] for r, m in self._means.items()],
-            "held": [list(r) for r in self._held],
-            "stamp": self._stamp,
-        }
-
-    def restore(self, state: dict[str, object]) -> None:
-        means, held, stamp = state["means"], state["held"], state["stamp"]
-        assert isinstance(means, list)
-        assert isinstance(held, list)
-        assert stamp is None or isinstance(stamp, int)
-        self._means = {(int(s), str(p), int(o)): float(m) for s, p, o, m in means}
-        self._held = {(int(s), str(p), int(o)): None for s, p, o in held}
-        self._ordered = None
-        self._stamp = stamp

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import transform_points
-from operators.simulator.native import open3d
+from operators.simulator.rendering.native import open3d
 from operators.simulator.scene import World
 from operators.simulator.settings import ColorCamera
 from operators.simulator.shapes import Array

@@ -37,7 +37,7 @@ from dataflow.messages import (
 )
 from dataflow.operator import Duration, Out, Param, Source
 from operators.simulator.events import SENSORS, Fault, FaultPlan, Kidnap, Lighting, changes, level_at
-from operators.simulator.schedule import Tick, generator, merged, ticks, ticks_at
+from operators.simulator.sensors.schedule import Tick, generator, merged, ticks, ticks_at
 from operators.simulator.settings import (
     ColorCamera,
     DepthCamera,
@@ -56,7 +56,7 @@ from operators.simulator.settings import (
 )
 
 if TYPE_CHECKING:
-    from operators.simulator.rig import Rig
+    from operators.simulator.sensors.rig import Rig
 
 Messages = dict[str, Message]
 Rng = np.random.Generator
@@ -155,7 +155,7 @@ class SimulatedRobot(Source):
         from operators.simulator.lookout import watching
         from operators.simulator.stage import Stage
         from operators.simulator.truth import TrueGraph
-        from operators.simulator.worlds import make_world
+        from operators.simulator.worlds.make import make_world
 
         if self.image_frame == self.depth_frame:
             raise ValueError(f"image_frame and depth_frame must differ, both are {self.image_frame!r}")
@@ -192,7 +192,7 @@ class SimulatedRobot(Source):
 
     def _new_rig(self) -> Rig:
         """The sensors as they are at the start: their biases walk and their counts grow from there."""
-        from operators.simulator.rig import FrameNames, Rig
+        from operators.simulator.sensors.rig import FrameNames, Rig
 
         frames = FrameNames(self.world_frame, self.odometry_frame, self.base_frame, self.image_frame, self.depth_frame)
         return Rig(self._stage, self.seed, frames, self._sensors, self.truth)

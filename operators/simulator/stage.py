@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.simulator.drive import Drive, Shake
-from operators.simulator.optics import Optics, View
-from operators.simulator.renderer import Renderer, always_on
+from operators.simulator.rendering.optics import Optics, View
+from operators.simulator.rendering.renderer import Renderer, always_on
 from operators.simulator.scene import World
 
 Array = NDArray[np.float64]

@@ -12,11 +12,11 @@ from dataflow.messages.geometry import matrix_to_quaternion
 from operators.simulator.classes import ACTIVITIES, ACTIVITY_IDS, CLASS_IDS, CLASSES, THINGS, VOID
 from operators.simulator.drive import Drive
 from operators.simulator.events import Change
-from operators.simulator.furnishing import FLOOR
-from operators.simulator.optics import Optics, View
 from operators.simulator.relations import Nearness, spatial
-from operators.simulator.renderer import Renderer
+from operators.simulator.rendering.optics import Optics, View
+from operators.simulator.rendering.renderer import Renderer
 from operators.simulator.scene import Thing, World
+from operators.simulator.things.furnishing import FLOOR
 
 Array = NDArray[np.float64]
 _STEP = 1e-3  # seconds; velocities are differences over twice that

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING
 from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
-    from operators.slam.landmark_slam import LandmarkSlam
-    from operators.slam.lidar_slam import LidarSlam
-    from operators.slam.visual_slam import VisualSlam
+    from operators.slam.landmarks.slam import LandmarkSlam
+    from operators.slam.lidar.slam import LidarSlam
+    from operators.slam.visual.slam import VisualSlam
 else:  # each needs another part of scipy
     __getattr__, __dir__ = lazily(
         __name__,
         {
-            "landmark_slam": ("LandmarkSlam",),
-            "lidar_slam": ("LidarSlam",),
-            "visual_slam": ("VisualSlam",),
+            "landmarks.slam": ("LandmarkSlam",),
+            "lidar.slam": ("LidarSlam",),
+            "visual.slam": ("VisualSlam",),
         },
     )
 

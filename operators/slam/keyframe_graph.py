@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -34,13 +34,13 @@ class Node(Generic[V]):
     view: V | None
 
 
+@dataclass(eq=False)
 class KeyframeGraph(Generic[V]):
     """Nodes by number, which ascends with time, and edges between them. Fixed nodes are never moved."""
 
-    def __init__(self) -> None:
-        self.nodes: dict[int, Node[V]] = {}
-        self.edges: list[Edge] = []
-        self.fixed: set[int] = set()
+    nodes: dict[int, Node[V]] = field(default_factory=dict)
+    edges: list[Edge] = field(default_factory=list)
+    fixed: set[int] = field(default_factory=set)
 
     def begin_with(self, nodes: Iterable[Node[V]]) -> None:
         """Begins with nodes that never move."""

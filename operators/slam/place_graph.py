@@ -8,6 +8,7 @@ from typing import Generic
 import numpy as np
 
 from dataflow.messages.geometry import invert
+from dataflow.operator import Remembered
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.tracking import moved_covariance
@@ -20,22 +21,25 @@ STRAIN = 12.6  # squared sigmas (95 % of 6 degrees of freedom) by which a loop m
 FAR = 30.0  # squared sigmas by which a sight may be off before it is a surprise
 
 
-class PlaceGraph(Generic[V]):
+class PlaceGraph(Remembered, Generic[V]):
     """Keyframes, motions between neighbours by odometry and by sight, and loops between views of one place.
 
     A chain of odometry that is broken begins an island. The first is the map, unless a map was loaded; others are tied
     to it by the first loops between them, two of which must agree.
     """
 
+    graph: KeyframeGraph[V]
+    T_map_odom: Matrix
+    tied: set[int]  # islands whose place in the map is known
+    islands: int  # begun so far
+    segments: dict[int, int]  # the odometry's segments' islands
+    surprises: list[Surprise]
+    loops: int
+
     def __init__(self, settings: PlaceSettings, index: Callable[[], Index[V]], moved: Moved) -> None:
         self._settings, self._new_index, self._moved = settings, index, moved
-        self.graph = KeyframeGraph[V]()
-        self.T_map_odom: Matrix = np.eye(4)
-        self.tied: set[int] = {0}  # islands whose place in the map is known
-        self.islands = 0  # begun so far
-        self.segments: dict[int, int] = {}  # the odometry's segments' islands
-        self.surprises: list[Surprise] = []
-        self.loops = 0
+        self.graph, self.T_map_odom, self.tied = KeyframeGraph(), np.eye(4), {0}
+        self.islands, self.segments, self.surprises, self.loops = 0, {}, [], 0
         self._index = index()
 
     @property
@@ -57,9 +61,9 @@ class PlaceGraph(Generic[V]):
         """Begins with a saved map, in which the sensor is to be found; its nodes never move."""
         self.graph.begin_with(saved)
         self.tied = {node.island for node in saved}
-        self.index_views()
+        self.restored()
 
-    def index_views(self) -> None:
+    def restored(self) -> None:
         """Makes the place index of the nodes' views."""
         self._index = self._new_index()
         for k, node in self.nodes.items():
@@ -114,7 +118,7 @@ class PlaceGraph(Generic[V]):
         self.graph.remove(gone)
         self.graph.settle()
         self.surprises = []
-        self.index_views()
+        self.restored()
 
     def _adjust(self, number: int, view: V, eyes: Eyes[V]) -> None:
         """Improves the newest nodes by what their views share, if the sensor's kind supports it."""

@@ -16,6 +16,7 @@ from dataflow.messages.depth_units import FIFTHS, MILLIMETRES
 from dataflow.messages.geometry import transform_matrix
 from dataflow.operator import SourceError
 from operators.association import mutually_nearest
+from operators.geometry.se3 import orthonormalised
 from operators.sources.pacing import frame_stamp
 
 Matrix = NDArray[np.float64]
@@ -55,8 +56,7 @@ class Frame:
             return None
         if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6 or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 0.05:
             raise SourceError(f"{self.pose}: frame {self.name}: not a rigid motion:\n{T}")
-        T[:3, :3] = nearest_rotation(T[:3, :3])
-        return T
+        return orthonormalised(T)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -154,13 +154,6 @@ def list_tum(folder: Path) -> Dataset:
         frames.append(Frame(image, stamp, folder / image, folder / depths[j][1][0], pose))
     K = _intrinsics_file(folder) or Intrinsics(525.0, 525.0, 319.5, 239.5)
     return Dataset(frames, FIFTHS, K, K, None)
-
-
-def nearest_rotation(M: Matrix) -> Matrix:
-    """The rotation (3, 3) nearest to M in the Frobenius norm."""
-    U, _, Vt = np.linalg.svd(M)
-    R: Matrix = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return R
 
 
 def read_matrix(file: Path, shape: tuple[int, int]) -> Matrix:

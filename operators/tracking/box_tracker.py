@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import TrackState
+from dataflow.operator import Remembered
 from operators.tracking.assignment import assign, overlap
 from operators.tracking.box_filter import BoxFilter, BoxNoise, boxes_of, predict
 
@@ -62,7 +62,7 @@ class BoxTrack:
         return 1 / (1 + math.exp(-self.evidence))
 
 
-class BoxTracker:
+class BoxTracker(Remembered):
     """Follows boxes through an image stream.
 
     Strong detections are matched with all tracks by the overlap with predicted boxes and, where there are feature
@@ -71,11 +71,16 @@ class BoxTracker:
     (Zhang et al., "ByteTrack", 2022). Boxes of different classes never match.
     """
 
+    tracks: list[BoxTrack]
+    _next: int
+    _stamp: int | None
+
     def __init__(self, settings: BoxTrackerSettings) -> None:
         self._settings = settings
-        self.tracks: list[BoxTrack] = []
-        self._next = 1
-        self._stamp: int | None = None
+        self.tracks, self._next, self._stamp = [], 1, None
+
+    def new_part(self, kind: type[Any]) -> BoxFilter:
+        return self._settings.filter(np.array([0.0, 0, 1, 1]), 1.0, self._settings.noise)
 
     def update(
         self,
@@ -120,13 +125,6 @@ class BoxTracker:
     def forget(self) -> None:
         """Drops all tracks; their ids are not used again."""
         self.tracks, self._stamp = [], None
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {"next": self._next, "stamp": self._stamp, "tracks": [_packed(track) for track in self.tracks]}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._next, self._stamp = int(state["next"]), state["stamp"]
-        self.tracks = [_unpacked(each, self._settings) for each in state["tracks"]]
 
     def _match(
         self,
@@ -200,16 +198,3 @@ def _grown(boxes: Array, share: float) -> Array:
 def _cosine(known: Array | None, feature: Array) -> float:
     """Likeness in [0, 1]; a half where the track has no vector yet."""
     return 0.5 if known is None else (1 + float(known @ feature)) / 2
-
-
-def _packed(track: BoxTrack) -> dict[str, Any]:
-    plain = {key: getattr(track, key) for key in ("id", "class_id", "evidence", "born", "seen", "hits", "feature")}
-    return plain | {"state": int(track.state), "filter": track.filter.snapshot()}
-
-
-def _unpacked(state: Mapping[str, Any], settings: BoxTrackerSettings) -> BoxTrack:
-    filter = settings.filter(np.array([0.0, 0, 1, 1]), 1.0, settings.noise)
-    filter.restore(state["filter"])
-    plain = {key: state[key] for key in ("id", "class_id", "evidence", "born", "seen", "hits")}
-    feature = None if state["feature"] is None else np.array(state["feature"])
-    return BoxTrack(**plain, state=TrackState(state["state"]), filter=filter, feature=feature)

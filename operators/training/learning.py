@@ -59,9 +59,9 @@ def learn_object(
 
         from operators.detection.custom.dataset import IMAGE_SUFFIXES, LabelledImage
         from operators.detection.custom.folder import read_detection_data
-        from operators.recognition.learned_object import learn as fitted
-        from operators.recognition.learned_object import shown_in
-        from operators.recognition.proposals import COLOR, Trunk, inner_maps
+        from operators.recognition.objects.learned_object import learn as fitted
+        from operators.recognition.objects.learned_object import shown_in
+        from operators.recognition.objects.proposals import COLOR, Trunk, inner_maps
         from operators.weights import shipped
 
         detector = shipped("detector.onnx") if weights is None else weights

@@ -14,7 +14,7 @@ from operators.training.options import Training, takes
 from operators.training.running import report
 
 if TYPE_CHECKING:
-    from operators.recognition.episodes import Episode
+    from operators.recognition.activity.episodes import Episode
 
 Worlds = Annotated[int, typer.Option(min=1, help="Worlds to train on.")]
 Chosen = Annotated[int, typer.Option("--validation", min=1, help="Worlds by which the best epoch is chosen.")]
@@ -58,8 +58,8 @@ def train_activity(
     """
     with friendly():
         options.keep_earlier(out)
-        from operators.recognition.activity_training import ActivityTask
-        from operators.recognition.sensed_people import read_tracks
+        from operators.recognition.activity.sensed_people import read_tracks
+        from operators.recognition.activity.training import ActivityTask
 
         training, choosing = _episodes(data, worlds, validation, processes, options.json)
         parts = [read_tracks(folder) if folder else [] for folder in (sensed, sensed_validation)]
@@ -96,7 +96,7 @@ def train_posture(
         if options.batch < 2:
             raise ValueError("--batch: normalisation needs 2 silhouettes a step or more")
         options.keep_earlier(out)
-        from operators.recognition.posture_training import PostureTask
+        from operators.recognition.posture.training import PostureTask
         from operators.training import made_worlds
         from operators.training.simulated_postures import TRAINING, VALIDATION, read_postures, write_postures
 

@@ -1,7 +1,7 @@
 """Episodes of people and other movers in simulated worlds, as true boxes over time: no image is rendered.
 
-Each world is drawn from a separate seed and driven through; `operators.recognition.tracked_people` derives from it what
-a tracker would see.
+Each world is drawn from a separate seed and driven through; `operators.recognition.activity.tracked_people` derives
+from it what a tracker would see.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.recognition.episodes import Episode
+from operators.recognition.activity.episodes import Episode
 from operators.simulator.drive import Drive
-from operators.simulator.frames import BODY_TO_OPTICAL, mounted
 from operators.simulator.scene import Thing
-from operators.simulator.worlds import make_world
+from operators.simulator.sensors.frames import BODY_TO_OPTICAL, mounted
+from operators.simulator.worlds.make import make_world
 from operators.training.made_worlds import Chosen, file_of, write_lacking
 
 TRAINING, VALIDATION, HELD_OUT = 40_000, 45_000, 50_000

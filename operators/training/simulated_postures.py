@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.recognition.posture_data import BODY, POSTURES, Postures
-from operators.recognition.silhouette import HALF, MIDDLE, silhouette
-from operators.simulator.frames import BODY_TO_OPTICAL, mounted
-from operators.simulator.optics import Optics, View, camera_rays
-from operators.simulator.persons import Person
-from operators.simulator.renderer import Renderer
+from operators.recognition.posture.data import BODY, POSTURES, Postures
+from operators.recognition.posture.silhouette import HALF, MIDDLE, silhouette
+from operators.simulator.people.persons import Person
+from operators.simulator.rendering.optics import Optics, View, camera_rays
+from operators.simulator.rendering.renderer import Renderer
 from operators.simulator.scene import Thing, World
+from operators.simulator.sensors.frames import BODY_TO_OPTICAL, mounted
 from operators.simulator.settings import ColorCamera, DepthCamera
-from operators.simulator.worlds import make_world
+from operators.simulator.worlds.make import make_world
 from operators.training.made_worlds import Chosen, file_of, write_lacking
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from dataflow.messages import Detections2D, Image, SegmentationMap
 from operators.detection.custom.dataset import ORIGIN
 from operators.simulator.classes import CLASSES, THINGS
 from operators.simulator.robot import SimulatedRobot
-from operators.simulator.worlds import INDOOR
+from operators.simulator.worlds.make import INDOOR
 from operators.weights.network_file import SIMULATOR
 
 VGA, QVGA = (640, 480), (320, 240)

@@ -90,6 +90,7 @@ def test_a_broken_file_ends_with_2_and_the_others_are_verified_all_the_same(
     assert "broken.mcap" in (error.get("message") or "")
 
 
+@pytest.mark.long
 def test_a_change_is_named_with_its_field_in_the_table_the_json_and_the_junit_file(
     dataflow, folder: Path, tmp_path: Path
 ) -> None:
@@ -122,6 +123,7 @@ def test_a_change_is_named_with_its_field_in_the_table_the_json_and_the_junit_fi
     assert (field["field"], field["index"]) == ("vectors", [0, 2])
 
 
+@pytest.mark.long
 def test_results_are_shown_also_when_their_file_cannot_be_written(dataflow, folder: Path) -> None:
     told = gate(dataflow, folder, "--junit", "/proc/v.xml", code=2)
 
@@ -129,6 +131,7 @@ def test_results_are_shown_also_when_their_file_cannot_be_written(dataflow, fold
     assert "2 of 2 recordings passed" in told.stdout
 
 
+@pytest.mark.long
 def test_an_accepted_change_passes_until_something_else_changes(dataflow, folder: Path, tmp_path: Path) -> None:
     baseline = tmp_path / "accepted.json"
     changed = graph_of(tmp_path, "changed.yaml", NUDGED)
@@ -168,6 +171,7 @@ def without_message(path: Path, stream: str, number: int, target: Path) -> None:
                     writer.write(found.stream, found.message, seq=found.seq, incarnation=found.incarnation)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("one", [SMOOTH, NUDGED])
 def test_what_could_not_be_repeated_is_not_accepted_and_ends_with_1(
     dataflow, folder: Path, tmp_path: Path, one: str
@@ -265,6 +269,7 @@ def test_wrong_options_of_the_gate_are_refused(dataflow, folder: Path, words: li
     assert message in gate(dataflow, folder, *words, code=2).stderr
 
 
+@pytest.mark.long
 def test_a_thin_recording_is_completed_and_is_then_verified(dataflow, folder: Path, tmp_path: Path) -> None:
     same = folder / "same.yaml"
     thin_graph = tmp_path / "thin.yaml"

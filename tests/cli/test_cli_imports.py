@@ -76,6 +76,7 @@ def hijacking(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["list", "info", "diff", "check", "show", "run"])
 def test_a_file_where_one_stands_replaces_no_module(made: tuple[Path, Path], tmp_path: Path, command: str) -> None:
     graph, recording = made
@@ -99,6 +100,7 @@ def test_nor_where_the_command_is_called_as_a_module(made: tuple[Path, Path], tm
     assert "hijacked" not in told.stdout + told.stderr
 
 
+@pytest.mark.long
 def test_a_recording_is_replayed_with_modules_of_a_named_folder(made: tuple[Path, Path], tmp_path: Path) -> None:
     graph, recording = made
     lost = run(tmp_path, "verify", recording, "-q")
@@ -111,6 +113,7 @@ def test_a_recording_is_replayed_with_modules_of_a_named_folder(made: tuple[Path
     assert "no such folder" in run(tmp_path, "replay", recording, "--path", "nowhere").stderr
 
 
+@pytest.mark.long
 def test_looking_at_a_recording_imports_none_of_its_modules(made: tuple[Path, Path], tmp_path: Path) -> None:
     _, recording = made
     (tmp_path / "own_operators.py").write_text("raise RuntimeError('imported')\n")
@@ -139,6 +142,7 @@ print(*sys.modules, file=sys.stderr)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["CloudBuilder", "EkfFusion", "operators.evaluation:ConsistencyMetrics", ""])
 def test_describing_operators_loads_no_large_library(tmp_path: Path, name: str) -> None:
     package = Path(__file__).resolve().parents[2]
@@ -156,4 +160,4 @@ def test_describing_operators_loads_no_large_library(tmp_path: Path, name: str) 
     assert loaded & {"torch", "torchvision", "onnxruntime", "scipy.stats", "pandas", "open3d"} == set()
     if name == "CloudBuilder":
         assert "operators.cloud.cloud_builder" in loaded
-        assert loaded & {"operators.cloud.clusterer", "operators.slam.lidar_slam", "scipy.spatial"} == set()
+        assert loaded & {"operators.cloud.clusterer", "operators.slam.lidar.slam", "scipy.spatial"} == set()

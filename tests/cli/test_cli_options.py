@@ -115,6 +115,7 @@ def typed(line: str, places: dict[str, str], tmp_path: Path) -> list[str]:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("line", TRIED, ids=lambda line: " ".join(line.split()[:3]))
 def test_a_command_takes_its_options(dataflow, places: dict[str, str], tmp_path: Path, line: str) -> None:
     if ".rrd" in line:

@@ -317,6 +317,7 @@ def test_ctrl_c_while_the_graph_starts_is_a_stop_and_no_failure(tmp_path: Path) 
         assert recording.metadata["dataflow:outcome"]["outcome"] == "interrupted"
 
 
+@pytest.mark.long
 def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
     dataflow, small: Path, tmp_path: Path, monkeypatch
 ) -> None:

@@ -20,6 +20,7 @@ def compressions(path: Path) -> set[str]:
     return {chunk.compression for chunk in summary.chunk_indexes}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("word", "named"), [("zstd", "zstd"), ("lz4", "lz4"), ("none", "")])
 def test_a_run_is_recorded_with_the_compression_that_is_asked_for(
     dataflow, small: Path, recorded: Recorded, tmp_path: Path, word: str, named: str

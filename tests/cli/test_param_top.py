@@ -232,6 +232,7 @@ def test_top_tells_the_latency_of_every_path_of_the_last_seconds(dataflow) -> No
     assert "costs most" in dataflow("top", "--once", "--every", "0.3").stdout
 
 
+@pytest.mark.long
 def test_a_process_that_does_not_answer_is_shown_so_until_it_goes_on(dataflow, alone: Background) -> None:
     process = alone.process_of("tuned")
     process.send_signal(signal.SIGSTOP)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import pytest
 from mutants import drawn, mutants_of, passes
 
 SOURCE = '''
@@ -53,6 +54,7 @@ def test_leaves_a_process():
 """
 
 
+@pytest.mark.long
 def test_no_process_of_the_tests_is_left(tmp_path: Path) -> None:
     (tmp_path / "test_leaving.py").write_text(LEAVING)
 

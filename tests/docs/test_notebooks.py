@@ -62,6 +62,7 @@ def test_the_tour_has_twenty_cells_without_outputs() -> None:
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "words"),
     [
@@ -82,6 +83,7 @@ def test_cells_show_what_they_say(shown: list[str], cell: int, words: list[str])
         assert word in shown[cell]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run_in_a_kernel(notebook: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("nbclient", reason="nbclient (the [dev] extra) is not installed")

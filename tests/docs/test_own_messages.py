@@ -106,6 +106,7 @@ def test_a_recording_opens_where_the_module_is_not(recorded: Path, page: dict[st
     assert lines[1] == f"{first.stamp} {first.message.mean}"
 
 
+@pytest.mark.long
 def test_tools_look_at_it_where_the_module_is_not(recorded: Path, folder: Path) -> None:
     script = (
         "import sys; from dataflow.cli.main import main\n"
@@ -134,6 +135,7 @@ def test_a_changed_type_is_named_with_field_and_forms(recorded: Path, graph: Gra
             plan_replay(recording, changed, replaced=["camera", "photometer"])
 
 
+@pytest.mark.long
 def test_a_running_graph_is_echoed_where_the_module_is_not(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from tampering import tampered
 
 from dataflow.editing.part import Part, write_part
-from dataflow.editing.spans import records_of_span
+from dataflow.editing.spans import RunRecords
 from dataflow.interop.opening import is_foreign
 from dataflow.recording import Recording
 from dataflow.recording.streams.copying import Origin
@@ -41,6 +41,7 @@ def test_a_part_holds_the_span_byte_for_byte(recorded: Path, tmp_path: Path) -> 
     assert found == expected
 
 
+@pytest.mark.long
 def test_a_replay_of_a_part_makes_what_the_whole_one_makes_there(stateful: Path, tmp_path: Path) -> None:
     part = cut(stateful, tmp_path / "part.mcap", 0.5, 0.8)
 
@@ -76,6 +77,7 @@ def test_only_the_end_cut_off_verifies_wholly_up_to_there(recorded: Path, tmp_pa
     assert not report.identical  # of the run's end nothing is known
 
 
+@pytest.mark.long
 def test_a_cut_that_cuts_nothing_off_is_the_whole(recorded: Path, tmp_path: Path) -> None:
     copy = cut(recorded, tmp_path / "copy.mcap", None, None)
 
@@ -157,7 +159,7 @@ def test_every_message_that_a_kept_firing_takes_is_kept_or_accounted_for(
             taken.append(record("op", len(taken), "snapshot", stamp, detail={"state": b"x"}))
     end = start + length
 
-    part = records_of_span({"cam": made, "op": taken}, {"cam": ("s",)}, {"s"}, start, end, lambda _: (start, end))
+    part = RunRecords({"cam": made, "op": taken}, {"cam": ("s",)}).of_span({"s"}, start, end, lambda _: (start, end))
 
     stored = {e.seq for r in made for e in r.outputs if e and start <= e.stamp <= end}
     extra = {e.seq for r in made for e in r.outputs if e and e.stamp in part.needed.get("s", {}).get(0, ())}

@@ -13,8 +13,11 @@ from dataflow.editing.merge import merge
 from dataflow.editing.part import Part, write_part
 from dataflow.editing.split import split
 from dataflow.messages import Imu, Odometry
-from dataflow.recording import Recording, RecordingError, RecordingWriter
+from dataflow.recording import Recorded, Recording, RecordingError, RecordingWriter
 from dataflow.recording.streams.copying import Origin
+from dataflow.recording.streams.ordering import Row
+from dataflow.recording.streams.streams import IndexedStream
+from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.verification.verify import verify
 
@@ -38,6 +41,7 @@ def merged(paths: list[Path], out: Path, *prefixes: str) -> list[str]:
             origin.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", [{"every": SECOND // 4}, {"size": 20_000}], ids=["time", "size"])
 def test_the_merge_of_a_split_is_the_whole(recorded: Path, tmp_path: Path, how: dict[str, int]) -> None:
     with Origin(recorded) as origin:
@@ -49,6 +53,46 @@ def test_the_merge_of_a_split_is_the_whole(recorded: Path, tmp_path: Path, how: 
     assert messages(tmp_path / "whole.mcap") == messages(recorded)
     assert records(tmp_path / "whole.mcap") == records(recorded)
     assert verify(tmp_path / "whole.mcap").identical
+
+
+def test_firing_records_are_read_once_for_all_parts(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+    of = FiringLog.of
+
+    def noting(log: FiringLog, operator: str) -> tuple[FiringRecord, ...]:
+        read.append(operator)
+        return of(log, operator)
+
+    monkeypatch.setattr(FiringLog, "of", noting)
+    with Origin(recorded) as origin:
+        parts = list(split(origin, tmp_path / "parts", every=SECOND // 4))
+
+    assert len(parts) > 2
+    assert "merge" in read
+    assert len(read) == len(set(read))
+
+
+def test_messages_are_decoded_for_the_part_that_they_are_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frame tree is derived from them."""
+    with RecordingWriter(tmp_path / "a.mcap", metadata={}) as writer:
+        writer.add_stream("a", Odometry)
+        for k in range(40):
+            writer.write("a", example(Odometry).replace(stamp=1000 + 10 * k), seq=k)
+    decoded: list[Path] = []
+    of = Recording._recorded
+
+    def noting(recording: Recording, stream: IndexedStream, row: Row) -> Recorded:
+        decoded.append(recording.path)
+        return of(recording, stream, row)
+
+    monkeypatch.setattr(Recording, "_recorded", noting)
+    with Origin(tmp_path / "a.mcap") as origin:
+        parts = list(split(origin, tmp_path / "parts", every=50))
+
+    assert len(parts) == 8
+    assert len(decoded) == 40
 
 
 def test_every_message_is_in_the_part_of_its_time(recorded: Path, tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.graph import GraphError, Problem, document, load_bundle, load_graph, load_text
+from dataflow.graph import GraphError, Problem, load_bundle, load_graph, load_text
+from dataflow.graph.yaml import document
 
 HEAD = """\
 graph: g

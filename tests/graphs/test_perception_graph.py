@@ -29,6 +29,7 @@ def run(*words: object) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 @needs_weights
 def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path: Path) -> None:
     file, graph = tmp_path / "room.mcap", REPOSITORY / "graphs" / "perception.yaml"
@@ -86,6 +87,7 @@ def test_postures_reach_the_activities_wherever_there_is_depth() -> None:
     assert nodes["perception/people"].inputs["postures"] == ("robot1/perception/postures/postures",)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "folder", "cut", "left_out", "must"),
     [

@@ -42,6 +42,7 @@ def test_a_graph_passes_the_check(file: Path) -> None:
     assert load_graph(file).nodes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SIMULATED)
 def test_every_operator_of_a_graph_of_geometry_fires_on_the_simulators_first_moment(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -59,6 +60,7 @@ def test_the_simulated_robot_is_the_one_of_the_recording() -> None:
     assert load_graph(DEMO).nodes["robot"].params == recorded.params
 
 
+@pytest.mark.long
 @needs_weights
 def test_the_demo_scores_everything_against_the_truth_and_its_recording_verifies(tmp_path: Path) -> None:
     file = tmp_path / "demo.mcap"
@@ -74,6 +76,7 @@ def test_the_demo_scores_everything_against_the_truth_and_its_recording_verifies
     assert json.loads(dataflow("verify", file, "--one-process", "--json", "-q"))["identical"] is True
 
 
+@pytest.mark.long
 @needs_weights
 def test_the_demo_runs_from_the_simulator_in_any_world() -> None:
     words = ["--set", "world=corridor", "--set", "seed=7", "--set", "duration=500ms", "--one-process", "--json", "-q"]

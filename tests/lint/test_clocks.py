@@ -62,6 +62,7 @@ def test_what_would_be_no_clock_is_not_taken_for_a_drift() -> None:
     assert clock_difference(turning(np.arange(5.0, 35.0, 0.03), swaying, drift=0.05), reference) is None
 
 
+@pytest.mark.long
 def test_a_camera_that_sways_for_four_seconds_has_no_clock_to_be_judged(tmp_path: Path) -> None:
     graph = dataflow.Graph("short")
     graph.add("camera", SyntheticRgbd, frames=120, rate=30, width=160, height=120)
@@ -84,12 +85,14 @@ def clock_findings(found: Report) -> dict[tuple[str, str], dict[str, float]]:
     return {(f.check, f.stream): dict(f.values or {}) for f in found.findings if f.check.startswith("clock")}
 
 
+@pytest.mark.long
 def test_a_robot_with_good_clocks_is_sound() -> None:
     found = report()
     assert found.findings == []
     assert {"robot1/imu", "robot1/ground_truth", "robot1/wheel_ticks", "robot1/wheel_odometry"} <= set(found.clocks)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("delay", [60, 150])
 def test_a_late_gyroscope_is_named_by_its_offset_against_all_others(delay: int) -> None:
     found = clock_findings(report(inertial={"delay": f"{delay}ms"}))
@@ -97,6 +100,7 @@ def test_a_late_gyroscope_is_named_by_its_offset_against_all_others(delay: int) 
     assert found["clock offset", "robot1/imu"]["offset_ms"] == pytest.approx(delay, abs=3)
 
 
+@pytest.mark.long
 def test_a_gyroscope_whose_clock_drifts_is_named_with_sign_and_rate() -> None:
     found = clock_findings(report(inertial={"clock_drift": 0.004}))
     assert list(found) == [("clock drift", "robot1/imu")]
@@ -110,6 +114,7 @@ def test_the_sign_is_turned_where_the_contract_trusts_the_gyroscope() -> None:
     assert found["clock offset", "robot1/ground_truth"]["offset_ms"] == pytest.approx(-150, abs=3)
 
 
+@pytest.mark.long
 def test_an_outage_of_the_wheels_is_a_gap_and_the_clocks_are_still_told() -> None:
     found = report(wheels={"outages": [[10, 13]]})
     gaps = {f.stream: dict(f.values or {}) for f in found.findings if f.check == "gap"}

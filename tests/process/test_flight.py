@@ -103,6 +103,7 @@ def _records(recording: Recording) -> Iterator[Any]:
     return iter(sorted((r for name in log.operators for r in log.of(name)), key=lambda r: r.stamp))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("asked", [3.0, 12.0, 21.7, 29.5])
 def test_what_is_kept_verifies_from_its_beginning(recorded: Path, graph: Graph, tmp_path: Path, asked: float) -> None:
     sink, _ = flown(recorded, graph, tmp_path, asks=[asked])

@@ -107,6 +107,7 @@ def verdicts(path: Path) -> dict[str, str]:
 IDENTICAL = {"first": "identical", "second": "identical"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "splitting", [Splitting(every=2 * SECOND), Splitting(size=20_000), Splitting(size=20_000, every=SECOND)]
 )

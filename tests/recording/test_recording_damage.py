@@ -135,11 +135,13 @@ def unsealed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_no_flipped_bit_changes_what_is_read_silently(recording: Path, seed: int) -> None:
     assert silent_changes(recording, seed=seed) == []
 
 
+@pytest.mark.long
 def test_without_checksums_only_metadata_and_the_header_can_change_silently(unsealed: Path) -> None:
     """And sizes, which are taken from where messages lie."""
     changes = silent_changes(unsealed, seed=2)

@@ -203,6 +203,7 @@ def opened(path: Path, content: bytes) -> tuple[str, int]:
     return said, int(megabytes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
@@ -235,6 +236,7 @@ def test_a_file_made_to_do_harm_costs_little_and_is_named(
     assert megabytes < 850
 
 
+@pytest.mark.long
 def test_large_messages_of_next_to_nothing_take_the_memory_of_three_at_a_time(tmp_path: Path) -> None:
     said, megabytes = opened(tmp_path / "hostile.mcap", large_chunks_with_an_index())
 

@@ -118,6 +118,7 @@ def test_a_recording_holds_as_many_metadata_records_as_are_read(tmp_path: Path) 
         file.close()
 
 
+@pytest.mark.long
 def test_dark_images_beyond_any_ratio_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Volumes, cost maps and dark frames: what together expanded more than 50-fold beyond 768 MiB was refused."""
     monkeypatch.undo()

@@ -48,6 +48,8 @@ def content(path: Path) -> dict[str, Any]:
             "stamps": [list(recording.stamps(name, 1155, None)) for name in recording.streams],
             "counts": [recording.counts(name) for name in recording.streams],
             "firings": list(recording.firings()),
+            "behind": [list(recording.firings("pose", skip=skip)) for skip in (17, 1, 43, 60, 99)],
+            "behind a stamp": list(recording.firings(start=1203, skip=5)),
             "events": list(recording.events()),
             "indexed": [recording.index("r/pose/out", 1100, 1300).read(k).stamp for k in range(9)],
             "damage": recording.damage,
@@ -130,6 +132,23 @@ def test_only_the_chunks_of_a_span_are_looked_up(path: Path, monkeypatch: pytest
         monkeypatch.setattr(message_index, "take_messages", noting)
         assert len(list(recording.messages(["r/camera/image"], 1200, 1240))) == 5
     assert 5 <= len(set(taken)) < 40  # of 120; many reach over the span, as one stream lags by 400 ns
+
+
+def test_records_that_are_passed_over_are_not_looked_up_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The records of an operator that was restarted often lie in many runs, each of which is read by itself."""
+    long(monkeypatch)
+    taken: list[int] = []
+    real = message_index.take_messages
+
+    def noting(contents: Any, indexes: Any, number: int, **options: Any) -> None:
+        taken.append(number)
+        real(contents, indexes, number, **options)
+
+    with Recording(path) as recording:
+        every = list(recording.firings("pose"))
+        monkeypatch.setattr(message_index, "take_messages", noting)
+        assert list(recording.firings("pose", skip=50)) == every[50:]
+    assert 10 <= len(taken) <= 14  # of 60
 
 
 def test_damaged_message_indexes_are_noted_when_they_are_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

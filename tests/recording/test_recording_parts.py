@@ -14,8 +14,9 @@ from dataflow.interop.opening import is_foreign
 from dataflow.messages import Pose
 from dataflow.recording import Recording, RecordingError, RecordingWriter, describe
 from dataflow.recording.mcap.attachments import Attachment
+from dataflow.recording.mcap.contents import Entries
 from dataflow.recording.streams.copying import Origin
-from dataflow.recording.streams.part_folder import parts_in
+from dataflow.recording.streams.part_folder import _JoinedIndex, parts_in
 from dataflow.records.reading import FiringLog, whole
 from dataflow.verification.gate import recordings_in
 
@@ -84,6 +85,28 @@ def test_parts_are_verified_record_by_record(folder: Path) -> None:
                 assert list(other.emissions(maker, stream)) == list(one.emissions(maker, stream))
                 checked += 1
         assert checked > 2
+
+
+def test_reading_the_records_of_parts_takes_time_by_their_number_alone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each part is two or three runs of the records, which are read without those before them."""
+    looked_up: list[int] = []
+    moved = _JoinedIndex._moved
+
+    def noting(index: _JoinedIndex, number: int, entries: Entries, after: int | None) -> Entries:
+        looked_up.append(len(entries))
+        return moved(index, number, entries, after)
+
+    monkeypatch.setattr(_JoinedIndex, "_moved", noting)
+    with Recording(folder) as recording:
+        log = FiringLog.read(recording)
+        for operator, batches in recording.firing_batches().items():
+            maker = SimpleNamespace(name=operator, outputs={})
+            assert len(log.outline(maker).runs) > 3
+            looked_up.clear()
+            assert len(list(log.ordered(maker))) > 3
+            assert sum(looked_up) <= 3 * batches
 
 
 def test_a_folder_of_parts_is_one_recording_for_commands(folder: Path) -> None:

@@ -21,7 +21,8 @@ from dataflow.messages import CompressedImage, DepthImage, Image, Pose, Transfor
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording import ForeignDecoder, Recording, RecordingError, RecordingWriter, register_decoder
 from dataflow.recording.layout import DIGESTS
-from dataflow.recording.mcap import chunks
+from dataflow.recording.mcap import cache
+from dataflow.recording.mcap.chunks import Chunks
 from dataflow.recording.streams.codecs import SchemaText, build
 from dataflow.recording.streams.foxglove import file_descriptor_set
 
@@ -129,10 +130,65 @@ def test_chunks_that_do_not_stay_in_memory_are_read_again(
     """Streams written one after the other: the merge goes to and fro between distant chunks."""
     rows = [(n, Image(stamp=i, frame=n, data=noise(i, 20, 20))) for n in "abcd" for i in range(12)]
     path = record(rows, chunk_bytes=1000)
-    monkeypatch.setattr(chunks, "CACHE_BYTES", 2500)
+    monkeypatch.setattr(cache, "KEPT_BYTES", 2500)
+    monkeypatch.setattr(cache, "MOST_BYTES", 2500)
     with Recording(path) as recording:
         got = [(m.stamp, m.stream, m.message) for m in recording.messages()]
     assert got == sorted(((m.stamp, n, m) for n, m in rows), key=lambda row: row[:2])
+
+
+@pytest.fixture
+def unpacked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Chunks, int]]:
+    """The chunks that are decompressed, each time, with what is kept of others then held to be small."""
+    found: list[tuple[Chunks, int]] = []
+    unpack = Chunks._decompress
+
+    def counted(chunks: Chunks, number: int) -> bytes:
+        found.append((chunks, number))
+        return unpack(chunks, number)
+
+    monkeypatch.setattr(Chunks, "_decompress", counted)
+    monkeypatch.setattr(cache, "KEPT_BYTES", 2500)
+    monkeypatch.setattr(cache, "NOTED", 8)
+    return found
+
+
+def test_memory_for_chunks_does_not_grow_with_a_recording(
+    record: Callable[..., Path], noise: Callable[..., Any], unpacked: list[tuple[Chunks, int]]
+) -> None:
+    path = record([("a", Image(stamp=i, frame="a", data=noise(i, 20, 20))) for i in range(100)], chunk_bytes=500)
+    with Recording(path) as recording:
+        for _ in range(3):
+            assert len(list(recording.messages())) == 100
+        (kept,) = {chunks.cache for chunks, _ in unpacked}
+        assert 0 < kept.nbytes <= 2500
+
+
+def test_chunks_in_use_at_a_time_stay_in_memory(
+    record: Callable[..., Path], noise: Callable[..., Any], unpacked: list[tuple[Chunks, int]]
+) -> None:
+    """Streams written one after the other, together larger than what is kept of what is read once."""
+    rows = [(n, Image(stamp=i, frame=n, data=noise(i, 20, 20))) for n in "abcdef" for i in range(60)]
+    with Recording(record(rows, chunk_bytes=1000)) as recording:
+        assert len(list(recording.messages())) == len(rows)
+        chunks = len(set(unpacked))
+    assert chunks > 60
+    assert len(unpacked) < 1.2 * chunks
+
+
+def test_the_parts_of_a_recording_share_the_memory_for_chunks(
+    tmp_path: Path, noise: Callable[..., Any], unpacked: list[tuple[Chunks, int]]
+) -> None:
+    for part in range(10):
+        with RecordingWriter(tmp_path / f"run_{part:03}.mcap", metadata={}, chunk_bytes=1000) as writer:
+            writer.add_stream("a", Image)
+            for i in range(10 * part, 10 * part + 10):
+                writer.write("a", Image(stamp=i, frame="a", data=noise(i, 20, 20)), seq=i)
+    with Recording(tmp_path) as recording:
+        assert len(list(recording.messages())) == 100
+        assert len({chunks for chunks, _ in unpacked}) == 10
+        (kept,) = {chunks.cache for chunks, _ in unpacked}
+        assert 0 < kept.nbytes <= 2500
 
 
 def test_an_empty_recording_opens(tmp_path: Path) -> None:

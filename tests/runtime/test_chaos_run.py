@@ -36,6 +36,7 @@ PLAN = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("placement", ["one_process", "process_each"])
 def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
@@ -63,6 +64,7 @@ def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
     assert diagnosed
 
 
+@pytest.mark.long
 def test_a_process_that_is_started_again_after_its_sources_have_ended_ends_in_order(tmp_path: Path) -> None:
     """The recorder has their ends, and is told to expect them again: what came in 0.5 s keeps `slow` busy for 3 s, and
     its hang comes well within these."""

@@ -49,6 +49,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_the_completed_recording_of_a_live_run_is_equal_to_the_full_one_and_verified(
     live: Path, tmp_path: Path
 ) -> None:

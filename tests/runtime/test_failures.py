@@ -147,6 +147,7 @@ def test_a_run_whose_nursery_is_killed_says_so_and_leaves_no_process(tmp_path: P
         assert recording.streams["test/left/fast"].count > 0
 
 
+@pytest.mark.long
 def test_an_operator_that_hangs_ends_the_run_within_the_stall_timeout() -> None:
     failure = fails(broken("hang"), placement="process_each", stall_timeout=1.0)
 
@@ -193,6 +194,7 @@ def unexplained(path: Path) -> dict[str, int]:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("live", "how"),
     [

@@ -190,6 +190,7 @@ SMALL = {"window": (8, 64 << 20)}
 """So that little has to wait for an operator before it counts as hung."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("placement", ["process_each", "one_process"])
 def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
     placement: str, path: Path, monkeypatch: pytest.MonkeyPatch
@@ -207,6 +208,7 @@ def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
     assert caught.value.operator == "bad"
 
 
+@pytest.mark.long
 def test_a_hang_without_a_deadline_is_ended_by_its_restart_policy(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(heartbeats, "HUNG_AFTER", 1.0)
     ran = Ran(robot(HANGS.format(f"queue: newest, size: 1, {AGAIN}"), count=400), path, **SMALL)
@@ -226,6 +228,7 @@ def leaky(live: str) -> Graph:
     )
 
 
+@pytest.mark.long
 def test_a_process_that_leaks_past_its_limit_is_started_again(path: Path) -> None:
     ran = Ran(leaky(AGAIN), path, LEAK)
 
@@ -239,6 +242,7 @@ def test_without_a_policy_a_leak_ends_the_run_before_the_machine_does(path: Path
         Ran(leaky("restart: {max: 0}"), path, LEAK)
 
 
+@pytest.mark.long
 def test_a_slow_operator_drops_by_its_policy_and_holds_up_nobody(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, inputs: {x: left/fast}, live: {queue: newest, size: 1}}",
@@ -257,6 +261,7 @@ def test_a_slow_operator_drops_by_its_policy_and_holds_up_nobody(path: Path) -> 
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_source_that_stops_is_an_event_in_the_diagnostics(path: Path) -> None:
     graph = robot(SMOOTH, "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}", count=1000)
 
@@ -269,6 +274,7 @@ def test_a_source_that_stops_is_an_event_in_the_diagnostics(path: Path) -> None:
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_source_that_stops_holds_up_no_other(path: Path) -> None:
     graph = robot(
         "right: {use: runtime_operators:Counter, params: {count: 250}}",
@@ -303,6 +309,7 @@ def test_a_flood_is_dropped_where_it_is_too_much_and_counted(path: Path) -> None
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_what_a_source_drops_is_counted_with_its_reason_everywhere(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, params: {sleep: 0.05}, inputs: {x: left/fast}, live: {queue: block}}",
@@ -318,6 +325,7 @@ def test_what_a_source_drops_is_counted_with_its_reason_everywhere(path: Path) -
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -> None:
     graph = robot(
         f"slow: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, live: {{queue: newest, size: 1, {AGAIN}}}}}",
@@ -334,6 +342,7 @@ def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_source_slower_than_the_clock_is_said_at_once_and_at_the_end(path: Path) -> None:
     graph = graph_of(
         "left: {use: runtime_operators:Counter, params: {count: 40, sleep: 0.15}}",
@@ -361,6 +370,7 @@ def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(pat
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late(path: Path) -> None:
     graph = robot(
         "right: {use: runtime_operators:Counter, params: {count: 100}}",
@@ -388,6 +398,7 @@ def test_a_clock_that_jumps_ahead_goes_on_there(path: Path) -> None:
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_stamp_in_the_past_is_dropped_and_a_malformed_message_from_outside_reaches_nobody(path: Path) -> None:
     past = {"kind": "past", "operator": "left", "by": "200ms", "every": "200ms"}
 
@@ -413,6 +424,7 @@ def test_a_device_runs_by_the_clock_and_is_repeated(path: Path) -> None:
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_source_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
     graph = graph_of(
         f"camera: {{use: faulty_operators:Camera, live: {{{AGAIN}}}}}",

@@ -78,6 +78,7 @@ def check_what_is_left(path: Path) -> None:
     assert numbers == list(range(len(numbers)))
 
 
+@pytest.mark.long
 def test_a_recording_that_may_not_grow_ends_the_run_and_stays_readable(tmp_path: Path) -> None:
     graph_file(tmp_path, count=3000, source="faulty_operators:Noise")
     (tmp_path / "small").mkdir()
@@ -92,6 +93,7 @@ def test_a_recording_that_may_not_grow_ends_the_run_and_stays_readable(tmp_path:
     check_what_is_left(tmp_path / "small" / "run.mcap")
 
 
+@pytest.mark.long
 def test_a_run_goes_on_without_its_recording_and_says_what_is_lost(tmp_path: Path) -> None:
     graph_file(tmp_path, count=600, source="faulty_operators:Noise")
     (tmp_path / "small").mkdir()
@@ -118,6 +120,7 @@ def _may_mount() -> bool:
     return subprocess.run(tried, capture_output=True, timeout=10).returncode == 0
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not _may_mount(), reason="needs the right to mount a file system (unshare -m, as root)")
 def test_a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable(tmp_path: Path) -> None:
     graph_file(tmp_path, count=3000, source="faulty_operators:Noise")
@@ -132,6 +135,7 @@ def test_a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable(tmp_p
 # A viewer that dies
 
 
+@pytest.mark.long
 def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
     graph = load_graph(graph_file(tmp_path, count=250), live=True)
     running = Background(graph, live=True, record=tmp_path / "run.mcap", placement="process_each")
@@ -220,6 +224,7 @@ class Outside:
         self._session.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("live", [False, True])
 def test_a_plain_subscriber_gets_every_message_in_the_documented_envelope(tmp_path: Path, live: bool) -> None:
     graph = load_graph(graph_file(tmp_path, count=150), live=live)
@@ -240,6 +245,7 @@ def test_a_plain_subscriber_gets_every_message_in_the_documented_envelope(tmp_pa
             assert seen[-1].kind is Kind.END
 
 
+@pytest.mark.long
 def test_a_slow_subscriber_from_outside_costs_nobody_anything(tmp_path: Path) -> None:
     """Messages of 1 MB: it blocks what publishes to it at once."""
     path = tmp_path / "outside.yaml"

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from dataflow.chaos.plan import plan_of
 from dataflow.client.attach import NotRunning, find_running
 from dataflow.client.trigger import trigger
@@ -62,6 +64,7 @@ def test_what_somebody_asks_for_is_kept_and_verifies(tmp_path: Path) -> None:
     assert {v.verdict for v in report.operators} == {"identical"}
 
 
+@pytest.mark.long
 def test_who_steers_the_run_has_it_keep_what_was(tmp_path: Path) -> None:
     @contextmanager
     def controls(supervisor: Supervisor) -> Iterator[None]:
@@ -83,6 +86,7 @@ def test_who_steers_the_run_has_it_keep_what_was(tmp_path: Path) -> None:
         assert "the key k" in kept.metadata["dataflow:flight"]["triggers"]
 
 
+@pytest.mark.long
 def test_an_operator_that_fails_keeps_what_led_to_it(tmp_path: Path) -> None:
     plan = {"faults": [{"kind": "raise", "operator": "first", "at": "1200ms"}]}
 

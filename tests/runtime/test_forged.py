@@ -35,6 +35,7 @@ def forged(key: str) -> list[bytes]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("live", [False, True], ids=["run", "live"])
 def test_forged_ends_frontiers_and_messages_change_nothing(tmp_path: Path, live: bool) -> None:
     graph = chain(

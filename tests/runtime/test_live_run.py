@@ -40,6 +40,7 @@ def test_a_live_run_with_drops_and_timeouts_is_verified_in_another_placement(pla
     assert {v.operator for v in verified.operators} == {"mix", "slow", "smooth", "merge", "sum"}
 
 
+@pytest.mark.long
 def test_live_runs_do_differ_from_each_other_so_verification_says_something(tmp_path: Path) -> None:
     graph = load_graph(HERE / "live.yaml", settings=["count=60"], live=True)
 

@@ -44,6 +44,7 @@ def messages(path: Path) -> dict[str, dict[int, bytes]]:
         }
 
 
+@pytest.mark.long
 def test_a_replay_from_the_middle_makes_what_the_whole_one_makes_there(recorded: Path, tmp_path: Path) -> None:
     again = tmp_path / "again.mcap"
 
@@ -79,6 +80,7 @@ def test_a_state_that_restores_to_something_else_is_found(recorded: Path, tmp_pa
     assert report.culprits == ("tuned",)
 
 
+@pytest.mark.long
 def test_a_middle_after_a_restart_has_the_parameters_with_which_it_was_started_again(tmp_path: Path) -> None:
     text = (HERE / "chaos.yaml").read_text().replace("runtime_operators:Tuned", "runtime_operators:TunedAtStart")
     file, path = tmp_path / "chaos.yaml", tmp_path / "run.mcap"
@@ -120,6 +122,7 @@ def test_a_start_beyond_the_end_is_refused(recorded: Path) -> None:
         verify(recorded, start=1e9)
 
 
+@pytest.mark.long
 def test_a_replay_that_begins_where_a_state_was_recorded_gives_nothing_twice(recorded: Path, tmp_path: Path) -> None:
     with Recording(recorded) as recording:
         first = min(s.first for s in recording.streams.values() if s.first and not s.static)

@@ -75,6 +75,7 @@ def test_replay_gives_the_digests_of_the_run_in_every_placement(recording: tuple
         assert replay(path, placement=placement).digests() == expected, placement
 
 
+@pytest.mark.long
 def test_replay_gives_the_same_digests_on_loaded_cores_with_operators_that_sleep_at_random(
     recording: tuple[Path, dict[str, str]],
 ) -> None:
@@ -85,6 +86,7 @@ def test_replay_gives_the_same_digests_on_loaded_cores_with_operators_that_sleep
         assert replay(path, graph=graph, placement="process_each").digests() == expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("window", [(1, 1), (3, 1 << 20)])
 def test_flow_control_cannot_change_what_fires(recording: tuple[Path, dict[str, str]], window: tuple[int, int]) -> None:
     path, expected = recording
@@ -92,6 +94,7 @@ def test_flow_control_cannot_change_what_fires(recording: tuple[Path, dict[str, 
     assert replay(path, window=window).digests() == expected
 
 
+@pytest.mark.long
 def test_a_replay_can_be_recorded_and_holds_the_same_streams(
     recording: tuple[Path, dict[str, str]], tmp_path: Path
 ) -> None:
@@ -103,6 +106,7 @@ def test_a_replay_can_be_recorded_and_holds_the_same_streams(
         assert dict(first.digests()) == dict(second.digests()) == expected
 
 
+@pytest.mark.long
 def test_a_replay_in_two_halves_covers_every_source_message_once(recording: tuple[Path, dict[str, str]]) -> None:
     path, _ = recording
 
@@ -112,6 +116,7 @@ def test_a_replay_in_two_halves_covers_every_source_message_once(recording: tupl
     assert first.streams["test/left/constant"][0] == second.streams["test/left/constant"][0] == 1
 
 
+@pytest.mark.long
 def test_the_window_grows_when_the_graph_must_look_further_ahead() -> None:
     graph = chain(
         "far: {use: runtime_operators:LookAhead, inputs: {a: left/fast, b: left/slow}}",
@@ -125,6 +130,7 @@ def test_the_window_grows_when_the_graph_must_look_further_ahead() -> None:
     assert any("doubled" in note for note in report.notes)
 
 
+@pytest.mark.long
 def test_large_messages_arrive_whole(mixed: Graph) -> None:
     graph = load_graph(HERE / "mixed.yaml", settings=["count=20", "padding=300000"])
 

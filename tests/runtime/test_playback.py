@@ -52,6 +52,7 @@ def until(holds: Any, seconds: float = 30.0) -> None:
     raise AssertionError("it does not come true")
 
 
+@pytest.mark.long
 def test_pauses_and_steps_change_no_digest_and_outlast_the_timeout(recorded: Path) -> None:
     expected = replay(recorded, placement="one_process").streams
     seen: list[int] = []
@@ -92,6 +93,7 @@ def test_a_script_pauses_and_steps_from_outside(recorded: Path) -> None:
     assert report.streams == replay(recorded, placement="one_process").streams
 
 
+@pytest.mark.long
 def test_a_playback_bar_moves_a_replay_through_a_graph(recorded: Path) -> None:
     told: list[Any] = []
 
@@ -117,6 +119,7 @@ def test_a_playback_bar_moves_a_replay_through_a_graph(recorded: Path) -> None:
     assert report.streams == replay(recorded, placement="one_process").streams
 
 
+@pytest.mark.long
 def test_a_plain_run_whose_sources_are_in_two_processes_is_paused_stepped_and_paced(recorded: Path) -> None:
     graph = load_graph(HERE / "chaos.yaml", settings=["count=40"])
     answers: list[dict[str, Any]] = []

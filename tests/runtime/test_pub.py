@@ -104,6 +104,7 @@ def test_a_run_that_is_not_live_has_no_clock_for_them() -> None:
         run(load_text(GRAPH))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_registry_of_its_own")
 def test_a_graph_without_such_a_source_takes_nothing() -> None:
     text = "\n".join(line for line in GRAPH.splitlines() if "remote" not in line)

@@ -62,6 +62,7 @@ def obeyed(configs: list[Mapping[str, Any]], *endpoints: str) -> set[str]:
     return used & {*endpoints, "scouting"}
 
 
+@pytest.mark.long
 def test_a_replay_leaves_the_recorded_network_alone(
     recorded: tuple[Path, str, str], spawned: list[Mapping[str, Any]]
 ) -> None:

@@ -57,6 +57,7 @@ def kill_recorder(supervisor: Supervisor) -> None:
     os.kill(supervisor.pid_of("@recorder"), signal.SIGKILL)
 
 
+@pytest.mark.long
 def test_a_recorder_that_is_killed_is_followed_by_another_and_the_run_goes_on(tmp_path: Path) -> None:
     report = ran(robot(250), kill_recorder, record=tmp_path / "run.mcap")
 
@@ -94,6 +95,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
+@pytest.mark.long
 def test_a_full_disk_stops_the_recording_until_it_has_room_and_never_the_run(small_disk: Path) -> None:
     ballast = small_disk / "ballast"
     ballast.write_bytes(bytes(2_600_000))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections import Counter, defaultdict, deque
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Number, Odometry
 from dataflow.operator import KEPT, In, Operator, Out, Param, Remembered
 from dataflow.state import StateError, plain, typed
+
+V = TypeVar("V")
 
 
 class Mode(enum.Enum):
@@ -59,6 +61,7 @@ class State:
     places: deque[Place] = field(default_factory=lambda: deque(maxlen=2))
     seen: set[str] = field(default_factory=set)
     pairs: dict[tuple[int, str], float] = field(default_factory=dict)
+    ordered: dict[str, None] = field(default_factory=dict)
     by_id: defaultdict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
     last: Odometry | None = None
     kind: Literal["a", "b"] = "a"
@@ -85,6 +88,50 @@ class Averager(Operator):
         return Number(stamp=value.stamp, value=self.state.window.total / len(self.state.window.values))
 
 
+class Ring(Remembered):
+    """Values in an array with room to grow, and a window of each name, of the length that its owner sets."""
+
+    values: npt.NDArray[np.float64]
+    others: dict[str, Window]
+    last: Window | None
+
+    def __init__(self, length: int) -> None:
+        self._length, self._used = length, 0
+        self.values, self.others, self.last = np.zeros(8), {}, None
+
+    def prepare_snapshot(self) -> None:
+        self.values = self.values[: self._used]
+
+    def new_part(self, kind: type[Any]) -> Any:
+        assert kind is Window
+        return Window(self._length)
+
+    def restored(self) -> None:
+        self._used = len(self.values)
+
+
+@dataclass
+class Rings:
+    rings: tuple[Ring, Ring]
+    by_name: dict[str, Ring]
+
+
+class Ringing(Operator):
+    value: In[Number]
+    state: Rings
+
+    def initial_state(self) -> Rings:
+        return Rings((Ring(2), Ring(5)), {"a": Ring(6)})
+
+    def new_part(self, kind: type[Any]) -> Any:
+        assert kind is Ring
+        return Ring(7)
+
+    def process(self, value: Number) -> None:
+        for ring in (*self.state.rings, self.state.by_name.setdefault("b", Ring(7))):
+            ring.others["x"] = ring.last = Window(ring._length)
+
+
 def number(stamp: int) -> Number:
     return Number(stamp=stamp, value=float(stamp))
 
@@ -94,7 +141,7 @@ def filled() -> State:
     state = State(last=odometry, raw=b"\0\1", phase=1 + 2j, single=np.float32(0.1), spare=(1.0, 2.5), kind="b")
     state.tracks = {9: Track(9, np.arange(3.0), "cup", Mode.FOLLOW), 2: Track(2, np.zeros((0, 3)))}
     state.places.extend(Place(k, np.full(3, k, float)) for k in range(3))
-    state.seen, state.pairs = {"b", "a"}, {(1, "near"): 0.5}
+    state.seen, state.pairs, state.ordered = {"b", "a"}, {(1, "near"): 0.5}, {"b": None, "a": None}
     state.by_id[4].append(1.5)
     state.windows["left"] = Window()
     state.windows["left"].add(2.0)
@@ -142,6 +189,29 @@ def test_an_operator_restored_anywhere_goes_on_alike(stamps: list[int], length: 
     assert later.state.window.length == length
 
 
+def test_parts_with_settings_are_restored_where_they_are_and_made_by_their_owner_where_not() -> None:
+    one, other = Ringing(), Ringing()
+    one.process(number(1))
+    first, second = other.state.rings
+
+    other.restore(unpack_state(pack_state(one.snapshot() or {})))
+
+    assert other.state.rings == (first, second)
+    lengths = [ring.others["x"].length for ring in (first, second, other.state.by_name["b"])]
+    assert lengths == [2, 5, 7]
+    assert second.last is not None
+    assert (second.last.length, other.state.by_name["a"].last) == (5, None)
+
+
+def test_room_for_growth_is_not_part_of_a_snapshot() -> None:
+    ring, back = Ring(2), Ring(2)
+    ring.values[:2], ring._used = (1.0, 2.0), 2
+
+    back.restore(unpack_state(pack_state(ring.snapshot())))
+
+    assert (back.values.tolist(), back._used) == ([1.0, 2.0], 2)
+
+
 def test_a_reset_begins_anew_but_for_what_is_kept() -> None:
     operator = Averager()
     operator.process(number(3))
@@ -167,7 +237,8 @@ def test_states_of_two_operators_share_nothing() -> None:
         ({"spare": [1.0, "x"]}, r"State.spare\[1\]: expected a float, got a str"),
         ({"tracks": [[1, {"id": 1}]]}, r"State.tracks\[1\] \(Track\) lacks label, mean, mode"),
         ({"last": {"schema": "Nothing"}}, "unknown message schema"),
-        ({"windows": [["left", {}]]}, "Window lacks values"),
+        ({"windows": [["left", {}]]}, "snapshot of another version: Window lacks values"),
+        ({"windows": {"left": {}}}, "snapshot of another version: State.windows: expected a list"),
     ],
 )
 def test_a_snapshot_that_does_not_fit_is_refused_with_the_field(change: dict[str, Any], words: str) -> None:
@@ -242,3 +313,29 @@ def test_an_operator_without_a_state_gives_no_snapshot() -> None:
     assert Plain().snapshot() is None
     with pytest.raises(NotImplementedError, match="Plain gives snapshots but cannot restore"):
         Plain().restore({})
+
+
+@dataclass
+class Kept(Generic[V]):
+    place: str
+    view: V | None = None
+
+
+@dataclass
+class Shelf(Generic[V]):
+    by_id: dict[int, Kept[V]] = field(default_factory=dict)
+
+
+def test_a_generic_dataclass_comes_back_with_the_types_that_it_is_used_with() -> None:
+    shelf = Shelf({1: Kept("there", Track(1, np.zeros(3))), 2: Kept("here")})
+
+    back = typed(Shelf[Track], unpack_state(pack_state(plain(shelf))))
+
+    assert isinstance(back.by_id[1].view, Track)
+    assert back.by_id[2] == Kept("here")
+
+
+def test_one_of_several_dataclasses_is_found_by_its_fields() -> None:
+    back = typed(Place | Kept[int] | Track, unpack_state(pack_state(plain(Track(1, np.zeros(3))))))
+
+    assert isinstance(back, Track)

@@ -52,6 +52,7 @@ def test_looking_for_a_graph_that_does_not_run_says_what_does() -> None:
         find_running("nothing")
 
 
+@pytest.mark.long
 def test_a_stopped_viewer_costs_nothing_and_loses_nothing(tmp_path: Path) -> None:
     graph = slow_graph(count=400, sleep=0.01)
     undisturbed = run(graph)

@@ -33,6 +33,7 @@ def run_tests(folder: Path, runtime: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 def test_a_project_passes_its_own_tests(tmp_path: Path) -> None:
     told = call("new", "project", "my-robot", "--to", tmp_path).stdout
     project = tmp_path / "my-robot"

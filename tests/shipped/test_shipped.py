@@ -86,6 +86,7 @@ def test_the_demo_names_what_is_missing(tmp_path: Path, monkeypatch) -> None:
     assert "install robot-dataflow again" in call("graphs", code=2).stderr
 
 
+@pytest.mark.long
 def test_the_demo_runs_to_its_end_without_a_display(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

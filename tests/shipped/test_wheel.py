@@ -45,6 +45,7 @@ def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build("build_wheel", next(folder.iterdir()), tmp_path_factory.mktemp("wheel"))
 
 
+@pytest.mark.long
 def test_the_sdist_holds_what_the_repository_holds(sdist: Path, repository: Path) -> None:
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
@@ -72,6 +73,7 @@ def test_the_wheel_carries_the_packages_the_graphs_the_demo_and_the_licence(whee
     assert not any("__pycache__" in name for name in names)
 
 
+@pytest.mark.long
 def test_the_wheel_works_from_an_empty_folder(wheel: Path, tmp_path: Path) -> None:
     site, empty = tmp_path / "site", tmp_path / "empty"
     empty.mkdir()

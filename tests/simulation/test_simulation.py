@@ -253,6 +253,7 @@ FOUND_BY = {
 """Scenarios that find a planted fault; how many seeds each needs: benchmarks/simulation.md."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(FOUND_BY))
 def test_a_planted_fault_is_found_and_its_plan_shrunk(name: str, memory: Path) -> None:
     scenario = FOUND_BY[name]

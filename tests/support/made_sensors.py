@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dataflow.messages import Imu, Message, NavSatFix, Odometry, Pose, RadarScan, Transforms
 from dataflow.testing import Played, play
 from operators.fusion import EkfFusion
-from operators.simulator.gnss import geodetic
+from operators.simulator.sensors.gnss import geodetic
 
 RATE = 50
 ORIGIN = (48.1, 11.5, 500.0)

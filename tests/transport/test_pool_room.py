@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from transport_envelopes import Holder, carrying
 
 from dataflow.messages import DepthImage, Message, PointCloud
-from dataflow.messages.memory import LARGE, copied, make_large_arrays_in
+from dataflow.messages.fields.memory import LARGE, copied, make_large_arrays_in
 from dataflow.transport.codec import decode, encode_parts, parts_size
 from dataflow.transport.pool import Block, SharedPool
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dataflow.graph import load_graph
+from dataflow.recording import RecordingError
 from dataflow.records.firing import CALLS, Emission, FiringRecord, encode_batch
 from dataflow.records.reading import FiringLog, whole
 from dataflow.sync import MessageRef
@@ -33,6 +35,7 @@ def test_places_are_a_set(
 
     expected = {place for place in set(some) - set(others) if since is None or place >= since}
     assert one.beyond(other, since) == len(expected)
+    assert [place in one for place in others] == [place in set(some) for place in others]
     assert {life: count for life, count in one.counts().items() if count} == {
         life: len({seq for at, seq in some if at == life}) for life, _ in some
     }
@@ -89,3 +92,13 @@ def test_a_parameter_that_lies_before_the_finish_which_it_followed_does_not_hide
     laid = [FiringRecord("smooth", 0, index, kind, 0) for index, kind in kinds.items()]  # type: ignore[arg-type]
     books = Books(FiringLog({"smooth": [encode_batch([r]) for r in laid]}, "run.mcap"), load_graph(MIXED))
     assert books.of("smooth").finished
+
+
+def test_an_error_does_not_grow_each_time_that_it_is_raised() -> None:
+    books = Books(FiringLog({"smooth": [b"no batch"]}, "run.mcap"), load_graph(MIXED))
+    depths = []
+    for _ in range(3):
+        with pytest.raises(RecordingError, match="damaged") as found:
+            books.of("smooth")
+        depths.append(len(found.traceback))
+    assert len(set(depths)) == 1

@@ -105,6 +105,7 @@ def test_it_cannot_be_verified_alone(folder: Path) -> None:
         verify(path, only=["away"])
 
 
+@pytest.mark.long
 def test_what_takes_messages_of_it_that_were_not_recorded_cannot_be_verified(folder: Path) -> None:
     path = recorded(folder, "src/**")
     delete(folder / "goes_away.py")
@@ -126,6 +127,7 @@ def test_a_module_that_is_here_and_fails_to_import_is_an_error(folder: Path) -> 
         verify(path)
 
 
+@pytest.mark.long
 def test_an_operator_that_lacks_a_parameter_of_then_is_named_and_the_rest_verified(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

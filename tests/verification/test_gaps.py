@@ -29,6 +29,7 @@ def gapped(kept: Path, tmp_path: Path) -> tuple[Path, str]:
     return tampered(kept, tmp_path / "gapped.mcap", messages=without), stream
 
 
+@pytest.mark.long
 def test_a_recording_with_gaps_is_replayed_in_processes_as_in_one(gapped: tuple[Path, str]) -> None:
     path, stream = gapped
 

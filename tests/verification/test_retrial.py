@@ -51,6 +51,7 @@ def test_an_operator_is_no_culprit_for_what_another_one_sets_in_a_library(tmp_pa
     assert report.shared == {"divide": ("strict",)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("placement", ["process_each", "one_process"])
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_the_writer_is_the_culprit_and_not_its_readers(tmp_path: Path, jobs: int, placement: Placement) -> None:
@@ -61,6 +62,7 @@ def test_the_writer_is_the_culprit_and_not_its_readers(tmp_path: Path, jobs: int
     assert wrote == "its input 'x' (FeatureVector at stamp 1000000000)"
 
 
+@pytest.mark.long
 def test_one_that_writes_only_later_is_named_where_a_reader_differs(tmp_path: Path) -> None:
     report = verify(recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}\ndouble: Double"), jobs=1)
 
@@ -68,6 +70,7 @@ def test_one_that_writes_only_later_is_named_where_a_reader_differs(tmp_path: Pa
     assert report.shared == {"double": ("solve",)}
 
 
+@pytest.mark.long
 def test_paranoid_names_it_where_nothing_reads_beside_it(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}")
 
@@ -75,6 +78,7 @@ def test_paranoid_names_it_where_nothing_reads_beside_it(tmp_path: Path) -> None
     assert verdicts(verify(path, paranoid=True)) == {"solve": "culprit"}
 
 
+@pytest.mark.long
 def test_a_reader_of_a_message_that_its_maker_changed_in_their_process_is_no_culprit(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "keep: Keep\nlate: Late from keep/out", "one_process")
 
@@ -84,6 +88,7 @@ def test_a_reader_of_a_message_that_its_maker_changed_in_their_process_is_no_cul
     assert report.shared == {"late": ("keep",)}
 
 
+@pytest.mark.long
 def test_operators_that_shared_a_module_in_the_run_and_differ_apart_are_named_with_those_beside(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count", "one_process")
 

@@ -113,6 +113,7 @@ def test_a_divided_operator_gets_the_verdict_and_the_digests_of_one_that_is_not(
     assert parts.work["look"].firings == whole.work["look"].firings
 
 
+@pytest.mark.long
 def test_one_that_differs_is_named_with_its_first_difference_as_if_it_were_not_divided(
     kept: Path, divided: list[dict[str, Any]]
 ) -> None:

@@ -125,6 +125,7 @@ def without(operator: str, first: int, last: int) -> Callable[[FiringRecord], bo
     return lambda record: record.operator != operator or not first <= record.index <= last
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("operator", ["robot", "beacon", "look", "smooth", "tally"])
 @pytest.mark.parametrize(
     ("first", "last"),

@@ -69,6 +69,7 @@ def test_a_worker_that_dies_names_the_operator_and_its_call(code: int, phase: st
     assert not raised.value.interrupted
 
 
+@pytest.mark.long
 def test_a_worker_without_progress_is_ended_and_its_last_words_are_shown() -> None:
     with pytest.raises(RunFailed, match=r"operator 'smooth' made no progress for 4 s in a firing") as raised:
         call_workers([call("stall")], threads=1, stall_timeout=4.0)

@@ -229,6 +229,7 @@ def test_a_damaged_packet_never_ends_in_more_than_a_lost_picture(format_: str) -
     decoder.close()
 
 
+@pytest.mark.long
 @FORMATS
 @pytest.mark.parametrize("number", [8, 9])
 def test_a_flipped_bit_of_a_header_is_a_lost_picture_whatever_it_announces(format_: str, number: int) -> None:

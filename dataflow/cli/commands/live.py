@@ -215,7 +215,7 @@ def _print_message(stream: str, message: Message, asked: list[str] | None, *, fu
         line = {"stream": stream, "type": message.SCHEMA, **values}
         print_json_line(line)
         return
-    from dataflow.messages.display import field_text
+    from dataflow.messages.display.text import field_text
     from dataflow.sync.stamps import format_stamp
 
     out.print(Text.assemble((stream, "bold"), f"  {format_stamp(message.stamp)}  ", (message.SCHEMA, "dim")))

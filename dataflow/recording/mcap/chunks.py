@@ -1,4 +1,4 @@
-"""The chunks of an MCAP file, decompressed within bounds; the newest ones stay in memory."""
+"""The chunks of an MCAP file, decompressed within bounds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import io
 import struct
 import zlib
 from array import array
-from collections import OrderedDict
 from collections.abc import MutableSequence
 from dataclasses import dataclass
 
@@ -17,11 +16,11 @@ import zstandard
 
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.limits import MAX_CHUNK_BYTES, MAX_RATIO, UNINDEXED_BYTES
+from dataflow.recording.mcap.cache import ChunkCache
 from dataflow.recording.mcap.rawfile import RECORD, RawFile
 
 Column = npt.NDArray[np.int64]
 Sizes = npt.NDArray[np.uint32]
-CACHE_BYTES = 256 * 2**20
 LZ4_AT_ONCE = 2**26
 """Bytes that are asked of the LZ4 library at once: it takes twice as many."""
 
@@ -56,8 +55,7 @@ class Chunks:
         self._sizes: MutableSequence[int] | Sizes = array("q")
         self._torn = -1
         self._file = file
-        self._cache: OrderedDict[int, bytes] = OrderedDict()
-        self._cached_bytes = 0
+        self.cache = ChunkCache()
         self._packed_bytes = self._unpacked_bytes = 0
         self._decompressor = zstandard.ZstdDecompressor()
 
@@ -97,20 +95,14 @@ class Chunks:
         """Uncompressed bytes, by chunk."""
         return np.array(self._sizes, np.int64)
 
-    def clear(self) -> None:
-        self._cache.clear()
-        self._cached_bytes = 0
-
     def data(self, number: int) -> bytes:
         """The records of a chunk, decompressed and checked."""
-        cached = self._cache.get(number)
-        if cached is not None:
-            self._cache.move_to_end(number)
-            return cached
-        self._make_room(self.ref(number).uncompressed_size)
-        data = self._decompress(number)
-        self._cache[number] = data
-        self._cached_bytes += len(data)
+        key = (self, number)
+        data = self.cache.get(key)
+        if data is None:
+            self.cache.make_room(key, self.ref(number).uncompressed_size)
+            data = self._decompress(number)
+            self.cache.add(key, data)
         return data
 
     def check_ratio(self, number: int) -> None:
@@ -126,12 +118,6 @@ class Chunks:
 
     def where(self, number: int) -> str:
         return f"chunk {number} at byte {self.ref(number).offset}"
-
-    def _make_room(self, size: int) -> None:
-        """Lets the oldest chunks go before the next one is there."""
-        while self._cache and self._cached_bytes + size > CACHE_BYTES:
-            _, old = self._cache.popitem(last=False)
-            self._cached_bytes -= len(old)
 
     def _decompress(self, number: int) -> bytes:
         ref = self.ref(number)

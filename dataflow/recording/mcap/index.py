@@ -20,6 +20,7 @@ from mcap.records import Header
 from dataflow.recording.errors import DamagedError, RecordingError
 from dataflow.recording.limits import MAX_CHUNK_BYTES
 from dataflow.recording.mcap.attachments import Attachment, Place, read_attachment
+from dataflow.recording.mcap.cache import ChunkCache
 from dataflow.recording.mcap.contents import UNCHUNKED, Contents, signed
 from dataflow.recording.mcap.ending import MAGIC
 from dataflow.recording.mcap.message_index import LoadedIndex, MessageIndex
@@ -54,8 +55,11 @@ class McapFile:
     and was got round, or left out. Raises `RecordingError` for a file that is no MCAP or is damaged otherwise.
     """
 
-    def __init__(self, path: Path, *, lenient: bool = False, watch: Watch | None = None) -> None:
-        """`lenient`: what cannot be read of a file without a sound index is left out, with a note."""
+    def __init__(
+        self, path: Path, *, lenient: bool = False, watch: Watch | None = None, cache: ChunkCache | None = None
+    ) -> None:
+        """`lenient`: what cannot be read of a file without a sound index is left out, with a note. `cache`: keeps the
+        chunks of several files, which are closed together."""
         self._lenient = lenient
         self.header = Header("", "")
         self.torn = False
@@ -76,13 +80,14 @@ class McapFile:
         self.metadata = contents.metadata
         self._attachments = contents.attachments
         self._chunks = contents.chunks
+        self._chunks.cache = cache or self._chunks.cache
         self._loose_bytes = contents.loose_bytes
         notice(path, [*([NO_END] if self.torn else ()), *self.damage])
 
     def close(self) -> None:
         """Closes the file. Idempotent."""
         self._file.close()
-        self._chunks.clear()
+        self._chunks.cache.clear()
 
     @property
     def nbytes(self) -> int:

@@ -45,10 +45,11 @@ class MessageIndex(Protocol):
         ≤ log time ≤ end."""
 
     def in_file_order(
-        self, channels: Collection[int], start: int | None = None, end: int | None = None
-    ) -> Iterator[Mapping[int, Entries]]:
-        """The messages of some channels in parts that follow each other in the file: at least those with start ≤ log
-        time ≤ end."""
+        self, channels: Collection[int], start: int | None = None, end: int | None = None, skip: int = 0
+    ) -> Iterator[tuple[int, Mapping[int, Entries]]]:
+        """The messages of some channels in parts that follow each other in the file, each with the number of those in
+        front of it: at least those with start ≤ log time ≤ end. Without a span, parts that lie wholly among the first
+        `skip` messages may be left out."""
 
     def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
         """Messages by channel from which sizes are told, and the chunks that hold them (None: all)."""
@@ -74,9 +75,9 @@ class LoadedIndex:
         yield self.entries(channel)
 
     def in_file_order(
-        self, channels: Collection[int], start: int | None = None, end: int | None = None
-    ) -> Iterator[Mapping[int, Entries]]:
-        yield {channel: self.entries(channel) for channel in channels}
+        self, channels: Collection[int], start: int | None = None, end: int | None = None, skip: int = 0
+    ) -> Iterator[tuple[int, Mapping[int, Entries]]]:
+        yield 0, {channel: self.entries(channel) for channel in channels}
 
     def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
         return self._entries, None
@@ -101,6 +102,8 @@ class LongIndex:
         self._file, self._chunks, self._indexes = file, chunks, indexes
         self._sealed, self._counts, self._damage = sealed, counts, damage
         self._spans: dict[int, tuple[int, int] | None] = {}
+        self._steps_known: dict[tuple[int, ...], int] = {}
+        """Messages of channels in those chunks that are looked up together, by the channels and the first chunk."""
 
     def count(self, channel: int) -> int:
         return self._counts.get(channel, 0) if self._counts is not None else len(self.entries(channel))
@@ -171,11 +174,20 @@ class LongIndex:
         return self._indexes.ordered
 
     def in_file_order(
-        self, channels: Collection[int], start: int | None = None, end: int | None = None
-    ) -> Iterator[Mapping[int, Entries]]:
+        self, channels: Collection[int], start: int | None = None, end: int | None = None, skip: int = 0
+    ) -> Iterator[tuple[int, Mapping[int, Entries]]]:
+        before, whole = 0, start is None and end is None
         for found in self._indexes.holding(list(channels), start, end):
             for numbers in self._steps(found):
-                yield self._load(numbers, channels)
+                key = (*sorted(channels), int(numbers[0]))
+                count = self._steps_known.get(key) if whole else None
+                if count is None or before + count > skip:
+                    loaded = self._load(numbers, channels)
+                    count = sum(map(len, loaded.values()))
+                    yield before, loaded
+                if whole:
+                    self._steps_known[key] = count
+                before += count
 
     def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
         lengths = self._indexes.index_lengths

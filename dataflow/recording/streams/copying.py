@@ -242,7 +242,9 @@ def framing(path: Path, kept: Mapping[str, Mapping[int, npt.NDArray[np.int64]]])
             for name, info in recording.streams.items()
             if name in kept and info.count and info.message_type in (Odometry, Transforms)
         ]
-        for found in recording.messages(names):
+        bounds = [(s[0], s[-1]) for n in names for s in kept[n].values() if len(s)]
+        start, end = min((first for first, _ in bounds), default=None), max((last for _, last in bounds), default=None)
+        for found in recording.messages(names, start, end):
             stamps = kept[found.stream].get(found.incarnation)
             if stamps is not None and len(stamps):
                 at = int(np.searchsorted(stamps, found.stamp))

@@ -91,8 +91,9 @@ def merged(cursors: Sequence[Iterator[Row]]) -> Iterator[tuple[int, Row]]:
             heapq.heapreplace(heap, (following[0], i))
 
 
-def in_file_order(entries: Sequence[tuple[int, Entries]]) -> Iterator[tuple[int, int, int, int]]:
-    """(name, chunk, offset, log time) of all messages of (name, entries), as they lie in the file."""
+def in_file_order(entries: Sequence[tuple[int, Entries]], skip: int = 0) -> Iterator[tuple[int, int, int, int]]:
+    """(name, chunk, offset, log time) of all messages of (name, entries) but the first `skip`, as they lie in the
+    file."""
     if not entries:
         return
     names = np.concatenate([np.full(len(e), name, np.int64) for name, e in entries])
@@ -100,7 +101,7 @@ def in_file_order(entries: Sequence[tuple[int, Entries]]) -> Iterator[tuple[int,
     offsets = np.concatenate([e.offsets for _, e in entries])
     times = np.concatenate([e.times for _, e in entries])
     order = np.lexsort((offsets, chunks))
-    for at in range(0, len(order), BLOCK):
+    for at in range(skip, len(order), BLOCK):
         block = order[at : at + BLOCK]
         yield from zip(*(column[block].tolist() for column in (names, chunks, offsets, times)), strict=True)
 

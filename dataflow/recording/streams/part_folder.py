@@ -9,7 +9,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import accumulate, groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from mcap.records import Channel, Schema
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import CUT, RECORDING, Kind
 from dataflow.recording.mcap.attachments import Attachment, Place
+from dataflow.recording.mcap.cache import ChunkCache
 from dataflow.recording.mcap.chunks import Column
 from dataflow.recording.mcap.contents import Entries
 from dataflow.recording.mcap.index import McapFile, RawMessage
@@ -52,9 +53,10 @@ class PartedFile:
     def __init__(self, path: Path, parts: Sequence[Path], *, watch: Watch | None = None) -> None:
         self.path = path
         self._files: list[McapFile] = []
+        cache = ChunkCache()
         try:
             for part in parts:
-                self._files.append(McapFile(part, watch=watch))
+                self._files.append(McapFile(part, watch=watch, cache=cache))
                 if not any(name == RECORDING for name, _ in self._files[-1].metadata):
                     raise RecordingError(f"{part} is no recording of this program, so {path} is not one in parts")
         except BaseException:
@@ -191,14 +193,27 @@ class _JoinedIndex:
                 yield self._moved(number, part, after)
 
     def in_file_order(
-        self, channels: Collection[int], start: int | None = None, end: int | None = None
-    ) -> Iterator[Mapping[int, Entries]]:
-        reached = {(channel, k): after for channel in channels for k, _, after, _ in self._parts_of(channel)}
-        for number, (index, owns) in enumerate(self._parts):
-            here = {owns[channel]: channel for channel in channels if channel in owns}
-            after = {channel: reached.get((channel, number)) for channel in here.values()}
-            for part in index.in_file_order(list(here), start, end):
-                yield {here[own]: self._moved(number, found, after.get(here[own])) for own, found in part.items()}
+        self, channels: Collection[int], start: int | None = None, end: int | None = None, skip: int = 0
+    ) -> Iterator[tuple[int, Mapping[int, Entries]]]:
+        held = sorted(
+            (k, own, channel, after, n) for channel in channels for k, own, after, n in self._parts_of(channel)
+        )
+        before, whole = 0, start is None and end is None
+        for number, listed in groupby(held, key=lambda item: item[0]):
+            here = {own: (channel, after, count) for _, own, channel, after, count in listed}
+            count = sum(count for _, _, count in here.values())
+            if whole and before + count <= skip:
+                before += count
+                continue
+            once = any(after is not None for _, after, _ in here.values())
+            left = 0 if once else max(0, skip - before)
+            passed = 0
+            for ahead, part in self._parts[number][0].in_file_order(list(here), start, end, left):
+                moved = {here[own][0]: self._moved(number, found, here[own][1]) for own, found in part.items()}
+                passed = passed if once else ahead
+                yield before + passed, moved
+                passed += sum(map(len, moved.values()))
+            before += passed
 
     def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
         raise RecordingError("the sizes of streams are told part by part")

@@ -7,12 +7,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
 from mcap.records import Channel
 
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import FORMAT, RECORDING, Kind
 from dataflow.recording.mcap.attachments import Attachment
+from dataflow.recording.mcap.contents import Entries
 from dataflow.recording.mcap.index import McapFile, RawMessage
 from dataflow.recording.mcap.rawfile import Watch
 from dataflow.recording.streams.access import StreamIndex
@@ -103,7 +105,8 @@ class Recording:
 
         Static streams come first and whole, whatever `start` and `end`. Each stream keeps its own order; an incarnation
         whose clock has jumped back is merged as if it followed directly on the one before. Memory holds the index and
-        at most 256 MiB of decompressed chunks. Without `streams`, those that have no message type are left out.
+        16 MiB of decompressed chunks, or up to 256 MiB where more are in use at a time. Without `streams`, those that
+        have no message type are left out.
 
         Raises `RecordingError` for an unknown stream, one without a message type, and data that does not decode.
         """
@@ -309,17 +312,22 @@ class Recording:
     def _in_file_order(
         self, channels: list[int], start: int | None = None, end: int | None = None, *, skip: int = 0
     ) -> Iterator[RawMessage]:
-        for part in self._file.index.in_file_order(channels, start, end):
-            count = sum(map(len, part.values()))
-            if start is None and end is None and skip >= count:
-                skip -= count
-                continue
-            for place in in_file_order(list(part.items())):
-                if (start is None or place[3] >= start) and (end is None or place[3] <= end):
-                    if skip:
-                        skip -= 1
-                    else:
-                        yield self._file.read(*place)
+        passed = 0
+        for before, part in self._file.index.in_file_order(channels, start, end, skip):
+            if start is not None or end is not None:
+                before, part = passed, {channel: _within(found, start, end) for channel, found in part.items()}
+            for place in in_file_order(list(part.items()), max(0, skip - before)):
+                yield self._file.read(*place)
+            passed = before + sum(map(len, part.values()))
+
+
+def _within(entries: Entries, start: int | None, end: int | None) -> Entries:
+    kept = np.ones(len(entries), bool)
+    if start is not None:
+        kept &= entries.times >= start
+    if end is not None:
+        kept &= entries.times <= end
+    return entries.where(kept)
 
 
 def _merged(records: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 from dataflow.execution.memory import MemoryGuard
@@ -83,7 +84,7 @@ def _checks(recording: Recording, graph: Graph, log: FiringLog, request: Mapping
         stream: StoredCheck(
             stream,
             graph.streams[stream].node,
-            log.emissions(graph.nodes[graph.streams[stream].node], stream),
+            partial(log.emissions, graph.nodes[graph.streams[stream].node], stream),
             static=recording.streams[stream].static,
             whole=request["begin"] is None,
         )

@@ -8,12 +8,13 @@ the sensor do not pull a pose towards rest, as they pull methods that pair point
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dataflow.operator import Remembered
 
 Array = NDArray[np.float64]
 Keys = NDArray[np.int64]
@@ -88,16 +89,26 @@ class Pairs:
     known: float
 
 
-class _Rows:
+class _Rows(Remembered):
     """Voxels of one size, in the order in which they came."""
+
+    moments: Array  # (N, 10): n, sum of x (3), sum of xx' (6), about the centre of the largest voxel
+    planes: Array  # (N, 9): centre (3), normal (3), thickness, slope, whether it is one
+    fitted: Array  # (N,) points of which the plane was made
+    births: NDArray[np.int64]  # (N,)
 
     def __init__(self, size: float) -> None:
         self.size = size
         self.count = 0
-        self.moments = np.zeros((1024, 10))  # n, sum of x (3), sum of xx' (6), about the centre of the largest voxel
-        self.planes = np.zeros((1024, 9))  # centre (3), normal (3), thickness, slope, whether it is one
-        self.fitted = np.zeros(1024)  # points of which the plane was made
-        self.births = np.zeros(1024, np.int64)
+        self.moments, self.planes = np.zeros((1024, 10)), np.zeros((1024, 9))
+        self.fitted, self.births = np.zeros(1024), np.zeros(1024, np.int64)
+
+    def prepare_snapshot(self) -> None:
+        for name in _ROWS:
+            setattr(self, name, getattr(self, name)[: self.count])
+
+    def restored(self) -> None:
+        self.count = len(self.fitted)
 
     def grow(self, more: int, birth: int) -> Rows:
         """Returns new rows."""
@@ -144,19 +155,24 @@ class _Rows:
 _ROWS = ("moments", "planes", "fitted", "births")
 
 
-class PlaneMap:
+class PlaneMap(Remembered):
     """Planes in voxels of `size`, and of half, a quarter ... of it. A point belongs to the largest plane there.
 
     The largest voxels, the blocks, are found through their sorted keys, the others through a table in each block, both
     by Morton codes: the code of a voxel is that of its block and three more bits for each halving.
     """
 
+    _keys: Keys
+    _order: Rows  # the block of each key
+    _corners: Array  # (B, 3) centre of each block
+    _tables: list[NDArray[np.int32]]  # (B, 8**k) row of each voxel of a block, or -1
+    _rows: list[_Rows]
+
     def __init__(self, size: float, levels: int) -> None:
         self._size, self._levels = size, levels
-        self._keys: Keys = np.zeros(0, np.int64)
-        self._order: Rows = np.zeros(0, np.intp)  # the block of each key
-        self._corners = np.zeros((0, 3))  # centre of each block
-        self._tables = [np.zeros((0, 8**k), np.int32) for k in range(levels)]  # row of each voxel of a block, or -1
+        self._keys, self._order = np.zeros(0, np.int64), np.zeros(0, np.intp)
+        self._corners = np.zeros((0, 3))
+        self._tables = [np.zeros((0, 8**k), np.int32) for k in range(levels)]
         self._rows = [_Rows(size / 2**k) for k in range(levels)]
 
     def __len__(self) -> int:
@@ -257,22 +273,6 @@ class PlaneMap:
         for k, table in enumerate(self._tables):
             self._tables[k] = np.concatenate([table, np.full((len(new), 8**k), -1, np.int32)])
         return np.repeat(blocks, np.diff(np.append(first, len(code))))
-
-    def snapshot(self) -> dict[str, Any]:
-        """Returns the map as arrays."""
-        rows = [{name: getattr(level, name)[: level.count].copy() for name in _ROWS} for level in self._rows]
-        return {"keys": self._keys, "order": self._order, "corners": self._corners, "rows": rows,
-                "tables": [table.copy() for table in self._tables]}  # fmt: skip
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes what `snapshot` of a map with the same sizes gave."""
-        self._keys, self._order = np.array(state["keys"]), np.array(state["order"])
-        self._corners = np.array(state["corners"])
-        self._tables = [np.array(table) for table in state["tables"]]
-        for level, values in zip(self._rows, state["rows"], strict=True):
-            for name in _ROWS:
-                setattr(level, name, np.array(values[name]))
-            level.count = len(level.fitted)
 
 
 def _firsts(code: Keys) -> Rows:

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from dataflow.messages import Diagnostics, Message, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix, about_fixed_axes, adjoint
 from operators.odometry.lidar.sweep import Sweep
 from operators.odometry.lidar.tracker import LidarTracker, State, Tracked, TrackerConfig
 
 _LEVELS = {State.PREDICTED: Level.WARN, State.LOST: Level.ERROR}
+
+
+@dataclass(kw_only=True)
+class LidarState(Counts):
+    """Holds the tracker with its map, and counts scans by state."""
+
+    tracker: LidarTracker
 
 
 class LidarOdometry(Operator):
@@ -73,9 +79,15 @@ class LidarOdometry(Operator):
     patience: float = Param(0.5, ge=0, doc="time bridged by prediction, and one scan at least", unit="s")
     give_up: float = Param(2.0, ge=0, doc="and time lost until a new map begins", unit="s")
 
+    state: LidarState
+
     def setup(self) -> None:
-        self._tracker = self._new()
-        self._counts: Counter[str] = Counter()
+        """Raises ValueError for a range that holds no point."""
+        if self.near >= self.far:
+            raise ValueError(f"near must be less than far, got {self.near} and {self.far}")
+
+    def initial_state(self) -> LidarState:
+        return LidarState(tracker=self._new())
 
     def process(self, cloud: PointCloud, extrinsics: Transforms | None = None) -> Mapping[str, Message]:
         """Raises ValueError where no transform relates the cloud's frame to the body's."""
@@ -90,27 +102,13 @@ class LidarOdometry(Operator):
         offsets = cloud.time_offsets
         if offsets is None and self.sweep is not None:
             offsets = self.sweep.offsets(cloud.points)
-        tracked = self._tracker.track(cloud.points, offsets, cloud.stamp)
-        self._counts[tracked.state.value] += 1
-        self._counts["with a direction untold"] += len(tracked.blind) > 0
+        tracked = self.state.tracker.track(cloud.points, offsets, cloud.stamp)
+        self.state.counts[tracked.state.value] += 1
+        self.state.counts["with a direction untold"] += len(tracked.blind) > 0
         messages: dict[str, Message] = {"status": _status(cloud.stamp, tracked)}
         if tracked.state is not State.LOST:
             messages["odometry"] = self._odometry(cloud.stamp, body, T_body_lidar, tracked)
         return messages, tracked, T_body_lidar
-
-    def on_reset(self, input: str) -> None:
-        """Begins anew: the clock of a stream did, so nothing before it can be compared with."""
-        self._tracker = self._new()
-
-    def snapshot(self) -> Mapping[str, Any]:
-        return {"tracker": self._tracker.snapshot(), "counts": dict(self._counts)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._tracker.restore(state["tracker"])
-        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
-
-    def summary(self) -> Mapping[str, int]:
-        return dict(self._counts)
 
     def _odometry(self, stamp: int, body: str, T_body_lidar: Matrix, tracked: Tracked) -> Odometry:
         T = T_body_lidar @ tracked.T @ invert(T_body_lidar)
@@ -128,8 +126,6 @@ class LidarOdometry(Operator):
         )
 
     def _new(self) -> LidarTracker:
-        if self.near >= self.far:
-            raise ValueError(f"near must be less than far, got {self.near} and {self.far}")
         own = {name: getattr(self, name) for name in TrackerConfig.__dataclass_fields__}
         return LidarTracker(TrackerConfig(**own))
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
+from dataflow.operator import Remembered
 from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix, Vector
@@ -80,23 +80,27 @@ class Tracked:
     points: NDArray[np.float64] | None = None
 
 
-class LidarTracker:
+class LidarTracker(Remembered):
     """Fits every scan to a map of planes, starting from constant velocity, and adds it to the map.
 
     Bad scans are bridged by the prediction; after `patience` the sensor is lost and looked for around where it was;
     after `give_up` a new map begins at the last pose, and the covariance holds the error of that.
     """
 
+    _map: PlaneMap
+    _motion: LidarMotion | None
+    _spacing: float | None
+    _epochs: list[Matrix]  # covariances, left perturbations: voxels' births index them
+    _epoch_T: Matrix
+    _first: Scan | None  # put into the map as it was taken: to be put right when the velocity is known
+    _pruned_at: Vector
+    _missed: int  # scans since the last measured pose
+
     def __init__(self, config: TrackerConfig) -> None:
-        self._config = config
+        self._config, self._spacing = config, config.spacing
         self._map = PlaneMap(config.voxel, config.levels)
-        self._motion: LidarMotion | None = None
-        self._spacing = config.spacing
-        self._epochs: list[Matrix] = []  # covariances, left perturbations: voxels' births index them
-        self._epoch_T = np.eye(4)
-        self._first: Scan | None = None  # put into the map as it was taken: to be put right when the velocity is known
-        self._pruned_at = np.zeros(3)
-        self._missed = 0  # scans since the last measured pose
+        self._motion, self._first, self._missed = None, None, 0
+        self._epochs, self._epoch_T, self._pruned_at = [], np.eye(4), np.zeros(3)
 
     def track(self, points: NDArray[np.float32], offsets: NDArray[np.float32] | None, stamp: int) -> Tracked:
         """Takes a scan: points (N, 3) in the sensor's frame, when each was measured after the stamp, s, or None.
@@ -304,35 +308,6 @@ class LidarTracker:
             state, reason, motion.T, covariance, motion.velocity, velocity_covariance,
             none if blind is None else blind, own | dict(counts or {}),
         )  # fmt: skip
-
-    def snapshot(self) -> dict[str, Any]:
-        """Returns all that the next scan depends on, as numbers, arrays, lists and mappings."""
-        motion, first = self._motion, self._first
-        return {
-            "motion": None if motion is None else {name: getattr(motion, name) for name in _MOTION},
-            "first": None if first is None else {name: getattr(first, name) for name in _SCAN},
-            "map": self._map.snapshot(),
-            "spacing": self._spacing,
-            "epochs": np.array(self._epochs).reshape(-1, 6, 6),
-            "epoch_T": self._epoch_T,
-            "pruned_at": self._pruned_at,
-            "missed": self._missed,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes what `snapshot` of a tracker with the same configuration gave."""
-        self._motion = None if state["motion"] is None else LidarMotion(**state["motion"])
-        self._first = None if state["first"] is None else Scan(**state["first"])
-        self._map = PlaneMap(self._config.voxel, self._config.levels)
-        self._map.restore(state["map"])
-        self._spacing = state["spacing"]
-        self._epochs = list(np.array(state["epochs"]))
-        self._missed = state["missed"]
-        self._epoch_T, self._pruned_at = np.array(state["epoch_T"]), np.array(state["pruned_at"])
-
-
-_MOTION = ("stamp", "T", "velocity", "covariance", "fresh", "before_stamp", "before_T")
-_SCAN = ("points", "offsets", "sample", "unusable")
 
 
 def _elsewhere(fits: list[Fit], rival: float, *, anywhere: bool) -> str:

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Odometry, Transforms
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry import se3
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix
 from operators.odometry.emission import outputs
-from operators.odometry.mono.memory import from_plain, to_plain
 from operators.odometry.mono.ranging import MetricDepth
 from operators.odometry.mono.settings import MonoOdometryConfig, RangingConfig
 from operators.odometry.mono.tracker import MonoOdometry, MonoResult, MonoState
 from operators.odometry.mono.two_view import TwoViewConfig
 from operators.odometry.rgbd.odometry import camera_of
 from operators.odometry.tracking import Status, TrackResult
+
+
+@dataclass
+class State(Counts):
+    """Holds what the odometry remembers, and counts frames by status, depth images by use."""
+
+    odometry: MonoState = field(default_factory=MonoState)
 
 
 class MonoVisualOdometry(Operator):
@@ -91,11 +95,8 @@ class MonoVisualOdometry(Operator):
     depth_far: float = Param(6.0, gt=0, doc="larger depths are no return", unit="m")
     depth_points: int = Param(15, ge=5, doc="fewest points of the map with a depth that a scale may rest on")
 
+    state: State
     _tracker: MonoOdometry | None = None
-    _restored: MonoState | None = None
-
-    def setup(self) -> None:
-        self._frames: Counter[str] = Counter()
 
     def process(
         self,
@@ -111,29 +112,18 @@ class MonoVisualOdometry(Operator):
         check_calibration("image", image, image_info)
         T_reference = None if scale is None else _camera_by(scale, image, extrinsics)
         given = None if depth is None else _metric(depth, depth_info, image_info, extrinsics)
-        result = self._tracking(image_info).track(image.data, image.stamp, T_reference, given)
-        self._frames[result.track.status.value] += 1
+        tracker = self._tracking(image_info)
+        result = tracker.track(image.data, image.stamp, T_reference, given)
+        self.state.odometry = tracker.state
+        self.state.counts[result.track.status.value] += 1
         if result.ranged is not None:
-            self._frames[f"depth {result.ranged.use.value}"] += 1
+            self.state.counts[f"depth {result.ranged.use.value}"] += 1
         return self._told(result, image.frame)
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew, so nothing before it can be compared with."""
-        self._tracker = self._restored = None
-
-    def snapshot(self) -> Mapping[str, Any]:
-        """The motion and the map."""
-        state = self._restored if self._tracker is None else self._tracker.snapshot()
-        return {} if state is None else to_plain(state) | {"frames": dict(self._frames)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Taken up with the first image, which brings the calibration."""
-        self._restored = from_plain(state) if state else None
-        self._frames = Counter({status: int(count) for status, count in state.get("frames", {}).items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        """Returns the number of frames of each status, and of depth images by what became of them."""
-        return dict(self._frames)
+        super().on_reset(input)
+        self._tracker = None
 
     def _told(self, result: MonoResult, frame: str) -> dict[str, Any]:
         track, known = result.track, result.scale.known
@@ -158,9 +148,7 @@ class MonoVisualOdometry(Operator):
         """The tracker, made for the first calibration, which later ones must repeat."""
         if self._tracker is None:
             self._tracker = MonoOdometry(image_info.K, self._config())
-            if self._restored is not None:
-                self._tracker.restore(self._restored)
-                self._restored = None
+            self._tracker.state = self.state.odometry
         elif not np.array_equal(self._tracker.K, image_info.K):
             raise ValueError("the calibration changed (K of image_info is another): one camera, one calibration")
         return self._tracker

@@ -36,7 +36,7 @@ SHARED_BEGINNING = 0.4  # share of the first view's corners without which a new 
 
 @dataclass(frozen=True, eq=False)
 class MonoState:
-    """Holds what an odometry remembers between frames."""
+    """Holds what an odometry remembers between frames; immutable, as its parts are."""
 
     motion: Motion | None = None
     covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
@@ -70,7 +70,7 @@ class MonoOdometry:
             raise ValueError("MonoOdometry.K must be a finite (3, 3) matrix with positive focal lengths")
         self.K = K
         self.config = config or MonoOdometryConfig()
-        self._state = MonoState()
+        self.state = MonoState()
 
     def track(
         self, image: NDArray[np.uint8], stamp: int, T_reference: Matrix | None = None, depth: MetricDepth | None = None
@@ -83,13 +83,13 @@ class MonoOdometry:
         a stamp that does not increase.
         """
         frame = self._look(image, stamp, T_reference)
-        if self._state.motion is None:
+        if self.state.motion is None:
             self._set(motion=Motion(stamp, np.eye(4), np.zeros(6)))
-        before = self._state
+        before = self.state
         result = self._go_on(frame) if before.map.begun else self._initialise(frame)
         self._set(T_reference=T_reference)
         if depth is None or depth.stamp <= before.ranging.stamp:
-            return MonoResult(result, self._state.scale)
+            return MonoResult(result, self.state.scale)
         return self._ranged(frame, result, depth, before)
 
     def _go_on(self, frame: MonoFrame) -> TrackResult:
@@ -98,8 +98,8 @@ class MonoOdometry:
         if frame.flaw is not None:
             return self._guessed(frame, T_predicted, str(frame.flaw))
         # 2. Follow the corners of the last image, and solve for the pose.
-        assert self._state.tracks is not None
-        tracks = self._state.tracks.followed(frame, T_predicted, self._state.map)
+        assert self.state.tracks is not None
+        tracks = self.state.tracks.followed(frame, T_predicted, self.state.map)
         fit = self._solve(tracks, frame.K)
         if fit is not None:
             return self._measured(frame, tracks, fit)
@@ -113,7 +113,7 @@ class MonoOdometry:
 
     def _initialise(self, frame: MonoFrame) -> TrackResult:
         """Waits for a second view that gives points, before there is any map."""
-        motion = self._state.motion
+        motion = self.state.motion
         assert motion is not None
         if motion.stamp < frame.stamp:
             self._set(motion=Motion(frame.stamp, motion.T_world_camera, np.zeros(6)))
@@ -122,11 +122,11 @@ class MonoOdometry:
         reason = self._begin(frame, motion.T_world_camera)
         if reason is not None:
             return self._result(Status.INITIALISING, reason, 0)
-        return self._result(Status.TRACKING, "the first map", len(self._state.map.numbers), keyframe=True)
+        return self._result(Status.TRACKING, "the first map", len(self.state.map.numbers), keyframe=True)
 
     def _begin(self, frame: MonoFrame, T_world_camera: Matrix) -> str | None:
         """Compares the frame with the beginning of a map; returns why there is none yet, or None where there is."""
-        state, config = self._state, self.config
+        state, config = self.state, self.config
         first, fewest = state.beginning, config.two_view.min_points
         tracks = None
         if first is not None and state.tracks is not None:
@@ -150,7 +150,7 @@ class MonoOdometry:
     # -- the steps ---------------------------------------------------------------------------------------
 
     def _predict(self, frame: MonoFrame) -> Matrix:
-        state = self._state
+        state = self.state
         assert state.motion is not None
         if state.scale.known and state.T_reference is not None and frame.T_reference is not None:
             T: Matrix = state.motion.T_world_camera @ invert(state.T_reference) @ frame.T_reference
@@ -159,8 +159,8 @@ class MonoOdometry:
 
     def _solve(self, tracks: Tracks, K: Matrix) -> PosedView | None:
         """Returns the pose that the map's points give; `agree` is of all tracks, and true where there is no point."""
-        config, (rows, known) = self.config, self._state.map.find(tracks.numbers)
-        points, pixels = self._state.map.points[rows[known]], tracks.pixels[known]
+        config, (rows, known) = self.config, self.state.map.find(tracks.numbers)
+        points, pixels = self.state.map.points[rows[known]], tracks.pixels[known]
         rough = solved(points, pixels, K, config.gate * config.sigma + 1.0, config.min_inliers)
         if rough is None:
             return None
@@ -175,7 +175,7 @@ class MonoOdometry:
 
     def _measured(self, frame: MonoFrame, tracks: Tracks, fit: PosedView) -> TrackResult:
         """Takes up a measured pose, and makes the frame a keyframe where one is due."""
-        state, config = self._state, self.config
+        state, config = self.state, self.config
         assert state.motion is not None
         T, newest = fit.T_world_camera, state.map.newest
         tracks = replace(tracks.only(fit.agree), T_world_camera=T)
@@ -197,7 +197,7 @@ class MonoOdometry:
 
     def _add_keyframe(self, frame: MonoFrame) -> None:
         """Remembers the frame, makes points of what it saw under a new angle, and adjusts the newest keyframes."""
-        config, state = self.config, self._state
+        config, state = self.config, self.state
         assert state.tracks is not None
         assert state.motion is not None
         tracks = self._replenished(state.tracks)
@@ -216,7 +216,7 @@ class MonoOdometry:
 
     def _recall(self, frame: MonoFrame, T_predicted: Matrix) -> tuple[Tracks, PosedView] | None:
         """Looks for the view in the map, the nearest keyframe first and the others by turns."""
-        known, config, turn = self._state.map, self.config, self._state.turns
+        known, config, turn = self.state.map, self.config, self.state.turns
         self._set(turns=turn + 1)
         views = sorted(known.views, key=lambda v: view_distance(v.T_world_camera, T_predicted, 1.0))
         others = views[1:]
@@ -231,7 +231,7 @@ class MonoOdometry:
 
     def _unmeasured(self, frame: MonoFrame, tracks: Tracks, T_predicted: Matrix) -> TrackResult:
         """Goes on without points: by the rotation that corners hold, and with a new map after a while."""
-        state, config = self._state, self.config
+        state, config = self.state, self.config
         assert state.motion is not None
         assert state.tracks is not None
         T, reason = T_predicted, f"{len(tracks.numbers)} corners followed, too few agree with the map"
@@ -258,20 +258,20 @@ class MonoOdometry:
         return self._guessed(frame, T, f"{reason}; for a new map: {why}")
 
     def _guessed(self, frame: MonoFrame, T: Matrix, reason: str) -> TrackResult:
-        state, config = self._state, self.config
+        state, config = self.state, self.config
         assert state.motion is not None
         spread = state.motion.spread(frame.stamp, config.acceleration, config.angular_acceleration)
         covariance = moved_covariance(state.covariance, state.motion.T_world_camera, T) + spread
         self._set(motion=state.motion.guessed(frame.stamp, T), covariance=covariance)
-        assert self._state.motion is not None
-        lost = self._state.motion.blind_s > config.patience_s
+        assert self.state.motion is not None
+        lost = self.state.motion.blind_s > config.patience_s
         return self._result(Status.LOST if lost else Status.PREDICTED, reason, 0)
 
     # -- the scale ---------------------------------------------------------------------------------------
 
     def _ranged(self, frame: MonoFrame, result: TrackResult, depth: MetricDepth, before: MonoState) -> MonoResult:
         """Takes the scale from a depth image; the pose is that of a result, or lies between it and the one before."""
-        state = self._state
+        state = self.state
         rows, known = state.map.find(np.zeros(0, np.int64) if state.tracks is None else state.tracks.numbers)
         T = pose_at(depth.stamp, result, before.motion if before.map.begun else None)
         given = replace(depth, camera=replace(depth.camera, K_color=frame.K))
@@ -280,12 +280,12 @@ class MonoOdometry:
         self._rescale(told.factor, told.scale)
         if told.use is RangingUse.FOUND:
             result = self._result(result.status, result.reason, result.inliers, result.keyframe)
-        return MonoResult(result, self._state.scale, told)
+        return MonoResult(result, self.state.scale, told)
 
     def _rescale(self, factor: float, scale: Scale) -> None:
         """Brings the map to metres: about the camera, so that its pose stays; where they are known for the first time,
         about the place where the map began."""
-        state = self._state
+        state = self.state
         assert state.motion is not None
         if factor == 1.0 and scale == state.scale:
             return
@@ -309,28 +309,20 @@ class MonoOdometry:
 
     def _replenished(self, tracks: Tracks) -> Tracks:
         """Adds corners where the image has none."""
-        more = tracks.replenished(self.config.corners, self._state.following)
-        self._set(following=self._state.following + len(more.numbers) - len(tracks.numbers))
+        more = tracks.replenished(self.config.corners, self.state.following)
+        self._set(following=self.state.following + len(more.numbers) - len(tracks.numbers))
         return more
 
     # -- results and state -------------------------------------------------------------------------------
 
-    def snapshot(self) -> MonoState:
-        """Returns all that the next result depends on, as immutable values of plain arrays."""
-        return self._state
-
-    def restore(self, state: MonoState) -> None:
-        """Goes on from a snapshot of an odometry with the same camera and configuration."""
-        self._state = state
-
     def _set(self, **changes: object) -> None:
-        self._state = replace(self._state, **changes)  # type: ignore[arg-type]
+        self.state = replace(self.state, **changes)  # type: ignore[arg-type]
 
     def _result(self, status: Status, reason: str, inliers: int, keyframe: bool = False) -> TrackResult:
-        motion = self._state.motion
+        motion = self.state.motion
         assert motion is not None
         return TrackResult(
-            motion.stamp, motion.T_world_camera.copy(), self._state.covariance.copy(), motion.velocity.copy(),
+            motion.stamp, motion.T_world_camera.copy(), self.state.covariance.copy(), motion.velocity.copy(),
             status, reason, inliers, 0.0, keyframe,
         )  # fmt: skip
 
@@ -340,7 +332,7 @@ class MonoOdometry:
             raise ValueError(f"image must be (H, W) or (H, W, 3) uint8, got {image.shape} {image.dtype}")
         if min(image.shape[:2]) < 32:
             raise ValueError(f"image must be at least 32 x 32 pixels, got {image.shape}")
-        state = self._state
+        state = self.state
         if state.shape not in (None, image.shape[:2]):
             raise ValueError(f"image size changed from {state.shape} to {image.shape[:2]}: one camera, one size")
         if state.motion is not None and stamp <= state.motion.stamp:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
+from operators.estimation.kernels import cauchy
 from operators.geometry.pinhole import Pixels, Points, project, unproject
-from operators.geometry.se3 import Matrix
+from operators.geometry.se3 import Matrix, nearest_rotation
 from operators.odometry.features import Mask
 
 PLANAR = 0.45  # share of the score above which the homography is believed
@@ -101,11 +102,10 @@ def turned(rays_a: Points, rays_b: Points, sigma: float) -> Matrix:
     b = rays_b / np.linalg.norm(rays_b, axis=1, keepdims=True)
     weight, R = np.ones(len(a)), np.eye(3)
     for _ in range(10):
-        u, _, vt = np.linalg.svd((weight[:, None] * b).T @ a)
-        R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        R = nearest_rotation((weight[:, None] * b).T @ a)
         off = np.linalg.norm(a @ R.T - b, axis=1)
-        weight = 1.0 / (1.0 + (off / max(3.0 * sigma, float(np.median(off)))) ** 2)
-    return np.asarray(R)
+        weight = cauchy((off / max(3.0 * sigma, float(np.median(off)))) ** 2)
+    return R
 
 
 def triangulate(T_a: Matrix, T_b: Matrix, pixels_a: Pixels, pixels_b: Pixels, K: Matrix) -> tuple[Points, Points]:

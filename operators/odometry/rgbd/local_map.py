@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from dataflow.operator import Remembered
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, orthonormalised
 from operators.odometry.keyframes import redundant, view_distance
@@ -24,7 +25,7 @@ def drifted(a: Keyframe, b: Keyframe) -> bool:
     return abs(a.place_variance - b.place_variance) >= DRIFTED**2
 
 
-class LocalMap:
+class LocalMap(Remembered):
     """Keyframes in order of time, those of the segment that the camera is in last; those that others make up for are
     forgotten first.
 
@@ -32,9 +33,10 @@ class LocalMap:
     recognised. Only keyframes of the newest segment are compared with directly.
     """
 
+    keyframes: list[Keyframe]
+
     def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self.keyframes: list[Keyframe] = []
+        self.capacity, self.keyframes = capacity, []
 
     @property
     def newest(self) -> Keyframe:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Odometry, Transforms
 from dataflow.messages.geometry import invert
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
 from operators.odometry.emission import outputs
 from operators.odometry.rgbd.camera import RgbdCamera
-from operators.odometry.rgbd.memory import from_plain, to_plain
+from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import DepthNoise
-from operators.odometry.rgbd.tracker import RgbdOdometry, State
+from operators.odometry.rgbd.tracker import RgbdOdometry, RgbdState
 
 Calibration = tuple[CameraInfo, CameraInfo, Transforms | None]
 
@@ -30,6 +29,13 @@ def camera_of(image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transf
 def same(known: Calibration | None, given: Calibration) -> bool:
     """Returns whether these are the very messages that are known, so that nothing has to be compared."""
     return known is not None and all(a is b for a, b in zip(known, given, strict=True))
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds what the odometry remembers, and counts frames by status."""
+
+    odometry: RgbdState
 
 
 class VisualOdometry(Operator):
@@ -73,12 +79,12 @@ class VisualOdometry(Operator):
     patience: float = Param(0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s")
     give_up: float = Param(2.0, ge=0, doc="time in a new map until it counts as tracking although apart", unit="s")
 
+    state: State
     _tracker: RgbdOdometry | None = None
     _calibration: Calibration | None = None
-    _restored: State | None = None
 
-    def setup(self) -> None:
-        self._frames: Counter[str] = Counter()
+    def initial_state(self) -> State:
+        return State(odometry=RgbdState(LocalMap(self.keyframes)))
 
     def process(
         self,
@@ -92,34 +98,19 @@ class VisualOdometry(Operator):
         check_calibration("image", image, image_info)
         check_calibration("depth", depth, depth_info)
         result = self._tracking(image_info, depth_info, extrinsics).track(image.data, depth.data, depth.stamp)
-        self._frames[result.status.value] += 1
+        self.state.counts[result.status.value] += 1
         return outputs(result, self.odometry_frame, depth.frame)
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew, so nothing before it can be compared with."""
-        self._tracker = self._calibration = self._restored = None
-
-    def snapshot(self) -> Mapping[str, Any]:
-        """The motion and the keyframes."""
-        state = self._restored if self._tracker is None else self._tracker.snapshot()
-        return {} if state is None else to_plain(state) | {"frames": dict(self._frames)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Taken up with the first frame, which brings the calibration."""
-        self._restored = from_plain(state) if state else None
-        self._frames = Counter({status: int(count) for status, count in state.get("frames", {}).items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        """Returns the number of frames of each status."""
-        return dict(self._frames)
+        super().on_reset(input)
+        self._tracker = self._calibration = None
 
     def _tracking(self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdOdometry:
         """The tracker, made for the first calibration, which later ones must repeat."""
         if self._tracker is None:
-            self._tracker = RgbdOdometry(camera_of(image_info, depth_info, extrinsics), self._config())
-            if self._restored is not None:
-                self._tracker.restore(self._restored)
-                self._restored = None
+            camera = camera_of(image_info, depth_info, extrinsics)
+            self._tracker = RgbdOdometry(camera, self._config(), self.state.odometry)
         elif not same(self._calibration, (image_info, depth_info, extrinsics)):
             self._tracker.camera.check_same(camera_of(image_info, depth_info, extrinsics))
         self._calibration = (image_info, depth_info, extrinsics)

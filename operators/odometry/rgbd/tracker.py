@@ -34,14 +34,14 @@ from operators.odometry.tracking import Status, TrackResult, moved_covariance
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """Holds what an odometry remembers between frames."""
+@dataclass(eq=False)
+class RgbdState:
+    """Holds what an odometry remembers between frames; but for the map, its parts are immutable."""
 
-    motion: Motion | None
-    covariance: Matrix
-    keyframes: tuple[Keyframe, ...]
-    shapes: tuple[tuple[int, ...], tuple[int, ...]] | None
+    map: LocalMap
+    motion: Motion | None = None
+    covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
+    shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
     noise: Noise = field(default_factory=Noise)
     watch: Watch = field(default_factory=Watch)
     recalls: int = 0  # frames that the map was searched for since the last loss
@@ -52,19 +52,13 @@ class State:
 class RgbdOdometry:
     """Tracks one camera. Deterministic: the same frames give the same bytes, in every process."""
 
-    def __init__(self, camera: RgbdCamera, config: RgbdOdometryConfig | None = None) -> None:
+    def __init__(
+        self, camera: RgbdCamera, config: RgbdOdometryConfig | None = None, state: RgbdState | None = None
+    ) -> None:
         self.camera = camera
         self.config = config or RgbdOdometryConfig()
         self._working = camera  # with K_color of the reduced image
-        self._map = LocalMap(self.config.keyframes)
-        self._motion: Motion | None = None
-        self._covariance = np.zeros((6, 6))
-        self._shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
-        self._noise = Noise()
-        self._watch = Watch()
-        self._recalls = 0
-        self._apart_since: int | None = None
-        self._trials: tuple[Trial, ...] = ()
+        self.state = state or RgbdState(LocalMap(self.config.keyframes))
 
     def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> TrackResult:
         """Returns the pose of the next frame: (H, W) or (H, W, 3) RGB uint8, (H', W') float32 metres, nanoseconds.
@@ -73,17 +67,17 @@ class RgbdOdometry:
         """
         self._check(image, depth, stamp)
         # 1. Reduce the images to what the rest works on, and see what is wrong with them.
-        frame = observe(image, depth, stamp, self.camera.K_color, self.camera.K_depth, self.config, self._watch)
-        self._watch = frame.watch
+        frame = observe(image, depth, stamp, self.camera.K_color, self.camera.K_depth, self.config, self.state.watch)
+        self.state.watch = frame.watch
         self._working = replace(self.camera, K_color=frame.K_color)
-        if self._motion is None or self._map.newest.empty:
+        if self.state.motion is None or self.state.map.newest.empty:
             return self._start(frame)
         # 2. Predict the pose from the motion so far.
-        T_predicted = self._motion.predict(stamp, self.config.decay_s)
+        T_predicted = self.state.motion.predict(stamp, self.config.decay_s)
         # 3. Track the keyframe's corners and solve for the pose.
         sighting = self._follow(frame, T_predicted)
         # 4. Refine with the depth image, against the surfaces of nearby keyframes.
-        fit = self._refine(frame, sighting, T_predicted, self._map.newest)
+        fit = self._refine(frame, sighting, T_predicted, self.state.map.newest)
         # 5. Failing that, or in a new map, recognise the view by its descriptors.
         measured = self._measured(frame, fit)
         recalled = self._recall(frame, T_predicted, measured=measured)
@@ -98,23 +92,23 @@ class RgbdOdometry:
 
     def _start(self, frame: Frame) -> TrackResult:
         """Begins the map with a frame, or waits for one that shows anything."""
-        if self._motion is None:
-            self._motion = Motion(frame.stamp, np.eye(4), np.zeros(6))
+        if self.state.motion is None:
+            self.state.motion = Motion(frame.stamp, np.eye(4), np.zeros(6))
         else:
-            spread = self._motion.spread(frame.stamp, self.config.acceleration, self.config.angular_acceleration)
-            self._covariance = self._covariance + spread
-            self._motion = self._motion.guessed(frame.stamp, self._motion.T_world_camera)
-            self._map.keyframes.clear()
+            spread = self.state.motion.spread(frame.stamp, self.config.acceleration, self.config.angular_acceleration)
+            self.state.covariance = self.state.covariance + spread
+            self.state.motion = self.state.motion.guessed(frame.stamp, self.state.motion.T_world_camera)
+            self.state.map.keyframes.clear()
         keyframe = self._keyframe(frame, None)
-        self._map.add(keyframe)
+        self.state.map.add(keyframe)
         if keyframe.empty:
             return self._result(Status.LOST, f"nothing seen yet: {frame.flaws}", None, keyframe=False)
-        self._motion = Motion(frame.stamp, self._motion.T_world_camera, np.zeros(6))
+        self.state.motion = Motion(frame.stamp, self.state.motion.T_world_camera, np.zeros(6))
         return self._result(Status.TRACKING, "the first view", None, keyframe=True)
 
     def _follow(self, frame: Frame, T_predicted: Matrix) -> Sighting | None:
         """Tracks the newest keyframe's corners from where the prediction puts them."""
-        keyframe = self._map.newest
+        keyframe = self.state.map.newest
         if frame.image_flaw is not None or len(keyframe.points) < self.config.min_inliers:
             return None
         T_color_world = self.camera.T_color_depth @ invert(T_predicted)
@@ -123,51 +117,51 @@ class RgbdOdometry:
 
     @property
     def _fitter(self) -> Fitter:
-        return Fitter(self._working, self.config, self._noise)
+        return Fitter(self._working, self.config, self.state.noise)
 
     def _refine(self, frame: Frame, sighting: Sighting | None, T_predicted: Matrix, known: Keyframe) -> Fit:
         """Refines a pose against the surfaces of a keyframe's segment."""
-        assert self._motion is not None
-        return self._fitter.refine(frame, sighting, self._motion, T_predicted, self._map, known.segment)
+        assert self.state.motion is not None
+        return self._fitter.refine(frame, sighting, self.state.motion, T_predicted, self.state.map, known.segment)
 
     def _measured(self, frame: Frame, fit: Fit) -> bool:
         """Returns whether a fit counts: after a gap, when it may be at a place that looks alike, with more evidence."""
-        assert self._motion is not None
-        gap = self._motion.blind_s + (frame.stamp - self._motion.stamp) * 1e-9 > self.config.patience_s
+        assert self.state.motion is not None
+        gap = self.state.motion.blind_s + (frame.stamp - self.state.motion.stamp) * 1e-9 > self.config.patience_s
         if gap and frame.image_flaw is None and frame.depth_flaw is None:
-            there = [k for k in self._map.keyframes if k.segment == self._map.newest.segment]
+            there = [k for k in self.state.map.keyframes if k.segment == self.state.map.newest.segment]
             return believed(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise) is not None
         return fit.inliers >= self.config.min_inliers or (fit.depth_agrees and fit.weakest_sigma < 0.05)
 
     def _recall(self, frame: Frame, T_predicted: Matrix, *, measured: bool) -> tuple[Fit, Keyframe] | None:
         """Looks for the view in the map: always while nothing is measured, now and then in a new map."""
-        assert self._motion is not None
-        if measured and self._apart_since is None:
-            self._recalls = 0
+        assert self.state.motion is not None
+        if measured and self.state.apart_since is None:
+            self.state.recalls = 0
             return None
-        self._recalls += 1
-        waits = measured and not recall_due(frame.stamp, self._apart_since, self._recalls)
+        self.state.recalls += 1
+        waits = measured and not recall_due(frame.stamp, self.state.apart_since, self.state.recalls)
         if frame.image_flaw is not None or waits:
             return None
-        others = self._map.elsewhere if measured else self._map.keyframes
-        chosen = candidates(others, T_predicted, RECALL_NEAR, RECALL_OTHERS, self._recalls)
-        for found, known in recognised(frame, chosen, self._fitter, self._motion, T_predicted, self._map):
-            here = known.segment == self._map.newest.segment
+        others = self.state.map.elsewhere if measured else self.state.map.keyframes
+        chosen = candidates(others, T_predicted, RECALL_NEAR, RECALL_OTHERS, self.state.recalls)
+        for found, known in recognised(frame, chosen, self._fitter, self.state.motion, T_predicted, self.state.map):
+            here = known.segment == self.state.map.newest.segment
             if not here or self._plausible(frame.stamp, found.T_world_camera, T_predicted):
                 return found, known
         return None
 
     def _followed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Takes up a pose that was measured against the newest keyframes."""
-        assert self._motion is not None
-        T, newest = fit.T_world_camera, self._map.newest
-        if self._motion.blind_s > self.config.patience_s:
-            self._try(frame.stamp, frame.stamp, self._motion.predict(frame.stamp, self.config.decay_s), T)
-        status = Status.RELOCALISED if self._motion.blind_s > self.config.patience_s else Status.TRACKING
-        self._motion = self._motion.measured(frame.stamp, T)
-        self._noise = fit.noise
+        assert self.state.motion is not None
+        T, newest = fit.T_world_camera, self.state.map.newest
+        if self.state.motion.blind_s > self.config.patience_s:
+            self._try(frame.stamp, frame.stamp, self.state.motion.predict(frame.stamp, self.config.decay_s), T)
+        status = Status.RELOCALISED if self.state.motion.blind_s > self.config.patience_s else Status.TRACKING
+        self.state.motion = self.state.motion.measured(frame.stamp, T)
+        self.state.noise = fit.noise
         covariance, sunk = carried(newest, T)
-        self._covariance = covariance + fit.covariance
+        self.state.covariance = covariance + fit.covariance
         keyframe = self._new_keyframe(frame, fit, sunk)
         return self._placed(status, _support(frame, fit), fit, keyframe)
 
@@ -175,77 +169,77 @@ class RgbdOdometry:
         self, frame: Frame, tracked: Fit | None, T_predicted: Matrix, found: Fit, known: Keyframe
     ) -> TrackResult:
         """Takes up a pose that was found among older keyframes, and a new map that is `tracked` meanwhile with it."""
-        assert self._motion is not None
-        T, apart = found.T_world_camera, known.segment != self._map.newest.segment
-        since = self._apart_since if apart and tracked is not None else None
+        assert self.state.motion is not None
+        T, apart = found.T_world_camera, known.segment != self.state.map.newest.segment
+        since = self.state.apart_since if apart and tracked is not None else None
         before = T_predicted if tracked is None else tracked.T_world_camera
         self._try(frame.stamp if since is None else since, frame.stamp, before, T)
         if apart:
             if tracked is not None:
-                self._map.join(known, T @ invert(tracked.T_world_camera))
+                self.state.map.join(known, T @ invert(tracked.T_world_camera))
             else:
-                self._map.drop_newest_segment(known)
-            self._apart_since = None
-        self._recalls = 0
-        self._motion = Motion(frame.stamp, T, np.zeros(6))
+                self.state.map.drop_newest_segment(known)
+            self.state.apart_since = None
+        self.state.recalls = 0
+        self.state.motion = Motion(frame.stamp, T, np.zeros(6))
         covariance, sunk = carried(known, T)
-        self._covariance = covariance + found.covariance
+        self.state.covariance = covariance + found.covariance
         keyframe = self._new_keyframe(frame, found, sunk)
         return self._placed(Status.RELOCALISED, f"the map found again by {found.inliers} features", found, keyframe)
 
     def _try(self, since: int, stamp: int, T_before: Matrix, T_found: Matrix) -> None:
         """Puts a place that is found on trial: what was placed since a stamp rests on it."""
-        assert self._motion is not None
-        spread = self._motion.spread(stamp, self.config.acceleration, self.config.angular_acceleration)
-        covariance = moved_covariance(self._covariance, self._motion.T_world_camera, T_before) + spread
-        running = [trial for trial in self._trials if not trial.over(stamp)]
-        self._trials = with_trial(running, Trial.of(since, stamp, T_before, covariance, T_found))
+        assert self.state.motion is not None
+        spread = self.state.motion.spread(stamp, self.config.acceleration, self.config.angular_acceleration)
+        covariance = moved_covariance(self.state.covariance, self.state.motion.T_world_camera, T_before) + spread
+        running = [trial for trial in self.state.trials if not trial.over(stamp)]
+        self.state.trials = with_trial(running, Trial.of(since, stamp, T_before, covariance, T_found))
 
     def _contradicted(self, frame: Frame, fit: Fit) -> tuple[Trial, ...]:
         """Returns the first place on trial that this view, as those just before, contradicts, and any found since."""
         if frame.flaws:
             return ()
-        segment, heard = self._map.newest.segment, []
-        for trial in self._trials:
+        segment, heard = self.state.map.newest.segment, []
+        for trial in self.state.trials:
             if not trial.over(frame.stamp):
-                there = [k for k in self._map.keyframes if k.segment == segment and k.stamp < trial.since]
+                there = [k for k in self.state.map.keyframes if k.segment == segment and k.stamp < trial.since]
                 says = contradicted(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise)
                 heard.append(trial if says is None else trial.heard(says))
-        self._trials = tuple(heard)
+        self.state.trials = tuple(heard)
         first = next((k for k, trial in enumerate(heard) if trial.failed), len(heard))
-        return self._trials[first:]
+        return self.state.trials[first:]
 
     def _taken_back(self, frame: Frame, fit: Fit, trials: tuple[Trial, ...]) -> TrackResult:
         """Takes back places and all that rests on them: a new map, at the pose as it would be without them."""
-        segment = self._map.unused_segment
-        self._map.part(trials, segment)
-        T, self._covariance = taken_back(trials, frame.stamp, fit.T_world_camera, self._covariance)
-        self._motion = Motion(frame.stamp, T, np.zeros(6))
-        self._map.add(replace(self._keyframe(frame, None), segment=segment))
-        self._apart_since, self._recalls = frame.stamp, 0
-        self._trials = self._trials[: -len(trials)]
+        segment = self.state.map.unused_segment
+        self.state.map.part(trials, segment)
+        T, self.state.covariance = taken_back(trials, frame.stamp, fit.T_world_camera, self.state.covariance)
+        self.state.motion = Motion(frame.stamp, T, np.zeros(6))
+        self.state.map.add(replace(self._keyframe(frame, None), segment=segment))
+        self.state.apart_since, self.state.recalls = frame.stamp, 0
+        self.state.trials = self.state.trials[: -len(trials)]
         reason = f"{trials[0].against} views contradict the place that was found: taken back"
         since = min(trial.since for trial in trials)
         return replace(self._result(Status.LOST, reason, fit, keyframe=True), taken_back=since)
 
     def _guessed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Goes on by the motion so far, and begins a new map where the old one stays out of sight."""
-        assert self._motion is not None
-        before, config = self._motion, self.config
+        assert self.state.motion is not None
+        before, config = self.state.motion, self.config
         # Depth that fits still holds the directions that it measures; the prediction fills in the others.
         T = fit.T_world_camera if fit.depth_agrees else before.predict(frame.stamp, config.decay_s)
-        self._motion = before.guessed(frame.stamp, T)
+        self.state.motion = before.guessed(frame.stamp, T)
         spread = before.spread(frame.stamp, config.acceleration, config.angular_acceleration)
-        self._covariance = moved_covariance(self._covariance, before.T_world_camera, T) + spread
+        self.state.covariance = moved_covariance(self.state.covariance, before.T_world_camera, T) + spread
         reason = frame.flaws or f"{fit.inliers} corners agree, and depth does not determine the pose"
-        if self._motion.blind_s <= config.patience_s:
+        if self.state.motion.blind_s <= config.patience_s:
             return self._result(Status.PREDICTED, reason, fit, keyframe=False)
         if frame.image_flaw is None:
             fresh = self._keyframe(frame, None)
             if len(fresh.points) >= 2 * config.min_inliers:
-                self._map.add(replace(fresh, segment=self._map.unused_segment))
-                self._apart_since = frame.stamp
-                self._motion = Motion(frame.stamp, T, np.zeros(6))
+                self.state.map.add(replace(fresh, segment=self.state.map.unused_segment))
+                self.state.apart_since = frame.stamp
+                self.state.motion = Motion(frame.stamp, T, np.zeros(6))
                 return self._result(Status.LOST, "nothing here is in the map: a new one begins", fit, keyframe=True)
         return self._result(Status.LOST, reason, fit, keyframe=False)
 
@@ -253,7 +247,7 @@ class RgbdOdometry:
 
     def _new_keyframe(self, frame: Frame, fit: Fit, sunk: Vector) -> bool:
         """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest."""
-        newest, surface = self._map.newest, fit.movers.left_out_of(frame.surface)
+        newest, surface = self.state.map.newest, fit.movers.left_out_of(frame.surface)
         baseline = view_distance(newest.T_world_camera, fit.T_world_camera, surface.typical_depth)
         moved = baseline > self.config.keyframe_distance or (fit.compared > 0 and fit.compared < 0.5 * fit.offered)
         starved = fit.inliers < max(0.4 * len(newest.points), 3 * self.config.min_inliers) or fit.recognised
@@ -265,25 +259,25 @@ class RgbdOdometry:
         richer = len(candidate.points) > 1.5 * fit.inliers + self.config.min_inliers
         due = richer or ((moved or better) and len(candidate.points) >= fit.inliers)
         if due:
-            self._map.add(replace(candidate, sunk=sunk))
+            self.state.map.add(replace(candidate, sunk=sunk))
         return due
 
     def _keyframe(self, frame: Frame, fit: Fit | None) -> Keyframe:
         """Makes a keyframe of a frame: the corners that agree with its fit, and new ones."""
-        assert self._motion is not None
-        T, config = self._motion.T_world_camera, self.config
+        assert self.state.motion is not None
+        T, config = self.state.motion.T_world_camera, self.config
         shape = frame.surface.inverse_depth.shape
         movers = fit.movers if fit else Movers.none(frame.surface.K, (shape[0], shape[1]))
         layers = self._layers(frame, T)
         none = Corners(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, np.int64))
         kept = none if fit is None else self._agreeing(fit, T)
-        kept = renewed(kept, layers, config.near, config.far, config.depth_noise, self._noise.depth)
+        kept = renewed(kept, layers, config.near, config.far, config.depth_noise, self.state.noise.depth)
         found = kept
         if frame.image_flaw is None:
             found = with_new(frame.gray, kept, config.corners, layers, config.near, config.far, movers)
-        segment = self._map.newest.segment if self._map.keyframes else 0
+        segment = self.state.map.newest.segment if self.state.map.keyframes else 0
         return Keyframe(
-            frame.stamp, T, self._covariance, frame.gray, movers.left_out_of(frame.surface),
+            frame.stamp, T, self.state.covariance, frame.gray, movers.left_out_of(frame.surface),
             found.pixels, found.points, found.ages, segment,
         )  # fmt: skip
 
@@ -292,9 +286,9 @@ class RgbdOdometry:
         patches = replace(self._working, K_depth=frame.surface.K)
         if frame.depth_flaw is None:
             return [(self._working, frame.depth), (patches, frame.surface.depth)]
-        if not self._map.keyframes:
+        if not self.state.map.keyframes:
             return []
-        return [(patches, self._map.rendered(T_world_camera, frame.surface).depth)]
+        return [(patches, self.state.map.rendered(T_world_camera, frame.surface).depth)]
 
     def _agreeing(self, fit: Fit, T_world_camera: Matrix) -> Corners:
         """Returns the tracked corners that fit the refined pose and do not move."""
@@ -305,48 +299,34 @@ class RgbdOdometry:
         ahead = points[:, 2] > self.config.near
         color = transform_points(self.camera.T_color_depth, np.where(ahead[:, None], points, 1.0))
         error = project(color, self._working.K_color) - sighting.pixels
-        agree = ahead & (np.einsum("ij,ij->i", error, error) < 9.0 * self._noise.pixel**2)
+        agree = ahead & (np.einsum("ij,ij->i", error, error) < 9.0 * self.state.noise.pixel**2)
         agree[agree] &= ~fit.movers.hold(points[agree])
         return Corners(sighting.pixels[agree], points[agree], sighting.ages[agree])
 
     def _plausible(self, stamp: int, T_world_camera: Matrix, T_predicted: Matrix) -> bool:
         """Returns whether the camera can have come that far since it was last measured."""
-        assert self._motion is not None
-        reach = 0.3 + TOP_SPEED * (self._motion.blind_s + (stamp - self._motion.stamp) * 1e-9)
+        assert self.state.motion is not None
+        reach = 0.3 + TOP_SPEED * (self.state.motion.blind_s + (stamp - self.state.motion.stamp) * 1e-9)
         return bool(np.linalg.norm(T_world_camera[:3, 3] - T_predicted[:3, 3]) < reach)
 
     # -- results and state -------------------------------------------------------------------------------
 
-    def snapshot(self) -> State:
-        """Returns all that the next result depends on, as immutable values of plain arrays; it pickles."""
-        return State(
-            self._motion, self._covariance, tuple(self._map.keyframes), self._shapes,
-            self._noise, self._watch, self._recalls, self._apart_since, self._trials,
-        )  # fmt: skip
-
-    def restore(self, state: State) -> None:
-        """Goes on from a snapshot of an odometry with the same camera and configuration."""
-        self._motion, self._covariance, self._shapes = state.motion, state.covariance, state.shapes
-        self._noise, self._watch = state.noise, state.watch
-        self._recalls, self._apart_since, self._trials = state.recalls, state.apart_since, state.trials
-        self._map.keyframes = list(state.keyframes)
-
     def _placed(self, status: Status, reason: str, fit: Fit, keyframe: bool) -> TrackResult:
         """Returns the result of a measured pose; in a new map it is not known where that is in the old one."""
-        assert self._motion is not None
-        if self._apart_since is None:
+        assert self.state.motion is not None
+        if self.state.apart_since is None:
             return self._result(status, reason, fit, keyframe)
-        lost = self._motion.stamp - self._apart_since < self.config.give_up_s * 1e9
+        lost = self.state.motion.stamp - self.state.apart_since < self.config.give_up_s * 1e9
         reason += "; a new map, its place in the old one unknown"
         return self._result(Status.LOST if lost else status, reason, fit, keyframe)
 
     def _result(self, status: Status, reason: str, fit: Fit | None, keyframe: bool) -> TrackResult:
-        assert self._motion is not None
+        assert self.state.motion is not None
         return TrackResult(
-            stamp=self._motion.stamp,
-            T_world_camera=self._motion.T_world_camera.copy(),
-            covariance=self._covariance.copy(),
-            velocity=self._motion.velocity.copy(),
+            stamp=self.state.motion.stamp,
+            T_world_camera=self.state.motion.T_world_camera.copy(),
+            covariance=self.state.covariance.copy(),
+            velocity=self.state.motion.velocity.copy(),
             status=status,
             reason=reason,
             inliers=fit.inliers if fit else 0,
@@ -363,11 +343,13 @@ class RgbdOdometry:
             if min(shape[:2]) < 32:
                 raise ValueError(f"{name} must be at least 32 x 32 pixels, got {shape}")
         shapes = (image.shape[:2], depth.shape)
-        if self._shapes not in (None, shapes):
-            raise ValueError(f"image and depth sizes changed from {self._shapes} to {shapes}: one camera, one size")
-        if self._motion is not None and stamp <= self._motion.stamp:
-            raise ValueError(f"stamp {stamp} ns does not follow the last frame's {self._motion.stamp} ns")
-        self._shapes = shapes
+        if self.state.shapes not in (None, shapes):
+            raise ValueError(
+                f"image and depth sizes changed from {self.state.shapes} to {shapes}: one camera, one size"
+            )
+        if self.state.motion is not None and stamp <= self.state.motion.stamp:
+            raise ValueError(f"stamp {stamp} ns does not follow the last frame's {self.state.motion.stamp} ns")
+        self.state.shapes = shapes
 
 
 def _support(frame: Frame, fit: Fit) -> str:

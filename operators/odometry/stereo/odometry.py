@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from dataflow.messages import CameraInfo, Diagnostics, Image, Odometry
-from dataflow.operator import In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.stereo import rectified_pair
 from operators.odometry.emission import outputs
 from operators.odometry.stereo.adjustment import StereoRig
-from operators.odometry.stereo.memory import from_plain, to_plain
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.stereo.tracker import StereoOdometry, StereoState
+
+
+@dataclass
+class State(Counts):
+    """Holds what the odometry remembers, and counts frames by status."""
+
+    odometry: StereoState = field(default_factory=StereoState)
 
 
 class StereoVisualOdometry(Operator):
@@ -49,37 +54,24 @@ class StereoVisualOdometry(Operator):
     give_up: float = Param(2.0, ge=0, doc="time in a new map until it counts as tracking although apart", unit="s")
     keyframes: int = Param(30, ge=1, doc="pairs kept to find the place again")
 
+    state: State
     _tracker: StereoOdometry | None = None
     _calibration: tuple[CameraInfo, CameraInfo] | None = None
-    _restored: StereoState | None = None
-
-    def setup(self) -> None:
-        self._frames: Counter[str] = Counter()
 
     def process(self, left: Image, right: Image, left_info: CameraInfo, right_info: CameraInfo) -> dict[str, Any]:
         """Raises ValueError where an image does not fit its calibration, that changes, or holds no baseline."""
         check_calibration("left", left, left_info)
         check_calibration("right", right, right_info)
-        result = self._tracking(left_info, right_info).track(left.data, right.data, left.stamp)
-        self._frames[result.status.value] += 1
+        tracker = self._tracking(left_info, right_info)
+        result = tracker.track(left.data, right.data, left.stamp)
+        self.state.odometry = tracker.state
+        self.state.counts[result.status.value] += 1
         return outputs(result, self.odometry_frame, left.frame)
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew, so nothing before it can be compared with."""
-        self._tracker = self._calibration = self._restored = None
-
-    def snapshot(self) -> Mapping[str, Any]:
-        state = self._restored if self._tracker is None else self._tracker.snapshot()
-        return {} if state is None else to_plain(state) | {"frames": dict(self._frames)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Taken up with the first pair, which brings the calibration."""
-        self._restored = from_plain(state) if state else None
-        self._frames = Counter({status: int(count) for status, count in state.get("frames", {}).items()})
-
-    def summary(self) -> Mapping[str, float | int]:
-        """Returns the number of frames of each status."""
-        return dict(self._frames)
+        super().on_reset(input)
+        self._tracker = self._calibration = None
 
     def _tracking(self, left_info: CameraInfo, right_info: CameraInfo) -> StereoOdometry:
         """The tracker, made for the first calibration, which later ones must repeat."""
@@ -94,9 +86,7 @@ class StereoVisualOdometry(Operator):
                 keyframes=self.keyframes,
             )
             self._tracker = StereoOdometry(rig_of(left_info, right_info), config)
-            if self._restored is not None:
-                self._tracker.restore(self._restored)
-                self._restored = None
+            self._tracker.state = self.state.odometry
         elif self._calibration is None or any(a is not b for a, b in zip(self._calibration, given, strict=True)):
             self._tracker.rig.check_same(rig_of(*given))
         self._calibration = given

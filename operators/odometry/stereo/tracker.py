@@ -33,16 +33,16 @@ TOP_SPEED = 3.0  # m/s beyond the last speed that a pose which is recognised in 
 
 @dataclass(frozen=True, eq=False)
 class StereoState:
-    """Holds what an odometry remembers between frames."""
+    """Holds what an odometry remembers between frames; immutable, as its parts are."""
 
-    motion: Motion | None
-    covariance: Matrix
-    left: Gray | None  # the last left image that was used
-    watch: Watches
-    poses: NDArray[np.float64]  # (W, 4, 4) T_world_camera of the window
-    points: Points  # (M, 3) in the world
-    pixels: Pixels  # (M, 2) where the last image shows them
-    seen: Sightings
+    motion: Motion | None = None
+    covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
+    left: Gray | None = None  # the last left image that was used
+    watch: Watches = (Watch(), Watch())
+    poses: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # T_world_camera of the window
+    points: Points = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) in the world
+    pixels: Pixels = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) where the last image shows them
+    seen: Sightings = field(default_factory=Sightings.none)
     offset: float = 0.0  # pixels that right columns are off by
     map: StereoMap = field(default_factory=StereoMap)
 
@@ -54,18 +54,18 @@ class StereoOdometry:
         self.rig = rig
         self.config = config or StereoOdometryConfig()
         self._relocalizer = StereoRelocalizer(rig)
-        self._state = _empty()
+        self.state = StereoState()
 
     def track(self, left: NDArray[np.uint8], right: NDArray[np.uint8], stamp: int) -> TrackResult:
         """Returns the pose of the next pair: two (H, W) or (H, W, 3) RGB uint8 images, nanoseconds.
 
         Raises ValueError for a wrong shape or type, a size that changed, or a stamp that does not increase.
         """
-        pair = observe(left, right, stamp, self._state.watch)
+        pair = observe(left, right, stamp, self.state.watch)
         self._check(pair)
-        self._state = state = replace(self._state, watch=pair.watches)
+        self.state = state = replace(self.state, watch=pair.watches)
         if state.motion is None:
-            self._state = replace(state, motion=Motion(stamp, np.eye(4), np.zeros(6)))
+            self.state = replace(state, motion=Motion(stamp, np.eye(4), np.zeros(6)))
             return self._begin(pair, Status.TRACKING, "the first view")
         T_predicted = state.motion.predict(stamp, self.config.decay_s)
         T, agree, pixels, reason = None, np.zeros(0, np.bool_), state.pixels, pair.flaw or "nothing seen yet"
@@ -86,12 +86,12 @@ class StereoOdometry:
     # -- the steps ---------------------------------------------------------------------------------------
 
     def _follow(self, last: Gray, gray: Gray, T_predicted: Matrix) -> tuple[Pixels, Mask]:
-        guess = self.rig.project(transform_points(invert(T_predicted), self._state.points))[:, :2]
-        return track_both_ways(last, gray, self._state.pixels, guess, back=0.7)
+        guess = self.rig.project(transform_points(invert(T_predicted), self.state.points))[:, :2]
+        return track_both_ways(last, gray, self.state.pixels, guess, back=0.7)
 
     def _solve(self, pixels: Pixels, found: Mask, T_predicted: Matrix) -> tuple[Matrix | None, Mask]:
         chosen, agree = np.flatnonzero(found), np.zeros(len(found), np.bool_)
-        solution = solved(self._state.points[chosen], pixels[chosen], self.rig.K, GATE, self.config.min_inliers)
+        solution = solved(self.state.points[chosen], pixels[chosen], self.rig.K, GATE, self.config.min_inliers)
         if solution is None:
             return None, agree
         T, inliers = solution
@@ -100,7 +100,7 @@ class StereoOdometry:
 
     def _measured(self, pair: StereoPair, T_world_camera: Matrix, pixels: Pixels, agree: Mask) -> TrackResult:
         """Adds a frame to the window, adjusts it, and drops what does not fit."""
-        state, config = self._state, self.config
+        state, config = self.state, self.config
         assert state.motion is not None
         kept = np.flatnonzero(agree)
         points, pixels = state.points[kept], pixels[kept]
@@ -118,7 +118,7 @@ class StereoOdometry:
         misfit = max(1.0, float(np.median(adjusted.squared)) / 2.37)
         step = SYSTEMATIC * misfit * np.linalg.inv(adjusted.information + 1e-6 * np.eye(6))
         status = Status.RELOCALISED if self._lost else Status.TRACKING
-        self._state = replace(
+        self.state = replace(
             state,
             covariance=moved_covariance(state.covariance, state.motion.T_world_camera, T) + step,
             motion=state.motion.measured(pair.stamp, T),
@@ -130,18 +130,18 @@ class StereoOdometry:
             seen=seen.of_points(np.flatnonzero(good)),
         )
         self._replenish(pair)
-        if self._state.map.due(T, config.keyframe_distance):
+        if self.state.map.due(T, config.keyframe_distance):
             self._keep(pair)
         count = int(np.count_nonzero(good))
         return self._placed(status, f"{count} corners", count, len(here) / max(len(kept), 1))
 
     def _guessed(self, pair: StereoPair, T: Matrix, reason: str) -> TrackResult:
         """Goes on by the motion so far, and begins a new map where the old one stays out of sight."""
-        state, config = self._state, self.config
+        state, config = self.state, self.config
         assert state.motion is not None
         spread = state.motion.spread(pair.stamp, config.acceleration, config.angular_acceleration)
         covariance = moved_covariance(state.covariance, state.motion.T_world_camera, T) + spread
-        self._state = replace(state, motion=state.motion.guessed(pair.stamp, T), covariance=covariance)
+        self.state = replace(state, motion=state.motion.guessed(pair.stamp, T), covariance=covariance)
         if not self._lost:
             return self._result(Status.PREDICTED, reason, 0, 0.0)
         if pair.flaw is None:
@@ -153,30 +153,30 @@ class StereoOdometry:
         if pair.flaw is not None:
             return self._result(Status.LOST, pair.flaw, 0, 0.0)
         if not self._see_anew(pair):
-            return self._result(Status.LOST, f"{len(self._state.points)} corners seen by both", 0, 0.0)
-        known, T = self._state.map, self._state.poses[-1]
+            return self._result(Status.LOST, f"{len(self.state.points)} corners seen by both", 0, 0.0)
+        known, T = self.state.map, self.state.poses[-1]
         if known.keyframes:
             known = known.begun_anew(pair.stamp)
         else:
-            depths = transform_points(invert(T), self._state.points)[:, 2]
+            depths = transform_points(invert(T), self.state.points)[:, 2]
             known = replace(known, unit=float(np.median(depths)) / TYPICAL)
-        self._state = replace(self._state, map=known)
+        self.state = replace(self.state, map=known)
         self._keep(pair)
-        return self._result(status, reason, len(self._state.points), 1.0)
+        return self._result(status, reason, len(self.state.points), 1.0)
 
     def _see_anew(self, pair: StereoPair) -> bool:
         """Begins the window at the pose so far; returns whether the pair shows enough for that."""
-        state = self._state
+        state = self.state
         assert state.motion is not None
-        T, none = state.motion.T_world_camera, _empty()
-        self._state = replace(
+        T, none = state.motion.T_world_camera, StereoState()
+        self.state = replace(
             state, left=pair.left, poses=T[None], points=none.points, pixels=none.pixels, seen=none.seen
         )
         self._replenish(pair)
-        if len(self._state.points) < self.config.min_inliers:
-            self._state = replace(self._state, left=None)
+        if len(self.state.points) < self.config.min_inliers:
+            self.state = replace(self.state, left=None)
             return False
-        self._state = replace(self._state, motion=Motion(pair.stamp, T, np.zeros(6)))
+        self.state = replace(self.state, motion=Motion(pair.stamp, T, np.zeros(6)))
         return True
 
     # -- finding the place again -------------------------------------------------------------------------
@@ -184,35 +184,35 @@ class StereoOdometry:
     @property
     def _lost(self) -> bool:
         """Returns whether nothing was measured for longer than the patience."""
-        assert self._state.motion is not None
-        return self._state.motion.blind_s > self.config.patience_s
+        assert self.state.motion is not None
+        return self.state.motion.blind_s > self.config.patience_s
 
     def _view(self, pair: StereoPair, T_world_camera: Matrix, segment: int) -> StereoKeyframe:
-        state = self._state
+        state = self.state
         return kept_pair(pair.left, pair.right, pair.stamp, T_world_camera, state.covariance, state.offset, segment)
 
     def _keep(self, pair: StereoPair) -> None:
         """Keeps a pair at its pose; the first since a new map began begins its segment."""
-        known = self._state.map
+        known = self.state.map
         begins = known.apart_since == pair.stamp
         segment = known.unused_segment if begins else known.segment
-        keyframe = self._view(pair, self._state.poses[-1], segment)
-        self._state = replace(self._state, map=known.with_keyframe(keyframe, self.config.keyframes))
+        keyframe = self._view(pair, self.state.poses[-1], segment)
+        self.state = replace(self.state, map=known.with_keyframe(keyframe, self.config.keyframes))
 
     def _believed(self, pair: StereoPair, T_world_camera: Matrix) -> bool:
         """Returns whether a pose counts: after a gap it may be at a place that looks alike."""
-        known = self._state.map
+        known = self.state.map
         if not self._lost or not known.keyframes:
             return True
         return self._relocalizer.believed(self._view(pair, T_world_camera, known.segment), known.keyframes, known.unit)
 
     def _recall(self, pair: StereoPair, T_predicted: Matrix, *, measured: bool) -> FoundAgain | None:
         """Looks for the view in the map: always after a gap, now and then in a new map that is tracked."""
-        known = self._state.map
+        known = self.state.map
         if pair.flaw is not None or not (self._lost or known.apart_since is not None):
             return None
         known = replace(known, recalls=known.recalls + 1)
-        self._state = replace(self._state, map=known)
+        self.state = replace(self.state, map=known)
         tracked = measured and not self._lost
         if tracked and not recall_due(pair.stamp, known.apart_since, known.recalls):
             return None
@@ -230,12 +230,12 @@ class StereoOdometry:
 
     def _supersedes(self, found: FoundAgain, agree: Mask) -> bool:
         """Returns whether a pose that was found has more support than the corners that agree on another."""
-        elsewhere = found.keyframe.segment != self._state.map.segment
+        elsewhere = found.keyframe.segment != self.state.map.segment
         return elsewhere or found.features > int(np.count_nonzero(agree))
 
     def _plausible(self, stamp: int, T_world_camera: Matrix, T_predicted: Matrix) -> bool:
         """Returns whether the camera can have come that far since it was last measured."""
-        motion = self._state.motion
+        motion = self.state.motion
         assert motion is not None
         speed = TOP_SPEED + float(np.linalg.norm(motion.velocity[:3]))
         reach = 0.3 + speed * (motion.blind_s + (stamp - motion.stamp) * 1e-9)
@@ -243,16 +243,16 @@ class StereoOdometry:
 
     def _relocalised(self, pair: StereoPair, T_tracked: Matrix | None, found: FoundAgain) -> TrackResult:
         """Takes up a pose that was found among the pairs kept, and a new map that is tracked meanwhile with it."""
-        state, T, by = self._state, found.T_world_camera, found.keyframe
+        state, T, by = self.state, found.T_world_camera, found.keyframe
         T_known_newest = None if T_tracked is None else T @ invert(T_tracked)
-        self._state = replace(
+        self.state = replace(
             state,
             motion=Motion(pair.stamp, T, np.zeros(6)),
             covariance=moved_covariance(by.covariance, by.T_world_camera, T) + found.covariance,
             map=state.map.placed(by, T_known_newest),
         )
         if not self._see_anew(pair):
-            return self._result(Status.LOST, f"{len(self._state.points)} corners seen by both", 0, 0.0)
+            return self._result(Status.LOST, f"{len(self.state.points)} corners seen by both", 0, 0.0)
         reason = f"the map found again by {found.features} features"
         return self._placed(Status.RELOCALISED, reason, found.features, 1.0)
 
@@ -270,7 +270,7 @@ class StereoOdometry:
 
     def _replenish(self, pair: StereoPair) -> None:
         """Adds corners where the image has none, with their points."""
-        state = self._state
+        state = self.state
         fresh = detect_corners(pair.left, self.config.corners, state.pixels)
         if not len(fresh):
             return
@@ -280,7 +280,7 @@ class StereoOdometry:
         sightings = sightings[found]
         new = transform_points(state.poses[-1], self.rig.triangulate(sightings - [0.0, 0.0, state.offset]))
         first = len(state.points)
-        self._state = replace(
+        self.state = replace(
             state,
             points=np.concatenate([state.points, new]),
             pixels=np.concatenate([state.pixels, sightings[:, :2]]),
@@ -289,17 +289,9 @@ class StereoOdometry:
 
     # -- results and state -------------------------------------------------------------------------------
 
-    def snapshot(self) -> StereoState:
-        """Returns all that the next result depends on, as immutable values of plain arrays."""
-        return self._state
-
-    def restore(self, state: StereoState) -> None:
-        """Goes on from a snapshot of an odometry with the same rig and configuration."""
-        self._state = state
-
     def _placed(self, status: Status, reason: str, inliers: int, matched: float) -> TrackResult:
         """Returns the result of a measured pose; in a new map it is not known where that is in the old one."""
-        since, motion = self._state.map.apart_since, self._state.motion
+        since, motion = self.state.map.apart_since, self.state.motion
         assert motion is not None
         if since is None:
             return self._result(status, reason, inliers, matched)
@@ -308,32 +300,19 @@ class StereoOdometry:
         return self._result(Status.LOST if lost else status, reason, inliers, matched)
 
     def _result(self, status: Status, reason: str, inliers: int, matched: float) -> TrackResult:
-        motion = self._state.motion
+        motion = self.state.motion
         assert motion is not None
         return TrackResult(
-            motion.stamp, motion.T_world_camera.copy(), self._state.covariance.copy(), motion.velocity.copy(),
+            motion.stamp, motion.T_world_camera.copy(), self.state.covariance.copy(), motion.velocity.copy(),
             status, reason, inliers, matched, status in (Status.TRACKING, Status.RELOCALISED),
         )  # fmt: skip
 
     def _check(self, pair: StereoPair) -> None:
-        left, motion = self._state.left, self._state.motion
+        left, motion = self.state.left, self.state.motion
         if left is not None and left.shape != pair.left.shape:
             raise ValueError(f"image size changed from {left.shape} to {pair.left.shape}: one camera, one size")
         if motion is not None and pair.stamp <= motion.stamp:
             raise ValueError(f"stamp {pair.stamp} ns does not follow the last frame's {motion.stamp} ns")
-
-
-def _empty() -> StereoState:
-    return StereoState(
-        None,
-        np.zeros((6, 6)),
-        None,
-        (Watch(), Watch()),
-        np.zeros((0, 4, 4)),
-        np.zeros((0, 3)),
-        np.zeros((0, 2)),
-        Sightings.none(),
-    )
 
 
 def _depth_guess(pixels: Pixels, known: Pixels, points: Points) -> NDArray[np.float64]:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import Remembered
+
 Array = NDArray[np.float64]
 
 _POSE = slice(0, 3)
@@ -20,10 +22,9 @@ class DriveNoise:
     slip: float = 0.006  # metres of one wheel after 1 m of its way; grows with the root of the way
     scale: float = 0.01  # share by which one wheel's radius is off, for ever
     track: float = 0.01  # share by which the distance of the wheels is off, for ever
-    step: float = 0.0  # metres of way between two counts of an encoder
 
 
-class DifferentialDrive:
+class DifferentialDrive(Remembered):
     """Integrates arcs: both wheels roll at constant speeds between two readings, which is exact for such motion.
 
     Slip is fresh at every step. Radii and track are off by the same share for ever, so these errors are states beside
@@ -31,11 +32,14 @@ class DifferentialDrive:
     correction of systematic odometry errors in mobile robots", 1996). Poses are x, y (metres) and yaw (radians).
     """
 
+    pose: Array
+    step: float  # metres of way between two counts of an encoder
+    _spread: Array  # of the pose and of the shares by which left radius, right radius and track are off
+
     def __init__(self, track: float, noise: DriveNoise) -> None:
         self._track, self._noise = track, noise
-        self.pose: Array = np.zeros(3)
-        # of the pose and of the shares by which left radius, right radius and track are off
-        self._spread: Array = np.diag([0.0, 0.0, 0.0, noise.scale**2, noise.scale**2, noise.track**2])
+        self.pose, self.step = np.zeros(3), 0.0
+        self._spread = np.diag([0.0, 0.0, 0.0, noise.scale**2, noise.scale**2, noise.track**2])
 
     def roll(self, left: float, right: float, doubt: float = 0.0) -> None:
         """Moves by what the wheels rolled, metres; `doubt` is a further standard deviation of each."""
@@ -69,7 +73,7 @@ class DifferentialDrive:
 
     def covariance(self) -> Array:
         """Returns that of the pose (3, 3), with the rest of a count that each wheel may have turned since."""
-        rest = self._noise.step**2 / 12
+        rest = self.step**2 / 12
         out = self._spread[_POSE, _POSE].copy()
         out[np.diag_indices(3)] += [rest, rest, 2 * rest / self._track**2]
         return out
@@ -78,17 +82,11 @@ class DifferentialDrive:
         """Returns that of forward speed and turn rate (2, 2) over a step in which the wheels rolled so far, metres."""
         n = self._noise
         rolled = np.abs([left, right])
-        variance = n.slip**2 * rolled + (n.scale * rolled) ** 2 + n.step**2 / 6 + doubt**2
+        variance = n.slip**2 * rolled + (n.scale * rolled) ** 2 + self.step**2 / 6 + doubt**2
         by_wheels = np.array([[0.5, 0.5], [-1 / self._track, 1 / self._track]]) / seconds
         out = (by_wheels * variance) @ by_wheels.T
         out[1, 1] += (n.track * (right - left) / self._track / seconds) ** 2
         return np.asarray(out)
-
-    def snapshot(self) -> dict[str, Array]:
-        return {"pose": self.pose, "spread": self._spread}
-
-    def restore(self, state: dict[str, Array]) -> None:
-        self.pose, self._spread = np.array(state["pose"]), np.array(state["spread"])
 
 
 def _chord(half: float) -> tuple[float, float]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, JointState, Odometry, WheelTicks
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import quaternion_from_yaw
-from dataflow.operator import Duration, In, Operator, Out, Param
+from dataflow.operator import KEPT, Counts, Duration, In, Operator, Out, Param
 from operators.odometry.wheels.differential_drive import DifferentialDrive, DriveNoise
 from operators.odometry.wheels.readings import Reading, reading
 from operators.status import counted_status
@@ -21,6 +21,17 @@ Array = NDArray[np.float64]
 
 UNREADABLE = "unreadable"
 _FLAT = 1e-6  # variance of height, roll and pitch: the floor is taken as flat
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the pose so far, which a reset of the clock leaves, and the last reading: the next is a first one then."""
+
+    drive: DifferentialDrive = field(metadata=KEPT)
+    stamp: int | None = None
+    last: Reading | None = None
+    speed: Array | None = None  # of left and right, m/s; None until two readings tell it
+    step: tuple[Array, float, float] = field(default_factory=lambda: (np.zeros(2), 1.0, 0.0))  # rolled, s, doubt
 
 
 class WheelOdometry(Operator):
@@ -61,80 +72,42 @@ class WheelOdometry(Operator):
     max_acceleration: float = Param(5.0, gt=0, doc="wheels that speed up faster slip", unit="m/s²")
     gap: Duration = Param("500ms", gt=0, doc="readings farther apart leave the way between unknown")
 
-    _drive: DifferentialDrive | None = None
-    _restored: Any = None
-    _stamp: int | None = None
-    _last: Reading | None = None
-    _speed: Array | None = None  # of left and right, m/s; None until two readings tell it
-    _step: tuple[Array, float, float]  # rolled, in seconds, doubted by
+    state: State
 
     def setup(self) -> None:
         """Raises ValueError where a wheel is on both sides."""
         both = set(self.left) & set(self.right)
         if both:
             raise ValueError(f"wheel {min(both)!r} is on both sides")
-        self._counts: Counter[str] = Counter()
-        self._begin()
+
+    def initial_state(self) -> State:
+        noise = DriveNoise(self.slip, self.scale_error, self.track_error)
+        return State(drive=DifferentialDrive(self.track, noise))
 
     def process(self, wheels: WheelTicks | JointState) -> dict[str, Any]:
         """Raises ValueError where a wheel is missing, or its radius or resolution is unspecified."""
         now = reading(wheels, (self.left, self.right), self.radius, self.ticks_per_turn)
-        if self._drive is None:
-            noise = DriveNoise(self.slip, self.scale_error, self.track_error, now.step)
-            self._drive = DifferentialDrive(self.track, noise)
-            if self._restored is not None:
-                self._drive.restore(self._restored)
-        state, level, text = self._move(self._drive, wheels.stamp, now)
-        self._counts[state] += 1
-        status = counted_status("wheel_odometry", wheels.stamp, f"{state}: {text}", level, self._counts)
+        state, level, text = self._move(self.state.drive, wheels.stamp, now)
+        self.state.counts[state] += 1
+        status = counted_status("wheel_odometry", wheels.stamp, f"{state}: {text}", level, self.state.counts)
         if state == UNREADABLE:
             return {"status": status}
-        return {"odometry": self._odometry(self._drive, wheels.stamp), "status": status}
-
-    def on_reset(self, input: str) -> None:
-        """The clock began anew: the next reading is a first one, at the pose so far."""
-        self._stamp = self._last = self._speed = None
-        self._step = (np.zeros(2), 1.0, 0.0)
-
-    def snapshot(self) -> Mapping[str, Any]:
-        last = self._last
-        return {
-            "drive": self._restored if self._drive is None else self._drive.snapshot(),
-            "stamp": self._stamp,
-            "last": None if last is None else [last.rolled, last.speed, last.step],
-            "speed": self._speed,
-            "step": list(self._step),
-            "counts": dict(self._counts),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self._begin()
-        self._restored = state["drive"]
-        self._stamp = state["stamp"]
-        self._last = None if state["last"] is None else Reading(*state["last"])
-        self._speed = state["speed"]
-        rolled, seconds, doubt = state["step"]
-        self._step = (np.array(rolled), float(seconds), float(doubt))
-        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
+        return {"odometry": self._odometry(self.state.drive, wheels.stamp), "status": status}
 
     def summary(self) -> Mapping[str, float | int]:
-        return {f"readings {state}": count for state, count in self._counts.items()}
-
-    def _begin(self) -> None:
-        self._drive = self._restored = self._stamp = self._last = self._speed = None
-        self._step = (np.zeros(2), 1.0, 0.0)
+        return {f"readings {state}": count for state, count in self.state.counts.items()}
 
     def _move(self, drive: DifferentialDrive, stamp: int, now: Reading) -> tuple[str, Level, str]:
         """Takes in a reading; returns its state, how bad that is, and a text."""
         if not now.finite:
             return UNREADABLE, Level.WARN, "the reading is not finite"
-        if self._stamp is None:
-            self._stamp, self._last = stamp, now
-            self._speed = now.speed
+        if self.state.stamp is None:
+            self.state.stamp, self.state.last, self.state.speed = stamp, now, now.speed
+            drive.step = now.step
             return "standing", Level.OK, "the first reading is the origin"
-        seconds = (stamp - self._stamp) * 1e-9
+        seconds = (stamp - self.state.stamp) * 1e-9
         rolled, speed = self._rolled(now, seconds)
-        self._stamp, self._last = stamp, now
+        self.state.stamp, self.state.last = stamp, now
         fastest = float(np.abs(rolled).max()) / seconds
         if fastest > self.max_speed:
             self._coast(drive, seconds)
@@ -143,7 +116,7 @@ class WheelOdometry(Operator):
         slipping = excess > 0 and seconds <= self.gap * 1e-9
         doubt = excess * seconds if slipping else 0.0
         drive.roll(float(rolled[0]), float(rolled[1]), doubt)
-        self._speed, self._step = speed, (rolled, seconds, doubt)
+        self.state.speed, self.state.step = speed, (rolled, seconds, doubt)
         if seconds > self.gap * 1e-9:
             drive.wander(float(np.abs(rolled).mean()) / 2)
             return "after a gap", Level.WARN, f"nothing was heard for {seconds:.2f} s"
@@ -155,28 +128,28 @@ class WheelOdometry(Operator):
 
     def _rolled(self, now: Reading, seconds: float) -> tuple[Array, Array]:
         """Metres that each side rolled since the last reading, and its speed now as far as it is told."""
-        if now.rolled is not None and self._last is not None and self._last.rolled is not None:
-            rolled = now.rolled - self._last.rolled
+        if now.rolled is not None and self.state.last is not None and self.state.last.rolled is not None:
+            rolled = now.rolled - self.state.last.rolled
             return rolled, rolled / seconds
         assert now.speed is not None
-        before = now.speed if self._speed is None else self._speed
+        before = now.speed if self.state.speed is None else self.state.speed
         return (before + now.speed) / 2 * seconds, now.speed
 
     def _excess(self, speed: Array, seconds: float, step: float) -> float:
         """Returns by how much a wheel's speed changed more than the robot can, in m/s; a count more or less is none."""
-        if self._speed is None:
+        if self.state.speed is None:
             return 0.0
-        return float(np.abs(speed - self._speed).max()) - self.max_acceleration * seconds - 2 * step / seconds
+        return float(np.abs(speed - self.state.speed).max()) - self.max_acceleration * seconds - 2 * step / seconds
 
     def _coast(self, drive: DifferentialDrive, seconds: float) -> None:
         """Goes on as before, in doubt of all of it and of a start from rest."""
-        rolled = np.zeros(2) if self._speed is None else self._speed * seconds
+        rolled = np.zeros(2) if self.state.speed is None else self.state.speed * seconds
         doubt = float(np.abs(rolled).max()) + 0.5 * self.max_acceleration * min(seconds, 1.0) ** 2
         drive.roll(float(rolled[0]), float(rolled[1]), doubt)
-        self._step = (rolled, seconds, doubt)
+        self.state.step = (rolled, seconds, doubt)
 
     def _odometry(self, drive: DifferentialDrive, stamp: int) -> Odometry:
-        rolled, seconds, doubt = self._step
+        rolled, seconds, doubt = self.state.step
         x, y, yaw = drive.pose
         left, right = rolled / seconds
         return Odometry(

@@ -61,6 +61,7 @@ def reason(outputs: dict[str, list[Message]]) -> str:
     return status.messages[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("there", [(0.8, 0.4, 2.0), (-1.0, -0.3, -1.0)])
 def test_two_scans_of_a_room_are_registered_without_a_guess(there: tuple[float, float, float]) -> None:
     A, B = at(0.2, 0.1, 0.0), at(*there)
@@ -163,6 +164,7 @@ def test_what_lies_on_a_surface_does_not_hang_in_free_space() -> None:
     assert explained(other, one, invert(A) @ B, Settings(0.5, 1, 0.5, 0.85, 0.04)).violation == 0
 
 
+@pytest.mark.long
 def test_scans_of_different_rooms_fail() -> None:
     other = np.array([[1.0, -1.4, 0.4, 0.3, 0.3, 0.4], [-1.5, 0.5, 0.6, 0.4, 0.2, 0.6]])
     outputs = registered(scan(at(0, 0, 1.0), 2, other, np.array([2.0, 2.6, 1.2])), scan(at(0.2, 0.1, 0), 1))
@@ -171,6 +173,7 @@ def test_scans_of_different_rooms_fail() -> None:
     assert outputs["aligned"] == []
 
 
+@pytest.mark.long
 def test_an_empty_symmetric_room_is_not_believed() -> None:
     nothing = np.zeros((0, 6))
     square = np.array([2.0, 2.0, 1.2])
@@ -191,6 +194,7 @@ def test_a_cloud_that_tells_nothing_fails(points: np.ndarray) -> None:
     assert reason(outputs) == "failed: fewer than 100 voxels with a normal"
 
 
+@pytest.mark.long
 def test_runs_repeat() -> None:
     source, target = scan(at(0.8, 0.4, 2.0), 2), scan(at(0.2, 0.1, 0.0), 1)
     one, two = (registered(source, target, trials=5000) for _ in range(2))

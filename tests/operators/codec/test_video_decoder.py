@@ -102,12 +102,14 @@ def test_the_images_are_the_same_in_every_placement_and_verify(recorded: Path, t
     assert verify(recorded).identical
 
 
+@pytest.mark.long
 def test_a_replay_from_the_middle_goes_on_with_the_same_images(recorded: Path, tmp_path: Path) -> None:
     replay(recorded, placement="one_process", record=tmp_path / "later.mcap", start=(WITHIN - 10**9) * 1e-9)
     whole = images(recorded)
     assert images(tmp_path / "later.mcap") == {stamp: digest for stamp, digest in whole.items() if stamp >= WITHIN}
 
 
+@pytest.mark.long
 def test_a_part_begins_with_a_key_frame_and_gives_the_same_images(recorded: Path, tmp_path: Path) -> None:
     part, fresh = tmp_path / "part.mcap", tmp_path / "fresh.yaml"
     with Origin(recorded) as origin:
@@ -156,6 +158,7 @@ def test_each_camera_of_a_split_part_begins_with_its_key_frame(two: Path, tmp_pa
     assert [packets(part, CAMERAS[1]) for part in parts] == [[*range(5, 13)], [*range(13, 21)], [*range(21, 29)]]
 
 
+@pytest.mark.long
 def test_split_parts_of_two_cameras_verify_and_are_the_whole(two: Path, tmp_path: Path) -> None:
     with Origin(two) as origin:
         parts = [Path(part.path) for part in split(origin, tmp_path / "parts", every=14 * PERIOD)]
@@ -167,6 +170,7 @@ def test_split_parts_of_two_cameras_verify_and_are_the_whole(two: Path, tmp_path
     assert images(tmp_path / "parts") == images(two)
 
 
+@pytest.mark.long
 def test_split_parts_begin_with_key_frames_and_are_the_whole(recorded: Path, tmp_path: Path) -> None:
     with Origin(recorded) as origin:
         parts = list(split(origin, tmp_path, every=10 * PERIOD))

@@ -114,6 +114,7 @@ def called(command: str, *words: str) -> Result:
 # ---- the first command of a user
 
 
+@pytest.mark.long
 def test_a_users_own_folder_becomes_a_detector_that_finds_their_objects(tmp_path: Path) -> None:
     data, out = write_yolo(tmp_path / "mine", 40), tmp_path / "mine.onnx"
     options = ["--epochs", "24", "--batch", "8", "--size", "128x96", "--width", "0.25", "--threads", "1"]
@@ -150,6 +151,7 @@ def test_a_users_own_folder_becomes_a_detector_that_finds_their_objects(tmp_path
     assert near / total > 0.6  # boxes in the pixels of the larger image
 
 
+@pytest.mark.long
 def test_the_terminal_shows_the_score_and_how_to_use_the_file(tmp_path: Path) -> None:
     data, out = write_coco(tmp_path / "mine", 6), tmp_path / "mine.onnx"
     options = [
@@ -177,6 +179,7 @@ def test_the_terminal_shows_the_score_and_how_to_use_the_file(tmp_path: Path) ->
     assert "--resume" in second.stderr
 
 
+@pytest.mark.long
 def test_a_network_is_scored_on_the_images_that_its_own_training_set_aside(tmp_path: Path) -> None:
     file, _ = exported(tmp_path, 2, {"classes": ["crate [old]", "[ball]"], "seed": 5})
     data = write_yolo(tmp_path / "mine", 9)
@@ -542,6 +545,7 @@ def test_the_right_answer_costs_least_and_ignored_objects_nothing() -> None:
     assert ignored < 1e-4 < nothing  # finding it where nothing is costs; where something ignored is, it does not
 
 
+@pytest.mark.long
 def test_training_steps_lower_the_loss_and_do_not_depend_on_the_order_of_objects() -> None:
     torch.manual_seed(0)
     torch.set_num_threads(1)

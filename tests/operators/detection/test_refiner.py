@@ -153,6 +153,7 @@ def test_sides_are_shares_of_the_window() -> None:
 # ---- what it changes
 
 
+@pytest.mark.long
 def test_boxes_that_are_astray_come_to_their_objects(refined: Refined) -> None:
     before, after = [], []
     for seed in range(500, 530):
@@ -282,6 +283,7 @@ def test_the_file_computes_what_the_trained_network_computes(refined: Refined) -
     assert np.abs(there - sides.numpy()).max() < 0.005
 
 
+@pytest.mark.long
 def test_8_bits_leave_the_refiner_as_it_is(refined: Refined, tmp_path: Path) -> None:
     _, file, data = refined
     small = tmp_path / "small.onnx"
@@ -356,6 +358,7 @@ def test_what_is_learned_from_shows_the_objects_mirrored_or_not(refined: Refined
     assert 12 < left < 36  # crates are in the left half, but for the mirror images
 
 
+@pytest.mark.long
 def test_an_interrupted_training_ends_with_the_same_bits(refined: Refined, tmp_path: Path) -> None:
     plain, _, data = refined
     few = DetectionData(data.classes, data.training[:8], data.validation)
@@ -383,6 +386,7 @@ def test_an_interrupted_training_ends_with_the_same_bits(refined: Refined, tmp_p
     assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
 
 
+@pytest.mark.long
 def test_a_refiner_is_not_trained_for_other_classes_nor_resumed_for_another_detector(
     refined: Refined, tmp_path: Path
 ) -> None:

@@ -102,6 +102,7 @@ def test_boxes_are_those_of_each_camera_alone_and_the_network_is_called_once(
     assert rig["detections_4"] == []
 
 
+@pytest.mark.long
 def test_images_of_other_sizes_are_not_given_borders_by_their_neighbours(
     checkpoints: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,6 +188,7 @@ operators:
 """
 
 
+@pytest.mark.long
 def test_a_graph_with_two_cameras_is_recorded_and_verifies(checkpoints: dict[str, str], tmp_path: Path) -> None:
     graph, file = tmp_path / "rig.yaml", tmp_path / "rig.mcap"
     graph.write_text(GRAPH.format(model=SSD, file=checkpoints[SSD]))

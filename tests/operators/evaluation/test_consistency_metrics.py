@@ -118,5 +118,6 @@ def test_a_truth_that_is_not_finite_is_counted_and_the_others_score() -> None:
     assert figures["position_nees_mean"] == pytest.approx(1 / 3)
 
 
+@pytest.mark.long
 def test_equal_poses_give_equal_figures_bit_for_bit() -> None:
     assert figures(1.0) == figures(1.0) != figures(1.01)

@@ -114,6 +114,7 @@ def test_the_absolute_error_is_evos(alignment: Alignment) -> None:
         assert found == pytest.approx(absolute_by_evo(matches, alignment), rel=1e-9, abs=1e-9), name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seconds", "metres"), [(1.0, 0.5), (0.1, 0.2), (0.01, 3.0), (30.0, 1000.0)])
 @pytest.mark.usefixtures("evo")
 def test_the_relative_errors_are_evos(seconds: float, metres: float) -> None:

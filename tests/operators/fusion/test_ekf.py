@@ -26,7 +26,7 @@ from dataflow.operator import Context, ParameterError
 from dataflow.testing import play
 from operators.fusion import EkfFusion
 from operators.geometry.geodesy import earth_centred, east_north_up
-from operators.simulator.gnss import geodetic
+from operators.simulator.sensors.gnss import geodetic
 
 
 def twist(stamp: int, frame: str = "base_link") -> Twist:
@@ -190,13 +190,14 @@ def test_without_inertial_sensor_a_control_input_carries_the_estimate_through_an
         state = operator.snapshot()
         other = EkfFusion(motion="constant_velocity", sensors=operator.sensors)
         other.setup()
+        assert state is not None
         other.restore(state)
         assert other.summary() == operator.summary()
-        assert operator._filter is not None
-        ends.append(float(np.linalg.norm(operator._filter.estimate(stamps[-1])[0].position - circle[-1][:3, 3])))
+        assert operator.state.filter is not None
+        ends.append(float(np.linalg.norm(operator.state.filter.estimate(stamps[-1])[0].position - circle[-1][:3, 3])))
         assert played["odometry"]
     assert ends[0] < 0.1
-    assert operator._filter.estimate(stamps[-1])[0].covariance[0, 0] > 0.1**2
+    assert operator.state.filter.estimate(stamps[-1])[0].covariance[0, 0] > 0.1**2
 
 
 def transform(t: float) -> Array:

@@ -69,11 +69,11 @@ def pose(covariance: Any = None, position: Any = (0, 0, 0)) -> Pose:
 )
 def test_a_message_that_cannot_be_used_is_counted(message: Message, reason: str) -> None:
     operator = begun(x={"sigma": None})
-    assert operator._filter is not None
-    before = operator._filter.estimate(19 * 10**8)[0]
+    assert operator.state.filter is not None
+    before = operator.state.filter.estimate(19 * 10**8)[0]
     process(operator, "x", message)
     assert operator.summary()[f"ignored, robot/x: {reason}"] == 1
-    after = operator._filter.estimate(19 * 10**8)[0]
+    after = operator.state.filter.estimate(19 * 10**8)[0]
     np.testing.assert_array_equal(after.position, before.position)
     np.testing.assert_array_equal(after.covariance, before.covariance)
 
@@ -113,8 +113,8 @@ def test_an_inertial_sample_without_covariance_is_as_good_as_the_last_and_the_fi
     assert isinstance(imu, Imu)
     for k, C in enumerate((None, np.zeros((3, 3)), np.full((3, 3), NAN))):
         process(operator, "imu", imu.replace(stamp=imu.stamp + k * 20_000_000, angular_velocity_covariance=C))
-    assert operator._filter is not None
-    assert np.isfinite(operator._filter.estimate(imu.stamp + 40_000_000)[0].covariance).all()
+    assert operator.state.filter is not None
+    assert np.isfinite(operator.state.filter.estimate(imu.stamp + 40_000_000)[0].covariance).all()
     first = EkfFusion()
     first.setup()
     with pytest.raises(ValueError, match="so gyro_noise must say how good they are"):
@@ -129,8 +129,8 @@ def test_whatever_a_pose_holds_the_estimate_stays_finite(data: st.DataObject) ->
     covariance = np.array(data.draw(st.lists(number, min_size=36, max_size=36))).reshape(6, 6)
     operator = begun(x={"use": "pose"})
     process(operator, "x", pose(covariance, position))
-    assert operator._filter is not None
-    at = operator._filter.estimate(2 * 10**9)[0]
+    assert operator.state.filter is not None
+    at = operator.state.filter.estimate(2 * 10**9)[0]
     assert np.isfinite(at.covariance).all()
     assert np.isfinite(at.position).all()
 

@@ -84,6 +84,15 @@ def test_orthonormalised_is_a_rotation_near_by(x: np.ndarray, seed: int) -> None
     np.testing.assert_allclose(R, T[:3, :3], atol=1e-2)
 
 
+@pytest.mark.long
+def test_the_nearest_rotation_is_never_a_reflection() -> None:
+    rng = np.random.default_rng(1)
+    for M in (*rng.normal(size=(20, 3, 3)), np.diag([1.0, 1.0, -0.01])):
+        R = se3.nearest_rotation(M)
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) > 0
+
+
 def test_covariance_about_fixed_axes_is_that_of_perturbed_poses() -> None:
     rng = np.random.default_rng(3)
     A = rng.normal(0, 0.003, (6, 6))

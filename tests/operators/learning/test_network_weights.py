@@ -48,6 +48,7 @@ def trained(worlds: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_a_training_begins_with_what_the_file_answers(trained: Path, worlds: Path) -> None:
     task = pair(worlds)
     task.begin_with(trained / "detector.onnx")
@@ -95,6 +96,7 @@ def test_the_shipped_networks_in_8_bits_can_be_trained_on(worlds: Path) -> None:
     assert (labels == shown).mean() > 0.95
 
 
+@pytest.mark.long
 def test_a_detector_and_a_segmenter_alone_begin_so_too(trained: Path, worlds: Path, tmp_path: Path) -> None:
     boxes = DetectorTask(read_detection_data(worlds), SIZE, seed=1)
     train(boxes, Settings(epochs=1, batch=4, threads=1), tmp_path / "boxes.onnx")

@@ -10,6 +10,7 @@ import pytest
 from made_room import CELL, Drive, mounts
 
 from dataflow.messages import OccupancyGrid
+from dataflow.state import StateError
 from dataflow.testing import Played, play
 from operators.localization import ParticleFilterLocalizer
 from operators.localization.competing_hypothesis import CompetingHypothesis, apart
@@ -84,14 +85,14 @@ def test_a_known_start_or_a_position_decides() -> None:
 def test_what_is_followed_comes_back_from_a_snapshot() -> None:
     drive = HallDrive(2.0)
     _, operator = localized(drive, {"scan": drive.scans()})
-    rival = operator._fused.competing
+    rival = operator.state.fused.competing
     other = CompetingHypothesis()
     other.restore(rival.snapshot())
     assert other.mean is not None
     np.testing.assert_array_equal(other.mean, rival.mean)
     assert (other.lead, other.decided) == (rival.lead, False)
-    other.restore({})
-    assert other.mean is None
+    with pytest.raises(StateError, match="CompetingHypothesis lacks"):
+        other.restore({})
 
 
 class TwoPlaces:
@@ -151,7 +152,7 @@ def test_places_that_were_decided_against_are_remembered_in_bounded_number() -> 
     competing, rng, observation = CompetingHypothesis(), np.random.default_rng(0), EverNewPlaces(0.0)
     for _ in range(150):
         competing.update(TwoPlaces.here, 0.0, observation, 1.0, False, rng)
-    refuted = competing.snapshot()["refuted"]
+    refuted = competing.snapshot()["_refuted"]
     assert observation.searches > 30
     assert len(refuted) <= 16
     assert refuted[-1, 0] > 5.0 * (observation.searches - 3), "the last ones"

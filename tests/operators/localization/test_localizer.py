@@ -180,8 +180,8 @@ def test_two_plays_give_the_same_digests_and_so_does_one_that_was_interrupted() 
     other.restore(state)
     for filter in (operator, other):
         filter.seed_rng(5)
-        filter._fused.move(np.array([0.1, 0.0, 0.1]), np.eye(3) * 1e-4, filter.rng)
-    assert np.array_equal(operator._fused.cloud()[0], other._fused.cloud()[0])
+        filter.state.fused.move(np.array([0.1, 0.0, 0.1]), np.eye(3) * 1e-4, filter.rng)
+    assert np.array_equal(operator.state.fused.cloud()[0], other.state.fused.cloud()[0])
     assert operator.summary() == other.summary()
 
 

@@ -70,6 +70,7 @@ def digests(results: list[PerceptionResult]) -> dict[str, list[bytes]]:
     return found
 
 
+@pytest.mark.long
 def test_the_results_are_those_of_the_graph_and_the_recording_verifies(room: Room, tmp_path: Path) -> None:
     graph, handed = tmp_path / "graph.mcap", tmp_path / "handed.mcap"
     dataflow.replay(DEMO, graph=REPOSITORY / "graphs" / "perception.yaml", end=END, record=graph)
@@ -88,6 +89,7 @@ def test_the_results_are_those_of_the_graph_and_the_recording_verifies(room: Roo
     assert dataflow.verify(handed).identical
 
 
+@pytest.mark.long
 def test_several_samples_of_one_step_are_taken_at_their_own_stamps(room: Room) -> None:
     stamps = [stamp for stamp, _ in room.given("image")]
     frames = dict(room.given("image", "depth"))

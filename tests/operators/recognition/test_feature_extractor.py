@@ -13,6 +13,7 @@ from dataflow.testing import play
 from operators.recognition import FeatureExtractor
 
 
+@pytest.mark.long
 def test_vectors_have_length_one_and_are_alike_for_alike_things(classifier: Path) -> None:
     shown = [image(picture(shape, 700 + i), i) for i, shape in enumerate(SHAPES * 4)]
     played = play(FeatureExtractor(weights=str(classifier)), {"image": shown})

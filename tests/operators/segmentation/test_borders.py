@@ -191,6 +191,7 @@ def test_of_equal_scores_the_first_class_is_the_best() -> None:
 # ---- the operator and its files
 
 
+@pytest.mark.long
 def test_it_finds_borders_better_than_the_first_look(files: tuple[Path, Path, SegmentationData]) -> None:
     plain, finer, _ = files
     wrong = []
@@ -222,6 +223,7 @@ def test_it_repeats_itself_and_confidence_stays(files: tuple[Path, Path, Segment
     assert np.array_equal(strict.process(image).classes == VOID, second.confidence < np.median(second.confidence))
 
 
+@pytest.mark.long
 def test_8_bits_leave_it_in_the_file(files: tuple[Path, Path, SegmentationData], tmp_path: Path) -> None:
     plain, finer, data = files
     small, smaller = tmp_path / "small.onnx", tmp_path / "smaller.onnx"

@@ -64,6 +64,7 @@ def test_images_that_are_all_for_validation_are_trained_on_and_that_is_said(tmp_
         read_segmentation_data(tmp_path)
 
 
+@pytest.mark.long
 def test_a_folder_of_masks_becomes_a_segmenter(tmp_path: Path) -> None:
     data = read_segmentation_data(write_folder(tmp_path / "data", 20))
     variation = Variation(color=0.1, noise=4, scale=1.2)

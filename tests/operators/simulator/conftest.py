@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from operators.simulator import worlds
+from operators.simulator.worlds import make
 
 
 @pytest.fixture(scope="session", autouse=True)
 def shared_worlds() -> Iterator[None]:
-    made = worlds.make_world
-    worlds.make_world = functools.lru_cache(maxsize=16)(made)
+    made = make.make_world
+    make.make_world = functools.lru_cache(maxsize=16)(made)
     yield
-    worlds.make_world = made
+    make.make_world = made

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from dataflow.messages.geometry import invert
 from operators.simulator.drive import Drive, bumps, sway
-from operators.simulator.frames import mounted
-from operators.simulator.inertial import true_reading
+from operators.simulator.sensors.frames import mounted
+from operators.simulator.sensors.inertial import true_reading
 from operators.simulator.settings import Inertial
 from operators.simulator.trajectory import Trajectory
 
@@ -52,6 +52,7 @@ def test_shakes_are_as_large_as_stated() -> None:
     np.testing.assert_allclose(angles.std(axis=0), 0.1, rtol=0.1)
 
 
+@pytest.mark.long
 def test_integrated_inertial_readings_follow_a_shaken_body() -> None:
     """Strapdown integration in three dimensions, from the true state at the start."""
     drive = Drive(Trajectory(OVAL), [bumps(4, 0.003), sway(4, 0.03, 0.1)])

@@ -84,6 +84,7 @@ def faulty() -> dict[str, list[Any]]:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sensor", PORTS)
 def test_a_frozen_sensor_repeats_its_last_measurement(
     sensor: str, healthy: dict[str, list[Any]], frozen: dict[str, list[Any]]

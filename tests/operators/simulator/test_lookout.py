@@ -9,7 +9,7 @@ from dataflow.messages import Activity, Detections2D, Odometry
 from operators.simulator.lookout import watching
 from operators.simulator.robot import SimulatedRobot
 from operators.simulator.settings import ColorCamera
-from operators.simulator.worlds import make_world
+from operators.simulator.worlds.make import make_world
 
 
 def robot(world: str, seed: int, people: int = 3, **params: object) -> SimulatedRobot:
@@ -28,6 +28,7 @@ def robot(world: str, seed: int, people: int = 3, **params: object) -> Simulated
     return made
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("world", "seed"), [("office", 801), ("corridor", 802), ("table_top", 803), ("yard", 804)])
 def test_who_chooses_and_most_of_what_there_is_to_choose_is_in_view(world: str, seed: int) -> None:
     """The head too, but at the table, where the camera looks down by 18 degrees and the round is near."""
@@ -54,6 +55,7 @@ def test_who_chooses_and_most_of_what_there_is_to_choose_is_in_view(world: str, 
     assert len(seen) >= 5, f"of {sorted(chosen)} only {sorted(seen)}"
 
 
+@pytest.mark.long
 def test_it_stands_still_on_its_round() -> None:
     made = robot("office", 801)
     round_path = make_world("office", 801, speed=0.5, hold=0.0, movers=True, people=3).path

@@ -9,12 +9,12 @@ import pytest
 
 from dataflow.messages.geometry import quaternion_to_matrix
 from operators.simulator import maps
-from operators.simulator.furnishing import FLOOR
-from operators.simulator.native import open3d
+from operators.simulator.rendering.native import open3d
 from operators.simulator.scene import Builder, Light, World
 from operators.simulator.shapes import Array, Material, box, pose, sheet
+from operators.simulator.things.furnishing import FLOOR
 from operators.simulator.trajectory import Trajectory
-from operators.simulator.worlds import NAMES, make_world
+from operators.simulator.worlds.make import NAMES, make_world
 
 BAND = (0.05, 1.5)
 
@@ -49,6 +49,7 @@ def test_cells_are_free_taken_or_never_seen() -> None:
     assert cells_at(grid, free).tolist() == [0] * 4  # below the board too, which hangs above the band
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_the_map_agrees_with_rays_through_the_world(name: str) -> None:
     """Level rays from the path end in taken cells and pass through cells that are not."""
@@ -72,6 +73,7 @@ def test_the_map_agrees_with_rays_through_the_world(name: str) -> None:
     assert hit.all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_points_of_true_surfaces_lie_on_the_true_mesh(name: str) -> None:
     here, o3d = world(name), open3d()

@@ -11,16 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from operators.simulator import corridor, office, table_top, yard
 from operators.simulator.drive import Drive
-from operators.simulator.inertial import true_reading
-from operators.simulator.movers import STANDING, Driving
-from operators.simulator.native import open3d
-from operators.simulator.persons import Person
+from operators.simulator.people.movers import STANDING, Driving
+from operators.simulator.people.persons import Person
+from operators.simulator.rendering.native import open3d
 from operators.simulator.scene import Thing, World
+from operators.simulator.sensors.inertial import true_reading
 from operators.simulator.settings import Inertial
 from operators.simulator.trajectory import Trajectory
-from operators.simulator.worlds import NAMES, make_world
+from operators.simulator.worlds import corridor, office, table_top, yard
+from operators.simulator.worlds.make import NAMES, make_world
 
 ROBOT_RADIUS, ROBOT_HEIGHT = 0.22, 1.3
 OVAL = np.stack([2 * np.cos(np.arange(12) * math.pi / 6), np.sin(np.arange(12) * math.pi / 6)], axis=1)
@@ -60,6 +60,7 @@ def test_too_few_waypoints_are_refused() -> None:
         Trajectory([(0, 0), (1, 0), (0, 1)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_speed_and_turning_stay_within_limits(name: str) -> None:
     for seed in range(2):
@@ -96,6 +97,7 @@ def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> 
     np.testing.assert_allclose(p, expected, atol=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [0, 3])
 def test_the_robot_touches_nothing(name: str, seed: int) -> None:
@@ -124,6 +126,7 @@ def unfurnished(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "decorate", lambda *args, **kwargs: None)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("unfurnished")
 @pytest.mark.parametrize(("name", "seeds"), [("office", 15), ("corridor", 4), ("table_top", 4), ("yard", 4)])
 def test_lanes_lie_apart_and_off_the_path_of_the_robot(name: str, seeds: int) -> None:
@@ -135,6 +138,7 @@ def test_lanes_lie_apart_and_off_the_path_of_the_robot(name: str, seeds: int) ->
             assert all(lane.apart(other) > 0 for other in here.lanes[k + 1 :]), (seed, lane.mover)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("unfurnished")
 @pytest.mark.parametrize(("name", "seeds"), [("office", 12), ("corridor", 4), ("table_top", 4), ("yard", 3)])
 def test_a_tour_keeps_off_all_lanes_and_crosses_itself(name: str, seeds: int) -> None:
@@ -152,6 +156,7 @@ def test_a_tour_keeps_off_all_lanes_and_crosses_itself(name: str, seeds: int) ->
         assert turned[same].max() > {"table_top": 0.1}.get(name, 3.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_a_tour_touches_nothing_and_stays_within_limits(name: str) -> None:
     here = make_world(name, 1, speed=0.5, hold=0.0, movers=True, people=4, tour=True)
@@ -167,6 +172,7 @@ def test_a_tour_touches_nothing_and_stays_within_limits(name: str) -> None:
     assert np.abs(motion.yaw_rate).max() < math.radians(45)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("unfurnished")
 @pytest.mark.parametrize(("name", "seeds"), [("office", 6), ("corridor", 3), ("table_top", 3), ("yard", 2)])
 def test_movers_never_meet(name: str, seeds: int) -> None:
@@ -181,6 +187,7 @@ def test_movers_never_meet(name: str, seeds: int) -> None:
                 assert gap > (0.7 if {first.label, second.label} <= {"person", "robot"} else 0.4), (seed, first.label)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [0, 3])
 def test_movers_keep_to_their_lanes(name: str, seed: int) -> None:
@@ -193,6 +200,7 @@ def test_movers_keep_to_their_lanes(name: str, seed: int) -> None:
                 assert lane.holds(thing.vertices(t)[:, :2]), (thing.label, t)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "seed"), [("office", 0), ("office", 2), ("office", 5), ("table_top", 1), ("corridor", 0)]
 )
@@ -224,6 +232,7 @@ def triangles_of(thing: Thing) -> np.ndarray:
     return np.concatenate([patch.triangles + first for patch, first in zip(patches, firsts, strict=False)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_movers_never_jump_and_never_sink_into_the_floor(name: str) -> None:
     for thing in world(name, 0).things:

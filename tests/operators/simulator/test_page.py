@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from operators.simulator import events, settings
 from operators.simulator.classes import ACTIVITIES, THINGS, VOID
 from operators.simulator.relations import PLACEMENT, SPATIAL
-from operators.simulator.worlds import NAMES
+from operators.simulator.worlds.make import NAMES
 
 PAGE = (Path(__file__).parents[3] / "docs" / "simulator.md").read_text(encoding="utf-8")
 SECTIONS: dict[str, type[BaseModel]] = {

@@ -68,6 +68,7 @@ def test_every_declared_port_is_fed_when_everything_is_on(everything: dict[str, 
     assert set(everything) == set(SimulatedRobot.spec.outputs)
 
 
+@pytest.mark.long
 def test_fresh_processes_make_the_same_bytes_with_one_thread_and_with_two(
     everything: dict[str, list[Message]],
 ) -> None:
@@ -101,6 +102,7 @@ def test_a_robot_set_up_twice_makes_the_same_bytes_again() -> None:
 NO_CAMERAS: dict[str, Any] = {"color_camera": {**SMALL, "rate": 0}, "depth_camera": {"rate": 0}, "truth": QUIET}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sensor", "ports"),
     [
@@ -172,6 +174,7 @@ def test_compressed_streams_decode_to_the_raw_ones(everything: dict[str, list[Me
         assert np.abs(decoded.data.astype(int) - raw.data).mean() < 8
 
 
+@pytest.mark.long
 def test_dropout_loses_its_share_and_outages_all_but_not_the_truth() -> None:
     lossy = run(
         duration="20s", color_camera={"rate": 0}, depth_camera={"rate": 0}, truth=QUIET, movers=False,
@@ -186,6 +189,7 @@ def test_dropout_loses_its_share_and_outages_all_but_not_the_truth() -> None:
     assert len(blind["objects"]) == 5
 
 
+@pytest.mark.long
 def test_delay_shows_what_was_so_long_before() -> None:
     noiseless = {**SMALL, "read_noise": 0.0, "shot_noise": 0.0, "exposure_change": 0.0}
     sharp = camera_only(color_camera=noiseless)["image"]
@@ -224,6 +228,7 @@ def test_black_frames_come_with_their_probability() -> None:
     assert 0.25 < np.mean(dark) < 0.75
 
 
+@pytest.mark.long
 def test_seeds_make_different_worlds() -> None:
     first, second = (camera_only(seed=seed, duration="100ms", color_camera=SMALL)["image"][0] for seed in (0, 1))
     assert np.abs(first.data.astype(int) - second.data).mean() > 10  # type: ignore[attr-defined]

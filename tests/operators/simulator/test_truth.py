@@ -15,18 +15,18 @@ from dataflow.messages import Boxes3D, Detections2D, SceneGraph, SegmentationMap
 from dataflow.messages.geometry import invert, quaternion_to_matrix, transform_points
 from operators.simulator import SimulatedRobot
 from operators.simulator.classes import ACTIVITIES, THINGS
-from operators.simulator.furnishing import FLOOR
-from operators.simulator.furniture import rover
-from operators.simulator.movers import Carried
-from operators.simulator.optics import Optics
-from operators.simulator.persons import Person
+from operators.simulator.people.movers import Carried
+from operators.simulator.people.persons import Person
 from operators.simulator.relations import PLACEMENT, SPATIAL
-from operators.simulator.renderer import Renderer
+from operators.simulator.rendering.optics import Optics
+from operators.simulator.rendering.renderer import Renderer
 from operators.simulator.scene import Builder, Light, Still, World
 from operators.simulator.shapes import Material, bounds, box, pose
+from operators.simulator.things.furnishing import FLOOR
+from operators.simulator.things.furniture import rover
 from operators.simulator.trajectory import Trajectory
 from operators.simulator.truth import masks, velocity
-from operators.simulator.worlds import NAMES, make_world
+from operators.simulator.worlds.make import NAMES, make_world
 
 WORLDS = ("office", "table_top")
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
@@ -55,6 +55,7 @@ def frames(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [step for step in steps if "objects" in step]
 
 
+@pytest.mark.long
 def test_masks_and_boxes_in_the_image_count_the_same_pixels(steps: list[dict[str, Any]]) -> None:
     for step in frames(steps):
         found, mask = step["objects"], step["masks"]
@@ -246,6 +247,7 @@ def test_placement_does_not_depend_on_where_things_are(robot: SimulatedRobot) ->
     assert replace(world, things=tuple(away)).relations(0.0) == world.relations(0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_every_world_has_many_classes_movers_and_goals(name: str) -> None:
     world = make_world(name, 5, speed=0.5, hold=0.0, movers=True)

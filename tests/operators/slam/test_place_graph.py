@@ -12,8 +12,8 @@ from dataflow.messages.geometry import invert
 from operators.geometry.se3 import Matrix
 from operators.slam.keyframe_graph import Node
 from operators.slam.place_graph import PlaceGraph
-from operators.slam.visual_graph import GraphSettings
-from operators.slam.visual_view import Sight
+from operators.slam.visual.graph import GraphSettings
+from operators.slam.visual.view import Sight
 
 
 class Eyes:

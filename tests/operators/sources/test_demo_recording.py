@@ -82,6 +82,7 @@ def alike(a: Message, b: Message) -> bool:
     )
 
 
+@pytest.mark.long
 def test_its_command_makes_nearly_the_same_first_second_on_any_machine(demo: Recording, again: Recording) -> None:
     recorded, made = first_second(demo), first_second(again)
     assert {stream: len(messages) for stream, messages in made.items()} == {s: len(m) for s, m in recorded.items()}

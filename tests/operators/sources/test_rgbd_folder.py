@@ -12,7 +12,6 @@ from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Tran
 from dataflow.messages.geometry import transform_matrix
 from dataflow.operator import ParameterError, SourceError
 from operators.sources import RgbdFolder
-from operators.sources.rgbd_layouts import nearest_rotation
 
 COLOR = np.zeros((6, 8, 3), np.uint8)
 COLOR[..., 0], COLOR[..., 2] = 200, 10  # RGB: reddish
@@ -81,14 +80,6 @@ def test_poses_are_made_rigid(tmp_path: Path) -> None:
     assert isinstance(pose, Pose)
     assert (pose.frame, pose.child_frame) == ("world", "camera_depth_optical")
     np.testing.assert_allclose(pose.matrix(), T_QUARTER, atol=1e-12)
-
-
-def test_the_nearest_rotation_is_never_a_reflection() -> None:
-    rng = np.random.default_rng(1)
-    for M in (*rng.normal(size=(20, 3, 3)), np.diag([1.0, 1.0, -0.01])):
-        R = nearest_rotation(M)
-        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(R) > 0
 
 
 @pytest.mark.parametrize("rate", [30, 29.97, 7])

@@ -42,6 +42,7 @@ def test_a_graph_is_run_and_its_figures_are_printed(tmp_path: Path) -> None:
     assert figures["metrics"]["matched"] == 5
 
 
+@pytest.mark.long
 def test_a_recording_takes_the_place_of_the_sources(tmp_path: Path) -> None:
     (tmp_path / "scored.yaml").write_text(GRAPH)
     recording = tmp_path / "four.mcap"
@@ -107,6 +108,7 @@ def test_a_graph_that_comes_with_dataflow_is_called_by_its_name(monkeypatch: pyt
     assert called[0][4].endswith("graphs/synthetic_rgbd.yaml")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("graph", "parameter", "others"),
     [

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from operators.recognition.activity_model import ActivityModel
-from operators.recognition.activity_score import macro_f1
-from operators.recognition.agent_features import COUNT
-from operators.recognition.episodes import Episode
-from operators.recognition.posture_data import BODY, POSTURES, Postures
-from operators.recognition.posture_model import PostureModel
-from operators.recognition.sensed_people import SensedTrack, write_tracks
-from operators.recognition.silhouette import MIDDLE, SIDE
+from operators.recognition.activity.episodes import Episode
+from operators.recognition.activity.features import COUNT
+from operators.recognition.activity.model import ActivityModel
+from operators.recognition.activity.score import macro_f1
+from operators.recognition.activity.sensed_people import SensedTrack, write_tracks
+from operators.recognition.posture.data import BODY, POSTURES, Postures
+from operators.recognition.posture.model import PostureModel
+from operators.recognition.posture.silhouette import MIDDLE, SIDE
 from operators.simulator.classes import ACTIVITIES
 from operators.training import simulated_postures
 from operators.training.commands import train
@@ -28,7 +28,7 @@ from operators.weights import NetworkFileError, trained_in_simulation
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.learning.balance import class_weights
-    from operators.recognition.posture_training import PostureTask, mirrored
+    from operators.recognition.posture.training import PostureTask, mirrored
 
 
 def made(seed: int) -> Episode:
@@ -186,6 +186,7 @@ def test_the_posture_network_is_trained_scored_and_written(tmp_path: Path) -> No
     np.testing.assert_allclose(model.judge(shapes[1:2].astype(np.float32) / 127)[0], both[1], rtol=1e-4)
 
 
+@pytest.mark.long
 def test_simulated_people_are_seen_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulated_postures, "_LOOKS", 2)
     monkeypatch.setattr(simulated_postures, "_MORE", 0)

@@ -40,6 +40,7 @@ def views(worlds: Path) -> list[NDArray[np.uint8]]:
     return [image.read() for image in read_detection_data(worlds).training]
 
 
+@pytest.mark.long
 def test_a_segmenter_in_8_bits_ends_with_its_scores_and_answers_as_before(
     trained: Path, worlds: Path, tmp_path: Path
 ) -> None:

@@ -111,6 +111,7 @@ def test_given_weights_are_taken_but_for_the_layers_of_other_classes(data: Path,
         task.begin_with({"other": torch.zeros(3)})
 
 
+@pytest.mark.long
 def test_a_run_that_was_resumed_ends_with_the_same_bits(data: Path, tmp_path: Path) -> None:
     settings = Settings(epochs=2, batch=3, threads=1, device="cpu", evaluate_every=2)
 

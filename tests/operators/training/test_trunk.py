@@ -49,6 +49,7 @@ def opened(folder: Path) -> tuple[Network, Network]:
     return open_network(folder / "detector.onnx", "detector"), open_network(folder / "segmenter.onnx", "segmenter")
 
 
+@pytest.mark.long
 def test_both_have_the_trunk_of_the_first_which_answers_as_before(
     apart: Path, tmp_path: Path, noise: NDArray[np.uint8]
 ) -> None:
@@ -84,6 +85,7 @@ def test_a_head_behind_another_range_computes_what_it_did(apart: Path, tmp_path:
         assert np.abs(before - after).max() <= 1.5 * max(step.max(), other.max())
 
 
+@pytest.mark.long
 def test_what_cannot_share_is_told_and_leaves_no_file(apart: Path, worlds: Path, tmp_path: Path) -> None:
     out = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
     with pytest.raises(TrainingFileError, match=r"detector\.float\.onnx is not in 8 bits: `dataflow train quantize`"):

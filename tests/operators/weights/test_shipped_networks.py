@@ -60,6 +60,7 @@ def found_share(truth: Detections2D, found: Detections2D) -> tuple[int, int]:
     return hits, len(plain)
 
 
+@pytest.mark.long
 def test_the_detector_finds_the_objects_in_plain_sight(views: list[WorldImage]) -> None:
     detector = ready(CustomDetector())
     counts = [found_share(view.objects, detector.process(view.image)) for view in views]

@@ -13,7 +13,7 @@ from dataflow.messages import CameraInfo, Image, Odometry, Transforms
 from dataflow.operator import Context
 from dataflow.testing import Played, play
 from operators.fusion import EkfFusion
-from operators.fusion.sensor_settings import SensorSettings
+from operators.fusion.sensors.settings import SensorSettings
 from operators.odometry import MonoVisualOdometry
 
 STATIC = ("image_info", "extrinsics")

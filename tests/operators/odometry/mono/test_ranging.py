@@ -137,6 +137,7 @@ USELESS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("make", "use"), USELESS.values(), ids=USELESS.keys())
 def test_depth_that_shows_nothing_is_counted_and_changes_no_pose(make: Any, use: RangingUse) -> None:
     operator = MonoVisualOdometry()

@@ -26,10 +26,11 @@ from operators.geometry import se3
 from operators.odometry import VisualOdometry
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fit, Fitter
+from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import Surface
-from operators.odometry.rgbd.tracker import RgbdOdometry, State
+from operators.odometry.rgbd.tracker import RgbdOdometry, RgbdState
 from operators.odometry.rgbd.trial import Trial, with_trial
 from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
 
@@ -245,7 +246,7 @@ def test_covariance_covers_the_error_and_grows_with_the_way() -> None:
 def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() -> None:
     odometry = RgbdOdometry(camera())
     for i, frame in enumerate(sequence(25, 3.0)[0]):
-        result, keyframes = odometry.track(*frame, i * 100_000_000), odometry.snapshot().keyframes
+        result, keyframes = odometry.track(*frame, i * 100_000_000), odometry.state.map.keyframes
         if i > 0 and not result.keyframe:
             newest = keyframes[-1]
             carried = moved_covariance(newest.covariance, newest.T_world_camera, result.T_world_camera)
@@ -256,7 +257,7 @@ def test_first_frames_of_a_camera_that_tracks_well_count_as_those_after_them() -
     """Nothing is known of the noise then; the doubt would stay in every later pose."""
     odometry, added = RgbdOdometry(camera()), []
     for i, frame in enumerate(sequence(40, 1.0)[0]):
-        known = odometry.snapshot().keyframes[-1] if i else None
+        known = odometry.state.map.keyframes[-1] if i else None
         result = odometry.track(*frame, i * 100_000_000)
         if known is not None:
             carried = moved_covariance(known.covariance, known.T_world_camera, result.T_world_camera)
@@ -316,6 +317,7 @@ def test_frozen_images_are_noticed_and_not_used() -> None:
     assert {r.status for r in results[11:25]} == {Status.PREDICTED}
 
 
+@pytest.mark.long
 def test_lost_depth_is_bridged_by_the_depth_of_the_map() -> None:
     """Twenty degrees of turning without depth: new corners take theirs from what the map expects there."""
     frames, poses = sequence(60, 1.5)
@@ -355,16 +357,17 @@ def test_old_map_is_found_again_after_a_gap() -> None:
     assert errors(results[50:], poses[45:])[0] < 0.03
 
 
-def at_a_wrong_place(state: State, since: int, T_wrong: NDArray[np.float64]) -> State:
+def at_a_wrong_place(state: RgbdState, since: int, T_wrong: NDArray[np.float64]) -> RgbdState:
     """The state of an odometry that was found again at stamp `since`, and placed wrong by a motion in the world."""
     assert state.motion is not None
     T = state.motion.T_world_camera
-    keyframes = [
-        replace(k, T_world_camera=T_wrong @ k.T_world_camera) if k.stamp >= since else k for k in state.keyframes
+    known = LocalMap(state.map.capacity)
+    known.keyframes = [
+        replace(k, T_world_camera=T_wrong @ k.T_world_camera) if k.stamp >= since else k for k in state.map.keyframes
     ]
     wrong = replace(state.motion, T_world_camera=T_wrong @ T)
     trial = Trial.of(since, state.motion.stamp, T, 1e-2 * np.eye(6), T_wrong @ T)
-    return replace(state, motion=wrong, keyframes=tuple(keyframes), trials=with_trial(state.trials, trial))
+    return replace(state, motion=wrong, map=known, trials=with_trial(state.trials, trial))
 
 
 def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
@@ -373,8 +376,8 @@ def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
     odometry = RgbdOdometry(camera())
     for i in range(25):
         odometry.track(*frames[i], stamps[i])
-    since = odometry.snapshot().keyframes[-1].stamp
-    odometry.restore(at_a_wrong_place(odometry.snapshot(), since, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0]))))
+    since = odometry.state.map.keyframes[-1].stamp
+    odometry.state = at_a_wrong_place(odometry.state, since, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0])))
     results = [odometry.track(*frames[i], stamps[i]) for i in range(25, 60)]
     assert np.linalg.norm((results[0].T_world_camera - poses[25])[:3, 3]) > 0.7
     (taken_back,) = (r for r in results if r.taken_back is not None)
@@ -384,15 +387,16 @@ def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
     assert errors(results[-5:], poses[-5:])[0] < 0.03
 
 
+@pytest.mark.long
 def test_a_wrong_place_is_taken_back_with_another_that_was_found_meanwhile() -> None:
     frames, poses = sequence(60, 1.5)
     stamps = [int(i * 1e9 / 30) for i in range(len(frames))]
     odometry = RgbdOdometry(camera())
     for i in range(17):
         odometry.track(*frames[i], stamps[i])
-    first, second = (k.stamp for k in odometry.snapshot().keyframes[-2:])
-    state = at_a_wrong_place(odometry.snapshot(), first, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0])))
-    odometry.restore(at_a_wrong_place(state, second, se3.exp(np.array([0.4, -0.4, 0.3, 0, 0, 0.3]))))
+    first, second = (k.stamp for k in odometry.state.map.keyframes[-2:])
+    state = at_a_wrong_place(odometry.state, first, se3.exp(np.array([0.5, 0.3, -0.6, 0, 0, 0])))
+    odometry.state = at_a_wrong_place(state, second, se3.exp(np.array([0.4, -0.4, 0.3, 0, 0, 0.3])))
     results = [odometry.track(*frames[i], stamps[i]) for i in range(17, 60)]
     taken_back = next(k for k, result in enumerate(results) if result.taken_back is not None)
     assert results[taken_back].taken_back == first
@@ -414,12 +418,13 @@ def test_a_right_place_is_not_taken_back() -> None:
     odometry = RgbdOdometry(camera())
     for i in range(25):
         odometry.track(*frames[i], stamps[i])
-    odometry.restore(at_a_wrong_place(odometry.snapshot(), odometry.snapshot().keyframes[-1].stamp, np.eye(4)))
+    odometry.state = at_a_wrong_place(odometry.state, odometry.state.map.keyframes[-1].stamp, np.eye(4))
     results = [odometry.track(*frames[i], stamps[i]) for i in range(25, 60)]
     assert {(r.status, r.taken_back) for r in results} == {(Status.TRACKING, None)}
     assert errors(results, poses[25:])[0] < 0.03
 
 
+@pytest.mark.long
 def test_new_map_apart_is_joined_when_the_old_one_is_seen_again() -> None:
     """The camera is turned to the other side of the room while it sees nothing, and comes back later."""
     frames, poses = sequence(40)
@@ -438,6 +443,7 @@ def test_new_map_apart_is_joined_when_the_old_one_is_seen_again() -> None:
     assert errors(results[-2:], poses[-2:])[0] < 0.03
 
 
+@pytest.mark.long
 def test_a_view_that_is_found_again_in_a_new_map_apart_says_nothing_of_the_old_one() -> None:
     frames, poses = sequence(60, 1.5)
     turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
@@ -493,7 +499,7 @@ def test_keyframes_hold_nothing_of_what_moves(monkeypatch: pytest.MonkeyPatch) -
         result = odometry.track(*frame, i * 100_000_000)
         if not result.keyframe or not fits or not fits[-1].movers.tiles.any():
             continue
-        kept = odometry.snapshot().keyframes[-1].surface
+        kept = odometry.state.map.keyframes[-1].surface
         assert not fits[-1].movers.hold(kept.points()).any()
         left_out += 1
     assert left_out > 0
@@ -600,6 +606,7 @@ def test_same_frames_give_the_same_bytes_after_other_random_draws() -> None:
     assert digest(follow(frames)) == first
 
 
+@pytest.mark.long
 def test_same_frames_give_the_same_bytes_in_another_process(repository: Path) -> None:
     script = (
         "import importlib.util as u;"
@@ -616,7 +623,7 @@ def test_restored_state_goes_on_alike() -> None:
     one, other = RgbdOdometry(camera()), RgbdOdometry(camera())
     for i in range(20):
         one.track(*frames[i], i * 33_000_000)
-    other.restore(pickle.loads(pickle.dumps(one.snapshot())))
+    other.state = pickle.loads(pickle.dumps(one.state))
     rest = [[o.track(*frames[i], i * 33_000_000) for i in range(20, 30)] for o in (one, other)]
     assert digest(rest[0]) == digest(rest[1])
 
@@ -671,7 +678,7 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
     one, other = VisualOdometry(), VisualOdometry()
     one.setup()
     other.setup()
-    assert one.snapshot() == {}
+    other.restore(unpack_state(pack_state(one.snapshot())))  # of no frame
     for i in range(20):
         one.process(*given(i))
     recorded = pack_state(one.snapshot())
@@ -717,6 +724,7 @@ def test_operator_refuses_an_image_that_its_calibration_does_not_describe() -> N
 # -- recorded data -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_recorded_sequence_is_followed_within_2_5_cm(data_dir: Path) -> None:
     from evo.core.metrics import APE, PoseRelation, StatisticsType

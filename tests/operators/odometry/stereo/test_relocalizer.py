@@ -11,12 +11,13 @@ from made_hallway import RIG, SIZE, Matrix, Pair, driving, pairs_at
 
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages.geometry import invert
+from dataflow.state import StateError, plain, typed
 from operators.geometry import se3
+from operators.odometry import StereoVisualOdometry
 from operators.odometry.stereo.map import StereoMap
-from operators.odometry.stereo.memory import from_plain, to_plain
 from operators.odometry.stereo.relocalizer import StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
-from operators.odometry.stereo.tracker import StereoOdometry
+from operators.odometry.stereo.tracker import StereoOdometry, StereoState
 from operators.odometry.tracking import MEASURED, Status, TrackResult
 
 PERIOD = 100_000_000
@@ -52,6 +53,7 @@ def aside(poses: list[Matrix]) -> list[Matrix]:
     return [T @ se3.exp(np.array([0.25, 0.05, 0.0, 0.0, -0.04, 0.0])) for T in poses]
 
 
+@pytest.mark.long
 def test_an_old_view_after_a_gap_is_found_at_its_place() -> None:
     pairs, poses = sequence(25)
     back = aside(poses[6::-1])
@@ -72,6 +74,7 @@ def test_a_camera_that_stood_still_in_the_dark_goes_on_where_it_was() -> None:
     assert max(off(r, poses[17]) for r in after) < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("paper", [4, 11], ids=["the other way", "another hallway"])
 def test_a_view_that_nothing_kept_shows_is_lost_and_then_apart_until_an_old_one_comes(paper: int) -> None:
     pairs, poses = sequence(25)
@@ -94,6 +97,7 @@ def test_a_view_that_nothing_kept_shows_is_lost_and_then_apart_until_an_old_one_
     assert "unknown" not in after[-1].reason
 
 
+@pytest.mark.long
 def test_a_new_map_is_moved_to_where_it_belongs_when_the_old_one_is_seen() -> None:
     """It turns round in the dark, drives on, and turns back in the light: the new map then joins the old one."""
     pairs, poses = sequence(25)
@@ -102,7 +106,7 @@ def test_a_new_map_is_moved_to_where_it_belongs_when_the_old_one_is_seen() -> No
     given = [*pairs[:18], *[DARK] * GAP, *seen(turned, noise=5)]
     results = [odometry.track(left, right, i * PERIOD) for i, (left, right) in enumerate(given)]
     assert off(results[-1], turned[-1]) < 0.2
-    known = odometry.snapshot().map
+    known = odometry.state.map
     assert known.apart_since is None
     assert {k.segment for k in known.keyframes} == {0}
     truth = dict(enumerate([*poses[:18], *[poses[17]] * GAP, *turned]))
@@ -110,6 +114,7 @@ def test_a_new_map_is_moved_to_where_it_belongs_when_the_old_one_is_seen() -> No
         assert np.linalg.norm((invert(truth[k.stamp // PERIOD]) @ k.T_world_camera)[:3, 3]) < 0.3
 
 
+@pytest.mark.long
 def test_the_same_pairs_give_the_same_bytes_also_from_a_snapshot_in_a_new_map() -> None:
     pairs, poses = sequence(25)
     there = seen([poses[17] @ AROUND] * 3, noise=5)
@@ -118,7 +123,7 @@ def test_the_same_pairs_give_the_same_bytes_also_from_a_snapshot_in_a_new_map() 
     odometry, other = StereoOdometry(RIG), StereoOdometry(RIG)
     for i, (left, right) in enumerate(given[:30]):
         odometry.track(left, right, i * PERIOD)
-    other.restore(from_plain(unpack_state(pack_state(to_plain(odometry.snapshot())))))
+    other.state = typed(StereoState, unpack_state(pack_state(plain(odometry.state))))
     for i, (left, right) in enumerate(given[30:], start=30):
         result = other.track(left, right, i * PERIOD)
         assert (result.status, result.reason) == (first[i].status, first[i].reason)
@@ -126,10 +131,13 @@ def test_the_same_pairs_give_the_same_bytes_also_from_a_snapshot_in_a_new_map() 
         assert result.covariance.tobytes() == first[i].covariance.tobytes()
 
 
-def test_a_state_of_the_former_version_has_no_map() -> None:
-    state = StereoOdometry(RIG).snapshot()
-    former = {name: value for name, value in to_plain(state).items() if name != "map"}
-    assert from_plain(former).map.keyframes == ()
+def test_a_state_of_a_version_without_a_map_is_refused() -> None:
+    operator = StereoVisualOdometry()
+    recorded = operator.snapshot()
+    assert recorded is not None
+    former = {name: value for name, value in recorded["odometry"].items() if name != "map"}
+    with pytest.raises(StateError, match=r"snapshot of another version: .*StereoState\) lacks map"):
+        operator.restore({**recorded, "odometry": former})
 
 
 # -- the pairs that are kept ---------------------------------------------------------------------------------------

@@ -53,7 +53,7 @@ def test_disparities_that_are_off_by_a_constant_do_not_stretch_the_way() -> None
     shifted = [(left, cv2.warpAffine(right, shift, SIZE, borderMode=cv2.BORDER_REPLICATE)) for left, right in pairs]
     odometry = StereoOdometry(RIG)
     results = [odometry.track(left, right, i * 100_000_000) for i, (left, right) in enumerate(shifted)]
-    assert odometry.snapshot().offset == pytest.approx(0.33, abs=0.15)
+    assert odometry.state.offset == pytest.approx(0.33, abs=0.15)
     late = np.linalg.norm(results[-1].T_world_camera[:3, 3] - results[12].T_world_camera[:3, 3])
     truth = np.linalg.norm(poses[-1][:3, 3] - poses[12][:3, 3])
     assert late == pytest.approx(truth, rel=0.01)

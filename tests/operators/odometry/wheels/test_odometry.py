@@ -83,6 +83,7 @@ def test_an_arc_in_parts_is_the_arc(left: float, right: float, parts: int) -> No
     np.testing.assert_allclose(divided.pose, whole.pose, atol=1e-12)
 
 
+@pytest.mark.long
 @given(st.lists(st.tuples(st.floats(-0.4, 0.6), st.floats(-0.4, 0.6)), min_size=1, max_size=8))
 def test_the_covariance_is_that_of_drives_with_drawn_errors(steps: list[tuple[float, float]]) -> None:
     noise = DriveNoise(slip=0.004, scale=0.005, track=0.004)

@@ -1,0 +1,1 @@
+"""From graph files to one flat list of operators."""

@@ -1,0 +1,1 @@
+"""From the flat list of operators to the graph: wired, checked, settled."""

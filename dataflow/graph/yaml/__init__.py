@@ -1,0 +1,1 @@
+"""Graph files as trees of values that know their line and column: read, checked, bounded."""

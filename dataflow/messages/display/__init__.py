@@ -1,0 +1,1 @@
+"""Messages and arrays for people: text, HTML, pictures."""

@@ -1,0 +1,1 @@
+"""Fields of a message class: what each accepts, where its arrays lie, and the functions made of them."""

@@ -1,0 +1,73 @@
+"""Input of the late filter and its record: samples, measurements, and the estimate after each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.fusion.filter.control import Command
+from operators.fusion.filter.error_state import Noise, State
+from operators.fusion.filter.gate import Health
+from operators.fusion.filter.measurements import Model
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Readings of the inertial sensor: time (ns), rad/s (3,), m/s² (3,), and their noise."""
+
+    time: int
+    gyro: Array
+    accel: Array
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Holds a sensor's measurement of a time (ns), with covariance (M, M).
+
+    `clock`: which of the state's time offsets is the sensor's, -1 for none; `assumed`: seconds taken for it in `time`.
+    """
+
+    time: int
+    sensor: str
+    model: Model
+    noise: Array
+    clock: int = -1
+    assumed: float = 0.0
+
+
+Entry = Sample | Measurement | Command
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One of several estimates, with the logarithm of its weight.
+
+    `against`: what was told of the first heading, which it is followed against for a time in motion.
+    """
+
+    weight: float
+    state: State
+    against: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor.
+
+    `refuted`: measurements contradict what was told of the first heading; `moving`: nanoseconds in motion so far.
+    """
+
+    time: int
+    hypotheses: tuple[Hypothesis, ...]
+    gyro: Array
+    accel: Array
+    health: Mapping[str, Health] = field(default_factory=dict)
+    command: Command | None = None
+    refuted: bool = False
+    moving: int = 0

@@ -1,0 +1,1 @@
+"""Activities of agents: features, recognition, and training of the network."""

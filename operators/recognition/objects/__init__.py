@@ -1,0 +1,1 @@
+"""Detection of known and of newly learned objects."""

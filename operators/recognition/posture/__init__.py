@@ -1,0 +1,1 @@
+"""Postures of people: silhouettes, recognition, and training of the network."""

@@ -1,0 +1,1 @@
+"""The scene graph: layers, activities and goals, what changed, and questions to it."""

@@ -1,0 +1,230 @@
+"""Upright boxes that agree with the image boxes of several views, with points on them, and with usual sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.estimation.kernels import huber
+from operators.labels import SizePrior
+from operators.scene.map.box_images import CORNERS, ELLIPSE, images
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Box = tuple[Array, Array, float]
+"""Centre (3,), full size (3,) and heading about the vertical of an upright box."""
+
+_STEPS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.02])  # of centre, m; of log sizes; of heading, rad
+_PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
+_PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
+_INSIDE = 0.02  # metres by which points stray from a box that they are of
+_TAIL = 0.8  # standard deviations of noise by which the outermost of accumulated points are beyond a side
+_TAIL_FLAT, _TAIL_ROUND = 1.4, 0.8  # and those of single views, on flat sides and on round ones, which recede
+_STRAYING, _STRAYING_RAW = 1 / 40, 1 / 10  # of points on each side are others' at most, and of those of single views
+_ASKEW = 8.0  # cost of lying otherwise than most things around
+_TURN, _TURN_ALONG = 0.1, 0.03  # radians by which the heading that points show strays, and that of a room
+_BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
+_SIZES = 4  # residuals, the last ones, that compare heading and sizes with what is known
+_ALIKE = 6  # views that tell as much as more do, since their errors are alike
+_ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
+
+
+@dataclass(frozen=True, eq=False)
+class ImageView:
+    """One view of an object: `P` (3, 4) maps the world to pixels; `box` (4,) is the object's in the image.
+
+    `edges` (4,) are those of the box, left, upper, right, lower, that are the object's and not the image's; `eye` (3,)
+    is where the camera was. `points` (N, 3) are some of those that the view shows of it.
+    """
+
+    P: Array
+    box: Array
+    edges: NDArray[np.bool_]
+    eye: Array
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+def fit_cuboid(
+    start: Box,
+    views: Sequence[ImageView],
+    points: Array,
+    usual: Sequence[SizePrior],
+    before: tuple[int, Box] | None = None,
+    heading: float | None = None,
+    noise: float = 0.0,
+    *,
+    raw: bool = False,
+) -> tuple[int, Box, Array]:
+    """Returns the upright box that agrees best with image boxes, with points (N, 3) of its surface, and with its class.
+
+    Least squares over centre, sizes and heading, by Gauss and Newton with differences: edges of the box's image against
+    those of each view, with a bounded influence, since things hide each other; points at most on the surface, and on it
+    where a view sees that side; log sizes as one of the usual ones. `start` is a box around the points. Each way in
+    which such things stand is tried, along the heading of `start` and along `heading`, that of most things around,
+    what always lies along the room only so; the best is returned with its number; with `before`, an earlier result,
+    only that one is tried. Last comes by how many standard deviations each view's edges stray from that box (V,).
+
+    `noise` is that of ranges at one metre, m; it grows by the square. Points are `raw` that are of single views.
+    After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
+    """
+    logs, spreads, along = _priors(tuple(usual))
+    ways = len(logs)
+    eyes = np.stack([v.eye for v in views])
+    if before is None:
+        x, forms = _starts(start, eyes, logs), np.arange(ways)
+        if heading is not None:
+            turned = _nearest_turn(start[2], heading)
+            x = np.concatenate([x, _starts(_along(points, turned), eyes, logs)])
+            forms = np.concatenate([forms[~along], forms + ways])
+            x = x[forms]
+        headings = x[:, 6].copy()
+    else:
+        form, box = before
+        form += ways if heading is not None and form < ways and along[form] else 0  # it settled before that was known
+        forms, x = np.array([form]), np.array([[*box[0], *np.log(box[1]), box[2]]])
+        headings = np.array([_nearest_turn(box[2], heading if heading is not None and form >= ways else start[2])])
+    logs, spreads = logs[forms % ways], spreads[forms % ways]
+    turns = np.where(along[forms % ways] & (forms >= ways), _TURN_ALONG, _TURN)
+    outline = ELLIPSE if usual and usual[0].round else CORNERS
+    inset = usual[0].inset if usual else 0.0
+    noise *= (_TAIL_ROUND if outline is ELLIPSE else _TAIL_FLAT) if raw else _TAIL
+    cut = int(len(points) * (_STRAYING_RAW if raw else _STRAYING))
+    P = np.stack([v.P for v in views], axis=1)
+    places = np.concatenate([points, eyes]).T.copy()
+    boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
+    sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+    weights = edges / (_PIXELS + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
+
+    def residuals(rows: Array) -> Array:
+        """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
+        flat = rows.reshape(-1, 7)
+        image = images(flat, P, outline) - boxes
+        image = (image * weights).reshape(len(flat), -1)
+        image[np.isnan(image)] = 0.0
+        turn = ((rows[..., 6] - headings[:, None]) / turns[:, None]).reshape(-1, 1)
+        size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
+        parts = [image, _surface(flat, places, len(points), cut, noise, inset), turn, size]
+        return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
+
+    askew = np.where((forms < ways) & (heading is not None), _ASKEW, 0.0)
+    for turn in range(_ROUNDS if before is None else 2):
+        values = residuals(x[:, None] + _PROBES)
+        r, J = values[:, 0], (values[:, 1:] - values[:, :1]) / _STEPS[:, None]
+        if turn == _CHOICE and len(x) > 1:
+            kept = np.argsort(_cost(r) + askew, kind="stable")[:2]
+            x, r, J, headings, logs, spreads = (a[kept] for a in (x, r, J, headings, logs, spreads))
+            forms, askew, turns = forms[kept], askew[kept], turns[kept]
+        weighted = J * _influence(r)[:, None]
+        A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
+        step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
+        x = x + step
+        if (np.abs(step) < 0.1 * _STEPS).all():
+            break
+    last = residuals(x[:, None])[:, 0]
+    best = int(np.argmin(_cost(last) + askew))
+    off = np.abs(last[best, : 4 * len(views)]).reshape(-1, 2, 2).sum(axis=1) * np.sqrt(max(1.0, len(views) / _ALIKE))
+    strays = off.max(axis=1) / np.maximum(edges.reshape(-1, 2, 2).sum(axis=1).max(axis=1), 1)
+    return int(forms[best]), (x[best, :3].copy(), np.exp(x[best, 3:6]), float(x[best, 6])), strays
+
+
+def _cost(r: Array) -> Array:
+    """Returns the cost (A,) of residuals (A, R), after Huber; that of sizes is not bounded."""
+    size, strays = np.abs(r), np.arange(r.shape[1]) < r.shape[1] - _SIZES
+    bounded = (size >= _BOUND) & strays
+    return np.asarray(np.where(bounded, _BOUND * (size - 0.5 * _BOUND), 0.5 * size * size).sum(axis=1))
+
+
+def _influence(r: Array) -> Array:
+    """Returns the weights (A, R) of residuals, after Huber: sizes, the last, do not stray as images and points do."""
+    weights = huber(r, _BOUND)
+    weights[:, -_SIZES:] = 1.0
+    return weights
+
+
+def _nearest_turn(yaw: float, towards: float) -> float:
+    """Returns the heading nearest to `yaw` that is `towards` or turned from it by quarters."""
+    return float(yaw + np.remainder(towards - yaw + np.pi / 4, np.pi / 2) - np.pi / 4)
+
+
+def _along(points: Array, yaw: float) -> Box:
+    """Returns the upright box with a heading around points (N, 3)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    local = points @ turn.T
+    low, high = local.min(axis=0), local.max(axis=0)
+    return (low + high) / 2 @ turn, high - low, yaw
+
+
+@lru_cache(maxsize=64)  # as many classes
+def _priors(usual: tuple[SizePrior, ...]) -> tuple[Array, Array, Mask]:
+    """Returns the usual log sizes (A, 3), their spreads, with the sides on the ground either way round, and which of
+    them (A,) always lie along the room.
+    """
+    rows = []
+    for each in usual:
+        a, b, c = each.size
+        rows.append(((a, b, c), each.spread, each.along))
+        if b > 1.3 * a:
+            turned = (each.spread[1], each.spread[0], each.spread[2])
+            rows.append(((b, a, c), turned, each.along))
+    if not rows:
+        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0), False))
+    sizes, spreads, along = (np.array(each) for each in zip(*rows, strict=True))
+    return np.log(sizes), spreads, along
+
+
+def _starts(start: Box, eyes: Array, logs: Array) -> Array:
+    """Returns the beginnings (A, 7): boxes that are as deep as usual away from the viewers, at `eyes` (V, 3)."""
+    center, size, yaw = start
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    along = axes @ (center - eyes.mean(axis=0))[:2]
+    deep = int(np.argmax(np.abs(along)))
+    sizes = np.tile(np.maximum(size, 0.01), (len(logs), 1))
+    lack = np.maximum(np.exp(logs)[:, deep] - sizes[:, deep], 0.0)
+    sizes[:, deep] += lack
+    rows = np.empty((len(logs), 7))
+    rows[:, :3], rows[:, 3:6], rows[:, 6] = center, np.log(sizes), yaw
+    rows[:, :2] += axes[deep] * np.sign(along[deep]) * lack[:, None] / 2
+    return rows
+
+
+def _surface(rows: Array, places: Array, count: int, cut: int, noise: float, inset: float) -> Array:
+    """Returns by how much the points' extents differ from the sides of boxes (K, 7): (K, 6), in standard deviations.
+
+    `places` (3, N) are `count` points, then the eyes; `cut` points on each side are left out. Sides that no view sees
+    may be farther out than the points.
+    """
+    c, s = np.cos(rows[:, 6, None]), np.sin(rows[:, 6, None])
+    half = np.exp(rows[:, 3:6]) / 2
+    x, y = places[0] - rows[:, :1], places[1] - rows[:, 1:2]
+    local = np.empty((len(rows), 3, places.shape[1]))
+    np.add(c * x, s * y, out=local[:, 0])
+    np.subtract(c * y, s * x, out=local[:, 1])
+    np.subtract(places[2], rows[:, 2:3], out=local[:, 2])
+    low, high = _extents(local[..., :count], cut)
+    residual = np.concatenate([low + half, half - high], axis=1)
+    eye = local[..., count:]
+    eyes = eye.shape[2]
+    way = np.abs(eye).sum(axis=2) / eyes
+    stray = noise * way * way  # along each axis, by how much of the distance lies along it
+    residual[:, :3] += stray
+    residual[:, 3:] += stray
+    if inset:
+        residual -= inset * np.concatenate([half, half], axis=1)
+    sides = half[..., None]
+    shown = np.concatenate([np.add.reduce(eye < -sides, axis=2), np.add.reduce(eye > sides, axis=2)], axis=1)
+    # positive: the side is beyond the points
+    return np.asarray(np.where(shown / eyes > 0.3, residual, np.minimum(residual, 0)) / _INSIDE)
+
+
+def _extents(values: Array, cut: int) -> tuple[Array, Array]:
+    """Returns the least and the greatest (K, 3) of values (K, 3, N) without the outermost `cut` on each side."""
+    if not cut:
+        return values.min(axis=2), values.max(axis=2)
+    last = values.shape[2] - 1 - cut
+    ranked = np.partition(values, (cut, last), axis=2)
+    return ranked[..., cut], ranked[..., last]

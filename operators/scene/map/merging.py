@@ -1,0 +1,98 @@
+"""Entries of the map that are of one thing, what is made of them, and entries that stand in the place of others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.scene.box_overlap import shared_volume
+from operators.scene.map.cells import Cells
+from operators.scene.map.kinds import Kinds
+from operators.scene.map.map_object import MOST_EVIDENCE, MapObject
+from operators.scene.map.matching import MapSettings, closeness, tolerance
+
+_COVERED = 0.15  # share of the smaller of two boxes that both have, from which they are one
+_APART_COVERED = 0.3  # that share where both are seen beside each other
+_PART = 0.4  # that share where the classes differ
+_LIKE = 6.0  # times smaller, and what is in the other is no part of it
+_NEAR, _NEAR_MOVERS = 0.1, 0.3  # metres that the bounds of two entries of one thing are apart at most
+_SELDOM = 0.15  # share of the views in which both are seen beside each other, from which they are two
+
+
+def may_be_one(cells: Sequence[Cells], rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Tells of some entries (N,) of the map and all (M,) whether their bounds are near enough to be `are_one`'s."""
+    low, high = (np.array([each.bounds[side] for each in cells]) for side in (0, 1))
+    apart = np.maximum(low[rows, None], low[None]) - np.minimum(high[rows, None], high[None])
+    return np.asarray(apart.max(axis=2) <= _NEAR_MOVERS)
+
+
+def are_one(a: MapObject, b: MapObject, kinds: Kinds, voxel: float) -> bool:
+    """Tells whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
+    apart = a.cells.apart(b.cells)
+    if apart > _NEAR_MOVERS:
+        return False
+    movers = kinds.is_mover(a), kinds.is_mover(b)
+    if any(movers) and a.class_id != b.class_id and not (kinds.is_still(a) and kinds.is_still(b)):
+        return False
+    if not any(movers) and apart > _NEAR:
+        return False
+    if all(movers):
+        return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
+    volumes = float(np.prod(a.size)), float(np.prod(b.size))
+    beside = max(a.beside[b.id], b.beside[a.id]) > _SELDOM * min(a.views, b.views)
+    both = shared_volume(a.box, b.box)
+    shared = both / max(min(volumes), 1e-9)
+    if a.class_id != b.class_id:
+        if both > 0 and both / (sum(volumes) - both) >= 0.5:
+            return True
+        like = max(volumes) <= _LIKE * min(volumes) and not (kinds.is_large(a) or kinds.is_large(b))
+        return like and not beside and shared >= _PART
+    if shared >= (_APART_COVERED if beside else _COVERED):
+        return True
+    small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
+    if a.images and b.images and not kinds.is_large(small):
+        return False
+    if closeness(small.cells, large.cells) <= 0.3:
+        return False
+    return large.cells.near(small.cells.points, 0.5 * tolerance(small.size) + 0.5 * voxel) >= 0.5
+
+
+def merge(a: MapObject, b: MapObject, kinds: Kinds) -> MapObject:
+    """Returns one entry for two: the older one's id, and the place of the one that was seen more often.
+
+    Voxels and images of both count only where they are of one class; else those of a part would shrink the whole.
+    """
+    best, other = (a, b) if (a.views, -a.id) > (b.views, -b.id) else (b, a)
+    if best.class_id == other.class_id and not kinds.is_mover(best):
+        best.cells.add(other.cells)
+        for image in other.images:
+            best.look(image)
+    for class_id, count in enumerate(other.votes.tolist()):
+        best.vote(class_id, count)
+    best.evidence = min(max(best.evidence, other.evidence), MOST_EVIDENCE)
+    best.seen, best.views = max(best.seen, other.seen), best.views + other.views
+    best.told += other.told
+    best.view = best.view + other.view
+    best.beside += other.beside
+    best.born, best.id = min((a.born, a.id), (b.born, b.id))
+    return best
+
+
+def smaller_in_place(object: MapObject, known: Iterable[MapObject], kinds: Kinds, s: MapSettings) -> list[Cells]:
+    """Returns the voxels of smaller things in the place of a large one that has images, as of a chair before a desk.
+
+    Masks give a part of such things to what is behind them. Only sure entries of other classes count.
+    """
+    if not (object.images and kinds.is_large(object)):
+        return []
+    return [
+        o.cells
+        for o in known
+        if o.class_id != object.class_id
+        and o.evidence >= s.confirm
+        and o.sightings >= s.views
+        and o.cells.apart(object.cells) <= s.voxel
+        and not (kinds.is_mover(o) or kinds.is_large(o))
+    ]

@@ -1,0 +1,82 @@
+"""Evidence in a view of whether an object is still where it was."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.scene.map.cells import Cells
+from operators.scene.map.kinds import Kinds
+from operators.scene.map.map_object import MOST_EVIDENCE, WHOLE, MapObject
+from operators.scene.map.matching import MapSettings
+from operators.scene.map.range_view import GROWTH, RangeView, Sight
+
+Array = NDArray[np.float64]
+
+_SELDOM = 3  # one view in so many is used to remove voxels of other objects
+_LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
+_EMPTY = 0.6  # share of the voxels looked at that are seen through, from which a place is empty
+_STRAY, _NOISES = 0.03, 3.0  # metres, and standard deviations of ranges, by which voxels stray from a surface
+
+
+def has_left(object: MapObject, view: RangeView, s: MapSettings) -> bool:
+    """Returns whether a view looks through the place of an object, as finely as its ranges allow.
+
+    What a small thing stood on is not far behind it: less than the margin that is safe for all.
+    """
+    away = float(np.linalg.norm(object.center - view.origin))
+    margin = min(s.margin + GROWTH * away, _STRAY + _NOISES * s.range_noise * away * away)
+    return _is_empty(view.of(object.cells.points, margin, 0.0))
+
+
+def look_at(
+    object: MapObject,
+    sight: Sight | None,
+    eye: Array,
+    own: Cells | None,
+    seconds: float,
+    kinds: Kinds,
+    s: MapSettings,
+    *,
+    left: bool,
+) -> None:
+    """Updates an object by what a view shows at its place, and by its voxels in the view (`own`), if any.
+
+    `seconds` is the time since the view before: a view soon after it weighs less. `left` marks an object whose place a
+    finer look found empty.
+    """
+    mover = kinds.is_mover(object)
+    if not len(object.cells):
+        object.evidence = -1.0
+        return
+    if not mover and sight is not None:
+        if own is not None and object.views % _SELDOM == 0:
+            object.cells.doubt(sight.confirmed, own, _SELDOM)
+        object.cells.carve(sight.free)
+        object.most = max(object.most, len(object.cells))
+    if own is not None:
+        return
+    if len(object.cells) < _LEFT * object.most:
+        object.evidence = -1.0
+    if mover:
+        object.evidence -= seconds * MOST_EVIDENCE / s.mover_memory
+    if sight is None:
+        return
+    share = min(seconds * 1e9 / WHOLE, 1.0)
+    if left or _is_empty(sight):
+        object.evidence -= share * s.vacated * (3 if mover else 1)
+    elif np.count_nonzero(sight.looked) >= _least(sight):
+        distance = float(np.linalg.norm(object.center - eye))
+        plain = np.count_nonzero(sight.confirmed) >= _EMPTY * len(sight.looked)
+        if plain and object.longest >= s.miss_angle * distance:
+            object.evidence -= share * s.missed
+
+
+def _is_empty(sight: Sight) -> bool:
+    looked = int(np.count_nonzero(sight.looked))
+    return looked >= _least(sight) and int(np.count_nonzero(sight.free)) >= _EMPTY * looked
+
+
+def _least(sight: Sight) -> float:
+    """Returns how many voxels must be looked at for a view to tell."""
+    return max(5.0, 0.2 * len(sight.looked))

@@ -1,0 +1,1 @@
+"""Textures of surfaces, painted by name, and the atlas that holds them."""

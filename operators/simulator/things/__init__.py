@@ -1,0 +1,1 @@
+"""Furniture and small things, and how they are put into rooms."""

@@ -1,0 +1,1 @@
+"""SLAM with a LiDAR."""

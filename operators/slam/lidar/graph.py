@@ -1,0 +1,117 @@
+"""A map of LiDAR scans whose poses are corrected when the LiDAR comes back to where it was."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dataflow.messages.geometry import invert
+from operators.geometry.se3 import Matrix
+from operators.odometry.tracking import moved_covariance
+from operators.slam.keyframe_graph import SAVED, KeyframeGraph, Node
+from operators.slam.lidar.scan_context import likeness
+from operators.slam.lidar.view import LidarEyes, LidarView
+from operators.slam.place_graph import PlaceGraph
+from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting, alike
+
+DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # errors of odometry beyond its covariance, over a metre
+STEP = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # and at each keyframe
+LEAST = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # of a sight: noise and calibration err alike in all
+
+
+@dataclass(frozen=True)
+class LidarSettings(PlaceSettings):
+    """Settings of a map of scans. A change of view is in metres, a radian of turn counting half a metre.
+
+    Only where the place in the map is not known are scans compared that look alike: odometry of a LiDAR drifts so
+    little that a place seen again lies where the map expects it.
+    """
+
+    spacing: float = 0.5
+    travel: float = 4.0
+    reach: float = 1.0
+    same: float = 0.25
+    aside: float = 0.0
+    beside: int = 0
+    near: int = 2
+    alike: int = 0
+    searched: int = 3
+    likeness: float = 0.5
+    least: Matrix = field(default_factory=LEAST.copy)
+
+
+class _Contexts:
+    """The place index of scans."""
+
+    def __init__(self) -> None:
+        self._keys: list[int] = []
+        self._views: list[LidarView] = []
+
+    def add(self, key: int, view: LidarView) -> None:
+        self._keys.append(key)
+        self._views.append(view)
+
+    def likeness(self, view: LidarView) -> dict[int, float]:
+        alike, _ = likeness(view.context, np.array([known.context for known in self._views]))
+        return dict(zip(self._keys, alike.tolist(), strict=True))
+
+
+class LidarGraph(PlaceGraph[LidarView]):
+    """The map that a LiDAR makes."""
+
+    graph: KeyframeGraph[LidarView]
+
+    def __init__(self, settings: LidarSettings, eyes: LidarEyes) -> None:
+        super().__init__(settings, _Contexts, between)
+        self._eyes = eyes
+
+    def add(
+        self, stamp: int, T_odom: Matrix, covariance: Matrix, view: LidarView, segment: int, found_again: bool
+    ) -> Added:
+        """Takes a scan and its pose in the odometry frame.
+
+        `segment` is the number of the odometry's map; `found_again`: it found this map again after a loss.
+        """
+        added = self.grow(stamp, T_odom, covariance, segment, found_again, self._eyes, lambda: view)
+        newest = self.newest
+        if added.node and newest is not None:
+            newest.covariance = self._lesser(newest.covariance, newest.covariance_odom)
+        return added
+
+    def covariance_at(self, T_odom: Matrix, covariance_odom: Matrix) -> Matrix:
+        """Returns the covariance (6, 6) in the map of a pose of the odometry."""
+        return self._lesser(super().covariance_at(T_odom, covariance_odom), covariance_odom)
+
+    def _lesser(self, covariance: Matrix, covariance_odom: Matrix) -> Matrix:
+        """Returns the covariance of a pose in the map, which is no greater than the odometry's where both frames began.
+
+        Along the chain of keyframes it grows with every step, while the odometry's own map may be more precise.
+        """
+        newest = self.newest
+        began_here = newest is not None and newest.island == 0 and SAVED not in self.tied
+        return covariance_odom if began_here and np.trace(covariance_odom) < np.trace(covariance) else covariance
+
+    def _recognised(
+        self, number: int, candidates: Sequence[int], eyes: Eyes[LidarView], added: Added
+    ) -> list[tuple[int, Sighting]]:
+        """Returns the loop to the view that looks most alike, if all that are believed say the same."""
+        sights = self._sights(number, candidates, eyes, False, added)
+        poses = [self.nodes[k].T @ seen.T_known_seen for k, seen in sights]
+        if not all(alike(poses[0], T) for T in poses[1:]):
+            added.refused.append("ambiguous: another place explains the scan as well")
+            return []
+        return self._weighed(number, sights[:1])
+
+
+def between(node: Node[LidarView], T_odom: Matrix, covariance_odom: Matrix) -> Matrix:
+    """Returns the covariance (6, 6) of the motion from a node to a pose of the same odometry.
+
+    It is what the odometry's own covariance has changed by: where that fell, since the LiDAR came back into a part of
+    its map that is more certain, the pose was corrected by as much.
+    """
+    change = covariance_odom - moved_covariance(node.covariance_odom, node.T_odom, T_odom)
+    values, axes = np.linalg.eigh((change + change.T) / 2)
+    way = float(np.linalg.norm((invert(node.T_odom) @ T_odom)[:3, 3]))
+    return np.asarray((axes * np.abs(values)) @ axes.T + way * DRIFT + STEP, np.float64)

@@ -1,0 +1,1 @@
+"""SLAM with an RGB-D camera."""

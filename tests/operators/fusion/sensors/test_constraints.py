@@ -1,0 +1,166 @@
+"""What holds of a body without a sensor of it: rest where nothing trembles, no slip where it rolls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from made_sensors import fused
+
+from dataflow.messages import Imu, Message, Odometry, Pose
+from dataflow.operator import Context
+from operators.fusion import EkfFusion
+from operators.fusion.filter.error_state import Noise
+from operators.fusion.filter.history import Sample
+from operators.fusion.sensors.constraints import Constraints
+
+RATE, GRAVITY = 100, 9.80665
+BIAS = np.array([0.06, -0.04, 0.03])
+TURN_BIAS = np.array([0.004, -0.003, 0.005])
+Array = np.ndarray
+
+
+def readings(
+    velocity: Array, tremble: Array, seed: int = 0, yaw: Array | None = None
+) -> tuple[list[Message], list[Message], Array]:
+    """Inertial samples of a level body with a velocity (N, 3) in the world, ten poses a second, and its places (N, 3).
+
+    `tremble` (N,) is the noise of the motion, m/s²; `yaw` (N,) where it looks.
+    """
+    rng = np.random.default_rng(seed)
+    heading = np.zeros(len(velocity)) if yaw is None else yaw
+    c, s = np.cos(heading), np.sin(heading)
+    push = np.gradient(velocity, 1 / RATE, axis=0)
+    own = np.column_stack([c * push[:, 0] + s * push[:, 1], c * push[:, 1] - s * push[:, 0], push[:, 2]])
+    turning = np.gradient(heading, 1 / RATE)
+    places = np.concatenate([np.zeros((1, 3)), np.cumsum((velocity[1:] + velocity[:-1]) / 2 / RATE, axis=0)])
+    imu: list[Message] = []
+    poses: list[Message] = []
+    for k in range(len(velocity)):
+        stamp = 10**9 + k * 10**9 // RATE
+        force = own[k] + [0, 0, GRAVITY] + BIAS + rng.normal(0, 0.02, 3) + tremble[k] * rng.normal(0, 1, 3)
+        strays = rng.normal(0, 0.002, 3) + 0.2 * tremble[k] * rng.normal(0, 1, 3)
+        imu.append(
+            Imu(
+                stamp=stamp,
+                frame="base_link",
+                angular_velocity=np.array([0, 0, turning[k]]) + TURN_BIAS + strays,
+                linear_acceleration=force,
+                angular_velocity_covariance=np.eye(3) * 4e-6,
+                linear_acceleration_covariance=np.eye(3) * 4e-4,
+            )
+        )
+        if not k % (RATE // 10):
+            T = np.eye(4)
+            T[:2, :2], T[:3, 3] = [[c[k], -s[k]], [s[k], c[k]]], places[k]
+            poses.append(
+                Pose.from_matrix(T, stamp=stamp, frame="world", child_frame="base_link", covariance=np.eye(6) * 4e-4)
+            )
+    return imu, poses, places
+
+
+def outage(
+    velocity: Array, tremble: Array, until: float, yaw: Array | None = None, **params: Any
+) -> tuple[EkfFusion, float]:
+    """The operator after motion with poses only `until` so many seconds, and how far off it is at the end (m)."""
+    imu, poses, places = readings(velocity, tremble, yaw=yaw)
+    known = [m for m in poses if m.stamp < 10**9 + until * 1e9]
+    operator, played = fused({"robot/imu": imu, "robot/pose": known}, heading=0.0, **params)
+    last = played["odometry"][-1]
+    assert isinstance(last, Odometry)
+    return operator, float(np.linalg.norm(last.position - places[-1]))
+
+
+def count(operator: EkfFusion, what: str) -> int:
+    return int(operator.summary().get(what, 0))
+
+
+def walked(seconds: float, stop: float) -> tuple[Array, Array]:
+    """Velocity and tremble of something carried about until it is put down."""
+    t = np.arange(int(seconds * RATE)) / RATE
+    moving = np.clip((stop - t) / 0.5, 0, 1) * np.clip((t - 0.8) / 0.5, 0, 1)
+    velocity = np.column_stack([0.6 * np.sin(1.1 * t), 0.5 * np.cos(0.7 * t), 0.1 * np.sin(2 * t)]) * moving[:, None]
+    return velocity, 0.4 * (moving > 0)
+
+
+@pytest.mark.long
+def test_what_was_put_down_stays_where_it_is() -> None:
+    velocity, tremble = walked(18.0, 7.0)
+    _, without = outage(velocity, tremble, 8.0)
+    operator, held = outage(velocity, tremble, 8.0, standstill=0.1)
+    assert held < 0.03 < 0.3 < without
+    assert count(operator, "standstill velocity, used") > 80
+
+
+def test_what_trembles_as_it_moves_slowly_is_not_taken_for_standing() -> None:
+    t = np.arange(10 * RATE) / RATE
+    velocity = np.column_stack([0.05 * np.clip(t - 0.8, 0, 1), 0 * t, 0 * t])
+    operator, _ = outage(velocity, 0.3 * (t > 0.8), 10.0, standstill=0.1)
+    assert count(operator, "standstill velocity, used") <= 3  # of the rest that it begins with
+    assert count(operator, "robot/pose, used") > 80
+
+
+@pytest.mark.long
+def test_an_even_motion_that_the_filter_knows_is_not_stopped() -> None:
+    t = np.arange(12 * RATE) / RATE
+    velocity = np.column_stack([0.5 * np.clip(t - 1.5, 0, 1), 0 * t, 0 * t])  # without a tremble: as a rail
+    without, off = outage(velocity, 0 * t, 8.0)
+    operator, stopped = outage(velocity, 0 * t, 8.0, standstill=0.1)
+    assert count(operator, "standstill velocity, refused") > 50
+    assert abs(stopped - off) < 0.1
+    assert "standstill velocity, used" not in without.summary()
+
+
+@pytest.mark.long
+def test_what_rolls_drifts_less_where_it_cannot_slip() -> None:
+    t = np.arange(22 * RATE) / RATE
+    speed = 0.8 * np.clip((t - 0.8) / 2, 0, 1)
+    yaw = 0.8 * np.sin(0.5 * np.clip(t - 0.8, 0, None))
+    velocity = np.column_stack([speed * np.cos(yaw), speed * np.sin(yaw), 0 * t])
+    _, without = outage(velocity, 0 * t, 12.0, yaw)
+    operator, held = outage(velocity, 0 * t, 12.0, yaw, slip=0.02)
+    assert held < 0.5 * without
+    assert count(operator, "slip, used") > 150
+
+
+def test_two_plays_and_one_continued_from_a_snapshot_give_equal_bits() -> None:
+    velocity, tremble = walked(6.0, 4.0)
+    imu, poses, _ = readings(velocity, tremble)
+    params: dict[str, Any] = {"heading": 0.0, "standstill": 0.1, "slip": 0.05, "sensors": {"robot/pose": {}}}
+    streams = {"robot/imu": imu, "robot/pose": poses}
+    assert fused(streams, **params)[1].digests() == fused(streams, **params)[1].digests()
+    one, other = EkfFusion(**params), EkfFusion(**params)
+    for operator in (one, other):
+        operator.setup()
+    firings: dict[int, dict[str, Message]] = {}
+    for name, messages in streams.items():
+        for message in messages:
+            firings.setdefault(message.stamp, {})[f"ns/{name}"] = message
+    rows = sorted(firings.items())
+    for stamp, given in rows[:480]:
+        one.process(given, Context(stamp))
+    other.restore(one.snapshot())
+    for stamp, given in rows[480:]:
+        first, second = (o.process(given, Context(stamp)) for o in (one, other))
+        assert first is not None
+        assert second is not None
+        assert first["odometry"].digest() == second["odometry"].digest()
+
+
+@pytest.mark.parametrize("gap", [1, 2], ids=["too few readings", "readings that end"])
+def test_a_standstill_needs_half_a_second_of_readings(gap: int) -> None:
+    constraints = Constraints(0.1, None)
+    quiet, up = Noise(1e-3, 1e-2, 0.0, 0.0), np.array([0.0, 0.0, GRAVITY])
+    found = []
+    for k in range(12):
+        time = k * 10_000_000 if gap == 1 else k * 400_000_000
+        found += list(constraints.after(Sample(time, np.zeros(3), up, quiet), np.eye(4)))
+    assert found == []
+
+
+def test_neither_is_used_unasked() -> None:
+    constraints = Constraints(None, None)
+    assert constraints.gates == {}
+    quiet, up = Noise(1e-3, 1e-2, 0.0, 0.0), np.array([0.0, 0.0, GRAVITY])
+    assert not [m for k in range(200) for m in constraints.after(Sample(k * 10**7, np.zeros(3), up, quiet), np.eye(4))]

@@ -1,0 +1,58 @@
+"""What several looks at a posture tell together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from operators.recognition.activity.looks import Looks
+
+
+def probabilities(*values: float) -> np.ndarray:
+    return np.array(values, np.float32)
+
+
+def test_looks_count_for_half_a_second() -> None:
+    looks = Looks()
+    assert looks.evidence(1.0) is None
+    looks.update(1.0, probabilities(0.8, 0.2))
+    looks.update(1.5, None)
+    assert looks.evidence(1.0) is not None
+    looks.update(1.6, None)
+    assert looks.evidence(1.0) is None
+
+
+def test_two_looks_that_contradict_each_other_say_nothing() -> None:
+    looks = Looks()
+    looks.update(0.0, probabilities(0.9, 0.1))
+    looks.update(0.25, probabilities(0.1, 0.9))
+    found = looks.evidence(1.0)
+    assert found is not None
+    np.testing.assert_allclose(found, 1.0, atol=1e-5)
+
+
+@given(
+    looks=st.lists(st.lists(st.floats(0, 1, width=32), min_size=3, max_size=3), min_size=1, max_size=4),
+    weight=st.floats(0, 3),
+)
+def test_the_likeliest_has_one_and_none_has_nothing(looks: list[list[float]], weight: float) -> None:
+    taken = Looks()
+    for k, look in enumerate(looks):
+        taken.update(0.1 * k, probabilities(*look))
+    found = taken.evidence(weight)
+    assert found is not None
+    assert found.max() == pytest.approx(1.0)
+    assert found.min() >= 0.01**weight * 0.99
+    if weight == 0:
+        assert (found == 1).all()
+
+
+def test_looks_go_on_after_a_snapshot() -> None:
+    first, second = Looks(), Looks()
+    first.update(0.0, probabilities(0.7, 0.3))
+    second.restore(first.snapshot())
+    for each in (first, second):
+        each.update(0.4, probabilities(0.5, 0.5))
+    assert str(first.evidence(1.0)) == str(second.evidence(1.0))

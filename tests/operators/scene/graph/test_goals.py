@@ -1,0 +1,91 @@
+"""Where an agent is going, from its path and what there is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from operators.labels import LabelSpace, labels_file
+from operators.scene.bodies import Body
+from operators.scene.graph.goals import GoalInference
+from operators.scene.graph.layers import GraphSettings, LayeredGraph
+
+STEP = 250_000_000
+roles = LabelSpace.read(Path(labels_file("simulator"))).roles
+
+
+def thing(id: int, label: str, x: float, y: float, *, size: float = 0.1, z: float = 0.8, yaw: float = 0.0) -> Body:
+    return Body(id, label, np.array([x, y, z]), np.full(3, size), yaw, np.zeros(3), roles(label))
+
+
+def person(x: float, y: float) -> Body:
+    return Body(9, "person", np.array([x, y, 0.85]), np.array([0.6, 0.4, 1.7]), 0.0, np.zeros(3), roles("person"))
+
+
+def after(places: list[tuple[float, float]], goals: list[Body]) -> dict[int, float]:
+    inference, found = inferring(), {-1: 1.0}
+    for k, (x, y) in enumerate(places):
+        found = inference.update(0.25 * k, person(x, y), goals)
+    return found
+
+
+def inferring() -> GoalInference:
+    s = GraphSettings()
+    return GoalInference(s.trust, s.memory, s.elsewhere)
+
+
+def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
+    doors = [thing(1, "door", 4, 0, size=1), thing(2, "door", 0, 4, size=1)]
+    for k in (4, 8, 14):
+        found = after([(0.15 * n, 0.0) for n in range(k)], doors)
+        assert sum(found.values()) == pytest.approx(1)
+        assert found[1] > found[2]
+    assert found[1] > 0.8
+
+
+@pytest.mark.parametrize("side", [1, -1], ids=["left", "right"])
+def test_a_path_to_a_thing_says_the_same_for_either_hand(side: int) -> None:
+    """Somebody walks straight past one mug to another, which lies on this side of a table or on that."""
+    mugs = [thing(2, "mug", 0.6, 0.3 * side), thing(3, "mug", 0.6, -0.3 * side)]
+    found = after([(0.08 * k, 0.03 * side * k) for k in range(9)], mugs)
+    assert max(found, key=lambda i: found[i]) == 2
+
+
+def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
+    """Doors left and right, equally far from who has come from the left: that to the left was left behind."""
+    left, right = thing(1, "door", -1, 0, size=1), thing(2, "door", 3, 0, size=1)
+    inference, walk = inferring(), [0.2 * k for k in range(6)]
+    for k, x in enumerate(walk):
+        late = inference.update(0.25 * k, person(x, 0.0), [right] if k < 5 else [left, right])
+    early = after([(x, 0.0) for x in walk], [left, right])
+    assert late == early
+    assert late[1] < 0.5 * late[2]
+
+
+def test_the_jitter_of_a_box_that_stands_still_says_nothing_against_any_goal() -> None:
+    rng = np.random.default_rng(3)
+    chair = [thing(1, "chair", 0.44, 0.0, size=0.5, z=0.4)]
+    still = after([(0.0, 0.0)] * 40, chair)
+    shaken = after([(float(x), float(y)) for x, y in rng.normal(0, 0.02, (39, 2))] + [(0.0, 0.0)], chair)
+    assert shaken[1] == pytest.approx(still[1], abs=0.02)
+
+
+def test_a_person_in_a_graph_heads_for_what_it_walks_to() -> None:
+    table = Body(1, "table", np.array([1.0, 0.0, 0.4]), np.array([0.6, 1.6, 0.8]), 0.0, np.zeros(3), roles("table"))
+    door = thing(2, "door", -3.0, 0.0, size=1)
+    graph = LayeredGraph(GraphSettings())
+    for k in range(10):
+        now = graph.update(k * STEP, [table, door, person(min(-1 + 0.15 * k, 0.3), 0.0)], None)
+    (act,) = now.acts
+    assert act.goal == 1
+
+
+def test_a_restored_inference_goes_on_the_same() -> None:
+    goals = [thing(1, "door", 4, 0, size=1), thing(2, "chair", 0, 4, size=0.5)]
+    first, second = inferring(), inferring()
+    for k in range(8):
+        first.update(0.25 * k, person(0.2 * k, 0.1 * k), goals)
+    second.restore(first.snapshot())
+    assert first.update(2.0, person(1.7, 0.8), goals) == second.update(2.0, person(1.7, 0.8), goals)

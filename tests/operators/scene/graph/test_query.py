@@ -1,0 +1,225 @@
+"""Questions to a scene graph, from Python and on the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dataflow.messages import SceneGraph
+from dataflow.recording import RecordingWriter
+from operators.scene.commands import scene
+from operators.scene.graph.query import _MEANT, _PHRASES, Clause, QueryError, as_json, ask, parse
+from operators.scene.graph.spark import as_spark_dsg
+
+NAMES = ("mug", "table", "person", "floor", "room")
+NODES = ((-2, 4), (0, 3), (1, 1), (2, 0), (3, 0), (4, 2), (5, 1))
+RELATIONS = ((2, "on", 1, 0.9), (3, "on", 0, 0.8), (2, "near", 4, 0.7), (1, "left_of", 5, 0.6), (4, "holding", 3, 0.4))
+
+
+def graph(stamp: int = 1_000_000_000) -> SceneGraph:
+    """Two tables, two mugs, a person: mug 2 is on table 1 near person 4, mug 3 on the floor."""
+    ids = [i for i, _ in NODES]
+    return SceneGraph(
+        stamp=stamp,
+        frame="world",
+        class_names=NAMES,
+        ids=np.array(ids, np.int64),
+        class_ids=np.array([c for _, c in NODES], np.int32),
+        positions=np.arange(3 * len(ids), dtype=float).reshape(-1, 3),
+        sizes=np.ones((len(ids), 3)),
+        scores=np.full(len(ids), 0.95, np.float32),
+        predicates=tuple(p for _, p, _, _ in RELATIONS),
+        subjects=np.array([ids.index(s) for s, _, _, _ in RELATIONS], np.int32),
+        objects=np.array([ids.index(o) for _, _, o, _ in RELATIONS], np.int32),
+        relation_scores=np.array([s for _, _, _, s in RELATIONS], np.float32),
+    )
+
+
+@pytest.mark.parametrize(
+    ("question", "ids"),
+    [
+        ("mug on table near person", [2]),
+        ("the mug that is on a floor", [3]),
+        ("table supports mug", [1]),
+        ("table right of table 1", [5]),
+        ("mug not on table", [3]),
+        ("person near mug", [4]),
+        ("anything on anything", [2, 3]),
+        ("person holding mug 3", [4]),
+        ("mug 2", [2]),
+        ("person on table", []),
+    ],
+)
+def test_a_question_finds_what_fits(question: str, ids: list[int]) -> None:
+    made = graph()
+    assert [int(made.ids[m.node]) for m in ask(made, question)] == ids
+
+
+def test_the_score_is_that_of_the_weakest_link() -> None:
+    assert ask(graph(), "mug on table near person")[0].score == pytest.approx(0.7)
+
+
+def test_relations_of_several_words_are_understood() -> None:
+    assert parse("mug in front of table and not left_of person", NAMES) == (
+        "mug",
+        [Clause("in_front_of", "table"), Clause("left_of", "person", False)],
+    )
+
+
+@pytest.mark.parametrize(
+    ("question", "words"),
+    [
+        ("mugg on table", "did you mean 'mug'"),
+        ("mug nearr table", "'nearr' is no relation; did you mean 'near'"),
+        ("mug insde table", "'insde' is no relation; did you mean 'in'"),
+        ("mug inside table", "did you mean 'in'"),
+        ("mug on top of table", "'on top of' is no relation; did you mean 'on'"),
+        ("mug ontop of table", "did you mean 'on'"),
+        ("mug besides table", "did you mean 'near'"),
+        ("mug below table", "did you mean 'under'"),
+        ("mug undr table", "did you mean 'under'"),
+        ("mug left table", "did you mean 'left of'"),
+        ("mug nearr table", "there are above, approaching, behind, facing, heads for"),
+        ("mug xyzzy table", "'xyzzy' is no relation; there are above"),
+        ("mug not", "ends where a relation should be named; there are above"),
+        ("mug on", "ends where a thing should be named"),
+        ("", "the question is empty"),
+    ],
+)
+def test_what_is_not_understood_is_named(question: str, words: str) -> None:
+    with pytest.raises(QueryError, match=words):
+        ask(graph(), question)
+
+
+def test_what_is_proposed_is_a_relation_and_no_relation_is_called_something_else() -> None:
+    assert set(_MEANT.values()) <= set(_PHRASES)
+    assert not set(_MEANT) & set(_PHRASES)
+
+
+def test_the_graph_as_json_names_layers_and_scores() -> None:
+    made = as_json(graph())
+    assert {n["name"]: n["layer"] for n in made["nodes"]}["room -2"] == "room"
+    assert made["relations"][0] == {"subject": 2, "predicate": "on", "object": 1, "score": 0.9}
+    json.dumps(made)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    file = tmp_path / "room.mcap"
+    with RecordingWriter(file, metadata={}) as writer:
+        writer.add_stream("robot1/scene/graph", SceneGraph)
+        for k in range(3):
+            writer.write("robot1/scene/graph", graph((k + 1) * 1_000_000_000), seq=k)
+    return file
+
+
+def asked(*words: str) -> tuple[int, str]:
+    done = CliRunner().invoke(scene, list(words))
+    return done.exit_code, done.output
+
+
+def test_the_command_answers_from_a_recording(recording: Path) -> None:
+    code, out = asked(str(recording), "--query", "mug on table near person")
+    assert code == 0
+    assert out.startswith("mug 2 at (9.00, 10.00, 11.00) m, score 0.70: on table 1; near person 4")
+    assert asked(str(recording), "--query", "person on table")[0] == 1
+    code, out = asked(str(recording), "--at", "1.2", "--query", "mug", "--json")
+    assert code == 0
+    assert json.loads(out)["stamp"] == 2_000_000_000
+    assert [m["id"] for m in json.loads(out)["matches"]] == [2, 3]
+    assert "holding" in asked(str(recording), "--nodes")[1]
+
+
+def test_a_time_after_the_last_graph_is_said(recording: Path) -> None:
+    code, out = asked(str(recording), "--at", "99")
+    assert code == 0
+    assert "nothing is newer than 2.0 s" in out
+    assert "newer" not in asked(str(recording), "--at", "2.5")[1]
+
+
+def test_an_export_is_not_replaced_unasked(recording: Path, tmp_path: Path) -> None:
+    file = tmp_path / "out" / "scene.json"
+    words = (str(recording), "--export", str(file))
+    assert asked(*words)[0] == 0
+    made = file.read_bytes()
+    file.write_text("mine")
+    code, out = asked(*words)
+    assert (code, file.read_text()) == (2, "mine")
+    assert "--overwrite" in out
+    assert asked(*words, "--overwrite")[0] == 0
+    assert file.read_bytes() == made
+    assert asked(*words[:2], str(tmp_path))[0] == 2  # a folder
+
+
+def test_a_recording_without_a_scene_graph_says_what_makes_one(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "run.mcap", metadata={}):
+        pass
+    code, out = asked(str(tmp_path / "run.mcap"))
+    assert code == 2
+    assert "holds no scene graph" in " ".join(out.split())
+
+
+def test_without_a_question_the_command_tells_the_graph_in_short(recording: Path) -> None:
+    code, out = asked(str(recording))
+    assert code == 0
+    assert "nodes," in out.splitlines()[0]
+    assert "who does what" in out
+    assert "person 4" in out
+    assert "what carries what" in out
+    assert "near" not in out.split("next:")[0], "what is near what is not told unasked"
+    listed = asked(str(recording), "--nodes")[1]
+    assert "position, m" in listed
+
+
+def test_the_command_says_what_is_wrong(recording: Path, tmp_path: Path) -> None:
+    code, out = asked(str(recording), "--query", "cup on table")
+    assert (code, "'cup' is no class of this graph" in " ".join(out.split())) == (2, True)
+    code, out = asked(str(tmp_path / "none.mcap"))
+    assert (code, "there is no file" in out) == (2, True)
+    code, out = asked(str(recording), "--stream", "other")
+    assert (code, "robot1/scene/graph" in " ".join(out.split())) == (2, True)
+
+
+def test_a_surface_is_asked_for_by_its_name_and_has_its_layer() -> None:
+    made = graph()
+    names = ["room", "floor", "table 1", "mug 2", "mug 3", "person 4", "wall 1"]
+    made = made.replace(
+        class_names=(*NAMES, "wall"),
+        ids=np.array([*made.ids[:-1], -11]),
+        class_ids=np.array([*made.class_ids[:-1], len(NAMES)], np.int32),
+        labels=tuple(names),
+    )
+    assert [int(made.ids[m.node]) for m in ask(made, "wall 1")] == [-11]
+    assert [int(made.ids[m.node]) for m in ask(made, "table left of wall 1")] == [1]
+    layers = {node["name"]: node["layer"] for node in as_json(made)["nodes"]}
+    assert (layers["wall 1"], layers["floor"], layers["room"]) == ("surface", "surface", "room")
+    exported = {node["attributes"]["name"]: node for node in as_spark_dsg(made)["nodes"]}
+    assert {name for name, node in exported.items() if node["layer"] == 3} == {"wall 1", "floor"}
+    assert len({node["id"] for node in exported.values()}) == len(names)
+
+
+def test_the_export_has_every_node_its_layer_and_one_edge_for_two_nodes(tmp_path: Path) -> None:
+    exported = as_spark_dsg(graph())
+    names = {node["id"]: node["attributes"]["name"] for node in exported["nodes"]}
+    assert len(names) == len(NODES)
+    assert [node["attributes"]["name"] for node in exported["nodes"] if node["layer"] == 4] == ["room -2"]
+    pairs = [frozenset((edge["source"], edge["target"])) for edge in exported["edges"]]
+    assert len(pairs) == len(set(pairs)) == len(RELATIONS) + len(NODES) - 1
+    told = [relation for edge in exported["edges"] for relation in edge["info"]["metadata"]["relations"]]
+    assert "mug 2 on table 1" in told
+
+
+def test_spark_dsg_opens_the_export(tmp_path: Path) -> None:
+    spark_dsg = pytest.importorskip("spark_dsg", reason="spark-dsg is not installed")
+    file = tmp_path / "graph.json"
+    file.write_text(json.dumps(as_spark_dsg(graph())))
+    opened = spark_dsg.DynamicSceneGraph.load(str(file))
+    assert opened.num_nodes() == len(NODES)
+    mug = opened.get_node(spark_dsg.NodeSymbol("O", 2).value)
+    assert mug.attributes.name == "mug 2"
+    np.testing.assert_allclose(mug.attributes.position, graph().positions[3])
+    assert opened.get_labelspace(2, 0).get_category(mug.attributes.semantic_label) == "mug"

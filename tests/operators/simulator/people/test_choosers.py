@@ -1,0 +1,161 @@
+"""Persons who choose among drinks and seats: what they are said to want is what they get, and nobody is in the way."""
+
+from __future__ import annotations
+
+import functools
+import re
+
+import numpy as np
+import pytest
+
+from operators.simulator.people.body import varied_body
+from operators.simulator.people.movers import Carried
+from operators.simulator.people.persons import Person
+from operators.simulator.rendering.native import open3d
+from operators.simulator.scene import Thing, World
+from operators.simulator.things.furnishing import FLOOR
+from operators.simulator.worlds.make import NAMES, make_world
+
+ROBOT_RADIUS = 0.22
+
+
+@functools.lru_cache
+def world(name: str, seed: int, people: int = 4) -> World:
+    return make_world(name, seed, speed=0.5, hold=0.0, movers=True, people=people)
+
+
+def choosers(here: World) -> list[Thing]:
+    return [
+        thing
+        for thing in here.objects()
+        if isinstance(thing.mover, Person) and len({act.goal for act in thing.mover.timeline.acts}) > 4
+    ]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+def test_there_are_as_many_persons_as_are_asked_for(name: str) -> None:
+    for people in (2, 3, 4):
+        here = world(name, 0, people)
+        assert sum(thing.label == "person" for thing in here.objects()) == people
+        assert len(choosers(here)) == people - 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_who_chooses_has_six_candidates_and_gets_what_it_wants(name: str, seed: int) -> None:
+    here = world(name, seed)
+    for person in choosers(here):
+        timeline = person.mover.timeline  # type: ignore[attr-defined]
+        goals = {act.goal for act in timeline.acts}
+        assert len(goals) == 6
+        reached = set()
+        for t in np.arange(0, timeline.period, 0.3):
+            (doing,) = (d for d in here.doings(t) if d.thing == person.id)
+            relations = [r for r in here.relations(t) if r.subject == person.id]
+            found = re.fullmatch(r"(?:sit down on|drink from) (\w+) (\d+)", doing.goal)
+            assert found is not None
+            wanted = int(found[2])
+            assert here.thing(wanted).label == found[1]
+            for relation in relations:
+                if relation.predicate in ("holding", "reaching_for", "sitting_on"):
+                    assert relation.object == wanted
+                    reached.add(doing.goal)
+            words = {r.predicate for r in relations}
+            assert ("sitting_on" in words) == (doing.activity == "sitting")
+            assert ("holding" in words) == (doing.activity == "drinking")
+            assert ("reaching_for" in words) == (doing.activity == "reaching")
+            assert ("on" in words) != ("sitting_on" in words)
+        assert reached == goals
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_goal_is_known_before_it_is_reached(name: str) -> None:
+    """From the choice until the hand or the pelvis moves there are seconds in which to infer it."""
+    for person in choosers(world(name, 0)):
+        acts, leads, lead = person.mover.timeline.acts, [], 0.0  # type: ignore[attr-defined]
+        for act in acts:
+            lead = lead + act.seconds if act.activity in ("standing", "walking") else 0.0
+            if act.activity == "walking":
+                leads.append(lead)
+        assert min(leads) > 2
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_hand_takes_what_it_reaches_for(name: str, seed: int) -> None:
+    here = world(name, seed)
+    for person in choosers(here):
+        mover = person.mover
+        assert isinstance(mover, Person)
+        before = -mover.timeline.phase
+        for act in mover.timeline.acts:
+            if act.activity == "drinking" and act.lift == (0.0, 1.0):
+                assert act.grasp is not None
+                assert np.linalg.norm(mover.grip(before + 1e-3) - act.grasp) < 0.03
+                still, lifted = (here.thing(act.object).mover.frame(t)[:3, 3] for t in (before, before + 1.3))
+                assert np.linalg.norm(still - act.grasp) < 0.12
+                assert lifted[2] > still[2] + 0.2
+            before += act.seconds
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_who_chooses_passes_through_nothing(name: str, seed: int) -> None:
+    """Not one edge of a body meets a triangle of what stands still, except of the chairs that it sits on."""
+    here, o3d = world(name, seed), open3d()
+    seats = {p.relation.object for p in here.placements if p.relation.predicate == "sitting_on"}
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    names = {}
+    for thing in here.objects():
+        if thing.still and thing.id not in seats:
+            triangles = o3d.core.Tensor(triangles_of(thing).astype(np.uint32))
+            names[int(scene.add_triangles(o3d.core.Tensor(thing.vertices(0.0).astype(np.float32)), triangles))] = thing
+    for person in choosers(here):
+        ends = triangles_of(person)
+        edges = np.unique(np.sort(np.concatenate([ends[:, [0, 1]], ends[:, [1, 2]], ends[:, [2, 0]]]), axis=1), axis=0)
+        for t in np.arange(0, person.mover.timeline.period, 0.7):  # type: ignore[attr-defined]
+            a, b = person.vertices(t)[edges].transpose(1, 0, 2)
+            hits = scene.cast_rays(o3d.core.Tensor(np.concatenate([a, b - a], axis=1).astype(np.float32)), nthreads=1)
+            met = hits["geometry_ids"].numpy()[hits["t_hit"].numpy() < 1]
+            assert not len(met), (t, {f"{names[int(k)].label} {names[int(k)].id}" for k in met})
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+def test_persons_more_keep_their_lanes_and_stay_off_the_robots_path(name: str) -> None:
+    for seed in range(6):
+        here = world(name, seed)
+        for k, lane in enumerate(here.lanes):
+            assert lane.gap(here.path.outline()) > ROBOT_RADIUS, (seed, lane.mover)
+            assert all(lane.apart(other) > 0 for other in here.lanes[k + 1 :]), (seed, lane.mover)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_carried_lies_on_its_table_while_nobody_holds_it(name: str) -> None:
+    here = world(name, 0)
+    for thing in (t for t in here.objects() if isinstance(t.mover, Carried)):
+        for t in np.arange(0, 60, 1.3):
+            held = any(r.predicate == "holding" and r.object == thing.id for r in here.relations(t))
+            lies = [r.object for r in here.relations(t) if r.predicate == "on" and r.subject == thing.id]
+            assert held != bool(lies)
+            assert FLOOR not in lies
+            if lies:
+                table = here.thing(lies[0]).vertices(t)
+                assert thing.vertices(t)[:, 2].min() == pytest.approx(table[:, 2].max(), abs=0.02)
+
+
+def test_varied_bodies_differ_in_size_and_shape() -> None:
+    bodies = [varied_body(np.random.default_rng(seed)) for seed in range(40)]
+    assert np.ptp([body.height for body in bodies]) > 0.35
+    assert len({tuple(len(part) for part in body.parts) for body in bodies}) >= 6
+    assert {len(body.parts) for body in bodies} == {13}
+
+
+def triangles_of(thing: Thing) -> np.ndarray:
+    """Corners (T, 3) of a thing's triangles as indices into its vertices."""
+    patches = [patch for part in thing.parts for patch in part]
+    firsts = np.cumsum([0, *(len(patch.vertices) for patch in patches)])
+    return np.concatenate([patch.triangles + first for patch, first in zip(patches, firsts, strict=False)])

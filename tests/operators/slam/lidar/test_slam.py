@@ -1,0 +1,286 @@
+"""LiDAR SLAM in a made room with known truth: loops, saved maps, other rooms, failures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.messages import PointCloud, Transforms
+from dataflow.messages.geometry import invert
+from dataflow.testing import Played, play
+from operators.cloud.registration import Settings
+from operators.geometry.se3 import Matrix
+from operators.odometry import LidarOdometry
+from operators.odometry.lidar.tracker import State, Tracked
+from operators.slam import LidarSlam
+from operators.slam.lidar.graph import LidarGraph, LidarSettings
+from operators.slam.lidar.map_file import read_lidar_map
+from operators.slam.lidar.mapper import LidarMapper, Mapped
+from operators.slam.lidar.view import LidarEyes, LidarView
+from operators.slam.place import Place
+from tests.support.made_scans import HALL, HALL_BOXES, NOTHING, at, drifting, on_round, scan
+
+ROUND = 28  # scans
+STEP = 250_000_000  # ns
+NEAR = {"keyframe": 0.35, "travel": 2.5}
+
+
+@cache
+def seen(pose: bytes, seed: int, room: str = "room") -> NDArray[np.float32]:
+    T = np.frombuffer(pose).reshape(4, 4)
+    if room == "hall":
+        return scan(T, seed, HALL, HALL_BOXES)
+    if room == "square":
+        return scan(T, seed, np.array([3.0, 3.0, 1.2]), NOTHING)
+    return scan(T, seed)
+
+
+def clouds(poses: Sequence[Matrix], room: str = "room", first: int = 0) -> list[PointCloud]:
+    return [
+        PointCloud(stamp=(first + k + 1) * STEP, frame="lidar", points=seen(T.tobytes(), first + k, room))
+        for k, T in enumerate(poses)
+    ]
+
+
+def run(given: list[PointCloud], **params: object) -> Played:
+    return play(LidarSlam(**(NEAR | params)), {"cloud": given})  # type: ignore[arg-type]
+
+
+def texts(played: Played) -> list[str]:
+    return [status.messages[0] for status in played["status"]]
+
+
+def errors(poses: Sequence, truth: Sequence[Matrix], origin: Matrix) -> NDArray[np.float64]:  # type: ignore[type-arg]
+    """Distance (m) of poses in the map from the truth, where the map's origin is known; no alignment."""
+    return np.array(
+        [np.linalg.norm((origin @ p.matrix())[:3, 3] - T[:3, 3]) for p, T in zip(poses, truth, strict=True)]
+    )
+
+
+def elsewhere(count: int) -> list[Matrix]:
+    """A LiDAR that crosses the room beside the round, turned round."""
+    return [at(-1.0 + 0.12 * k, -1.1 + 0.03 * k, 2.6 + 0.05 * k) for k in range(count)]
+
+
+@pytest.fixture(scope="module")
+def around() -> Played:
+    """A round and a bit more."""
+    return run(clouds(on_round(ROUND + 5)))
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of a round."""
+    file: Path = tmp_path_factory.mktemp("maps") / "room.npz"
+    run(clouds(on_round(ROUND)), save=str(file))
+    return file
+
+
+# -- odometry and correction ---------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_odometry_is_that_of_lidar_odometry_and_pose_is_its_correction(around: Played) -> None:
+    plain = play(LidarOdometry(), {"cloud": clouds(on_round(ROUND + 5))})
+    assert around.digests()["odometry"] == plain.digests()["odometry"]
+    for odometry, correction, pose in zip(around["odometry"], around["correction"], around["pose"], strict=True):
+        assert (correction.frames, correction.child_frames) == (("map",), ("odom",))
+        np.testing.assert_allclose(correction.matrices()[0] @ odometry.matrix(), pose.matrix(), atol=1e-9)
+        assert (pose.frame, pose.child_frame, pose.stamp) == ("map", "lidar", odometry.stamp)
+
+
+def test_a_place_seen_again_is_a_loop_and_the_map_does_not_grow_there(around: Played) -> None:
+    told = texts(around)
+    assert any(text.startswith("corrected") for text in told[ROUND - 2 :])
+    assert not any(text.startswith("corrected") for text in told[: ROUND // 2])
+    views = [int(s.values[s.keys.index("views")]) for s in around["status"]]
+    assert views[-1] - views[ROUND - 1] <= 1
+    assert errors(around["pose"], on_round(ROUND + 5), on_round(1)[0]).max() < 0.03
+    assert len(around["path"]) > 0
+    assert len(around["map"]) > 0
+
+
+def test_poses_are_those_of_the_body_where_one_is_named() -> None:
+    mount = at(0.3, 0.1, 0.4)
+    extrinsics = Transforms.from_matrix(mount, stamp=0, frame="base_link", child_frame="lidar")
+    given = {"cloud": clouds(on_round(ROUND + 4)), "extrinsics": [extrinsics]}
+    played = play(LidarSlam(body_frame="base_link", **NEAR), given, static=("extrinsics",))  # type: ignore[arg-type]
+    bodies = [T @ invert(mount) for T in on_round(ROUND + 4)]
+    assert played["pose"][-1].child_frame == "base_link"
+    assert errors(played["pose"], bodies, bodies[0]).max() < 0.03
+    walls = played["map"][-1].points @ bodies[0][:3, :3].T + bodies[0][:3, 3]
+    assert np.quantile(np.abs(walls[:, 0]), 0.99) == pytest.approx(4.0, abs=0.1)  # half the room's length
+
+
+def test_covariance_covers_the_error(around: Played) -> None:
+    truth = on_round(ROUND + 5)
+    R, squares = truth[0][:3, :3], []
+    for pose, T in zip(around["pose"][1:], truth[1:], strict=True):
+        off = (truth[0] @ pose.matrix())[:3, 3] - T[:3, 3]
+        squares.append(off @ np.linalg.solve(R @ pose.pose_covariance[:3, :3] @ R.T, off) / 3)
+    assert 0.005 < np.mean(squares) < 3.0
+
+
+# -- loops of an odometry that drifts ------------------------------------------------------------------------
+
+
+def mapper(rivals: int = 3) -> LidarMapper:
+    eyes = LidarEyes(Settings(0.1, 1, 0.5, 0.9, 0.04), Settings(0.1, 1, 0.5, 0.9, 0.08), 0.03, 10.0, 0.5)
+    graph = LidarGraph(LidarSettings(spacing=0.35, travel=2.5, searched=rivals), eyes)
+    return LidarMapper(graph, lambda points: LidarView(points, 10.0, 0.1))
+
+
+def tracked(
+    T: Matrix, points: NDArray[np.float32] | None, covariance: Matrix, state: State = State.TRACKING
+) -> Tracked:
+    none = np.zeros((0, 6))
+    given = None if points is None else points.astype(np.float64)
+    return Tracked(state, "", T, covariance, np.zeros(6), None, none, {}, given)
+
+
+def mapped(poses: Sequence[Matrix], said: Sequence[Matrix], slam: LidarMapper) -> list[Mapped]:
+    """What becomes of scans from `poses` whose odometry says `said`."""
+    grown = np.diag([1e-2**2] * 6)
+    return [
+        slam.take(tracked(T, seen(at.tobytes(), k), (k + 1) * grown), (k + 1) * STEP)
+        for k, (at, T) in enumerate(zip(poses, said, strict=True))
+    ]
+
+
+def test_a_loop_takes_drift_away() -> None:
+    poses = on_round(ROUND + 5)
+    said = drifting(poses)
+    slam = mapper()
+    found = mapped(poses, said, slam)
+    truth = invert(poses[0]) @ poses[-1]
+    last = found[-1].T_map_odom
+    assert last is not None
+    assert np.linalg.norm((said[-1] - truth)[:3, 3]) > 0.2
+    assert np.linalg.norm((last @ said[-1] - truth)[:3, 3]) < 0.03
+    (middle,) = (n for n in slam.graph.nodes.values() if n.stamp == (ROUND // 2 + 1) * STEP)
+    true = invert(poses[0]) @ poses[ROUND // 2]  # the pose graph puts the middle of the round right too
+    assert np.linalg.norm((middle.T - true)[:3, 3]) < 0.6 * np.linalg.norm((said[ROUND // 2] - true)[:3, 3])
+
+
+@pytest.mark.long
+def test_a_new_map_of_the_odometry_is_tied_to_the_old_one_when_two_scans_say_the_same() -> None:
+    """The LiDAR is lost and carried across the room; its odometry begins anew, with a pose that means nothing."""
+    slam, poses = mapper(), on_round(ROUND)
+    mapped(poses, [invert(poses[0]) @ T for T in poses], slam)
+    lost = slam.take(tracked(np.eye(4), None, np.eye(6), State.LOST), 40 * STEP)
+    assert (lost.place, lost.T_map_odom) == (Place.ADRIFT, None)
+    there, wrong = elsewhere(8), at(9.0, -4.0, 1.0)
+    results = [
+        slam.take(tracked(wrong @ invert(there[0]) @ T, seen(T.tobytes(), 50 + k), np.eye(6)), (41 + k) * STEP)
+        for k, T in enumerate(there)
+    ]
+    assert results[0].place is Place.SEARCHING
+    assert results[0].T_map_odom is None
+    (found,) = [k for k, result in enumerate(results) if result.added.found]
+    assert found > 0
+    T = results[-1].T_map_odom
+    assert T is not None
+    pose = poses[0] @ T @ wrong @ invert(there[0]) @ there[-1]
+    assert np.linalg.norm((pose - there[-1])[:3, 3]) < 0.03
+
+
+# -- saved maps ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
+    poses = elsewhere(10)
+    played = run(clouds(poses, first=60), map_file=str(saved))
+    assert "corrected: the map is found" in texts(played)
+    assert len(played["pose"]) >= 5
+    assert errors(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0]).max() < 0.04
+
+
+@pytest.mark.long
+def test_a_saved_map_of_another_room_is_not_found(saved: Path) -> None:
+    played = run(clouds(elsewhere(5), "hall"), map_file=str(saved))
+    assert {text.split(":")[0] for text in texts(played)} == {"searching"}
+    assert played["pose"] == []
+    assert played["correction"] == []
+
+
+@pytest.mark.long
+def test_a_room_that_looks_alike_in_four_headings_is_not_found(tmp_path: Path) -> None:
+    run(clouds(on_round(ROUND), "square"), save=str(tmp_path / "square.npz"))
+    played = run(clouds(elsewhere(4), "square", first=60), map_file=str(tmp_path / "square.npz"))
+    assert played["pose"] == []
+    assert any("ambiguous" in text for text in texts(played))
+
+
+def test_a_saved_map_has_the_same_bytes_each_time(tmp_path: Path) -> None:
+    given = clouds(on_round(8))
+    for name in ("a.npz", "b.npz"):
+        run(given, save=str(tmp_path / name))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert len(read_lidar_map(tmp_path / "a.npz")) > 2
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 cut off"])
+def test_a_file_that_is_no_map_is_refused(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "wrong.npz"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match="is no LiDAR map"):
+        read_lidar_map(file)
+
+
+def test_a_damaged_map_and_one_of_another_version_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "new.npz", version=np.array(99))
+    with pytest.raises(ValueError, match="version 99"):
+        read_lidar_map(tmp_path / "new.npz")
+    np.savez(tmp_path / "cut.npz", version=np.array(1))
+    with pytest.raises(ValueError, match="damaged"):
+        read_lidar_map(tmp_path / "cut.npz")
+    with pytest.raises(FileNotFoundError):
+        LidarSlam(map_file=str(tmp_path / "none.npz")).setup()
+
+
+# -- bad scans, repeats --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((500, 3), np.nan)])
+def test_scans_that_tell_nothing_are_named_and_survived(points: NDArray[np.float64]) -> None:
+    poses = on_round(14)
+    given = clouds(poses)
+    given[7] = given[7].replace(points=points.astype(np.float32))
+    played = run(given)
+    assert texts(played)[7].startswith("adrift: odometry predicted: 0 usable points")
+    assert texts(played)[-1].startswith("mapped")
+    assert errors(played["pose"], poses, poses[0])[-1] < 0.03
+
+
+def test_nothing_but_empty_scans_gives_no_pose() -> None:
+    nothing = np.zeros((0, 3), np.float32)
+    played = run([PointCloud(stamp=(k + 1) * STEP, frame="lidar", points=nothing) for k in range(4)])
+    assert {text.split(":")[0] for text in texts(played)} == {"adrift"}
+    assert played["pose"] == played["odometry"] == played["map"] == []
+
+
+def test_the_same_scans_give_the_same_bytes(around: Played) -> None:
+    assert run(clouds(on_round(ROUND + 5))).digests() == around.digests()
+
+
+def test_a_restored_state_goes_on_alike() -> None:
+    given = clouds(on_round(ROUND + 4))
+    one, other = LidarSlam(**NEAR), LidarSlam(**NEAR)  # type: ignore[arg-type]
+    one.setup()
+    other.setup()
+    for cloud in given[: ROUND - 3]:
+        one.process(cloud)
+    recorded = pack_state(one.snapshot())
+    other.restore(unpack_state(recorded))
+    assert pack_state(other.snapshot()) == recorded
+    for cloud in given[ROUND - 3 :]:
+        sent, again = one.process(cloud), other.process(cloud)
+        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
+    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
