@@ -22,7 +22,7 @@ LONG = {
     "dataflow.cli.commands.recording:record": 71,
     "dataflow.cli.commands.replay:replay": 181,
     "dataflow.cli.commands.run:run": 106,
-    "dataflow.cli.commands.verification:verify": 160,
+    "dataflow.cli.commands.verification:verify": 148,
     "dataflow.process.operator_process:OperatorProcess.__init__": 80,
     "dataflow.supervision.plan:process_plans": 69,
     "dataflow.verification.verify:verify": 78,

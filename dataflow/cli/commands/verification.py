@@ -37,6 +37,8 @@ from dataflow.cli.support.run_options import Paranoid, Quiet
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from dataflow.causes.why import Why
+    from dataflow.graph import Graph
     from dataflow.verification.gate import Baseline, Checked
     from dataflow.verification.report import VerifyReport
 
@@ -111,6 +113,10 @@ def verify(
         ),
     ] = None,
     paranoid: Paranoid = False,
+    why: Annotated[
+        bool,
+        typer.Option("--why", metavar=FLAG, help="Find the causes: run each culprit alone, 8 times at most."),
+    ] = False,
     quiet: Quiet = False,
     one_process: Annotated[
         bool, typer.Option("--one-process", metavar=FLAG, help="Deprecated: means --jobs 1.")
@@ -139,6 +145,7 @@ def verify(
 
       dataflow verify run.mcap
       dataflow verify run.mcap --only odometry --json
+      dataflow verify run.mcap --only odometry --why
       dataflow verify run.mcap --only odometry --only mapper
       dataflow verify run.mcap --from odometry --graph changed.yaml
       dataflow verify run.mcap --tolerance 1e-5
@@ -149,27 +156,9 @@ def verify(
     from dataflow.verification.workers.prestart import early_workers
 
     with friendly_errors():
-        if one_process and process_each:
-            raise fail("--one-process and --process-each exclude each other")
-        if jobs is not None and (one_process or not 1 <= jobs <= MOST_JOBS):
-            raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}, without --one-process")
-        if one_process or process_each:
-            instead = "--jobs 1" if one_process else "nothing: each operator is fed from the recording"
-            say(f"[yellow]note:[/] {'--one-process' if one_process else '--process-each'} is deprecated; use {instead}")
         only = only or None  # typer gives an empty list where there is none
-        if first is not None and only is not None:
-            raise fail("--from and --only exclude each other")
-        if graph is None and settings:
-            raise fail("--set changes a graph file: name it with --graph")
-        if tolerance is not None and not 0 <= tolerance < float("inf"):
-            raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
-        check_offset("--start", start)
-        if start is not None and baseline is not None:
-            raise fail("--start and --baseline exclude each other: a baseline is of whole recordings")
-        if accept and baseline is None:
-            raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
-        if accept and (first is not None or only is not None):
-            raise fail("--accept takes whole recordings: leave --from and --only out")
+        _refuse_deprecated(one_process, process_each, jobs)
+        _refuse_what_excludes(first, only, graph, settings, tolerance, start, baseline, accept=accept)
         for target in recordings:
             if not target.is_dir():
                 existing(target, "a recording")
@@ -200,10 +189,47 @@ def verify(
             found = recordings_in(recordings)
             single = len(recordings) == 1 and recordings[0] == found[0][0]
             checked = _check(found, known, options, quiet=quiet, single=single)
-            _report(checked, single=single, json=json, junit=junit)
+            reasons = [_reasons(one, only, loaded) for one in checked] if why else []
+            _report(checked, reasons, single=single, json=json, junit=junit)
             if known is not None:
                 _mind_baseline(known, checked, accept=accept, whole=not single)
     raise typer.Exit(_exit_code(checked, known if accept else None))
+
+
+def _refuse_deprecated(one_process: bool, process_each: bool, jobs: int | None) -> None:
+    if one_process and process_each:
+        raise fail("--one-process and --process-each exclude each other")
+    if jobs is not None and (one_process or not 1 <= jobs <= MOST_JOBS):
+        raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}, without --one-process")
+    if one_process or process_each:
+        instead = "--jobs 1" if one_process else "nothing: each operator is fed from the recording"
+        say(f"[yellow]note:[/] {'--one-process' if one_process else '--process-each'} is deprecated; use {instead}")
+
+
+def _refuse_what_excludes(
+    first: str | None,
+    only: list[str] | None,
+    graph: Path | None,
+    settings: list[str] | None,
+    tolerance: float | None,
+    start: float | None,
+    baseline: Path | None,
+    *,
+    accept: bool,
+) -> None:
+    if first is not None and only is not None:
+        raise fail("--from and --only exclude each other")
+    if graph is None and settings:
+        raise fail("--set changes a graph file: name it with --graph")
+    if tolerance is not None and not 0 <= tolerance < float("inf"):
+        raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
+    check_offset("--start", start)
+    if start is not None and baseline is not None:
+        raise fail("--start and --baseline exclude each other: a baseline is of whole recordings")
+    if accept and baseline is None:
+        raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
+    if accept and (first is not None or only is not None):
+        raise fail("--accept takes whole recordings: leave --from and --only out")
 
 
 def _check(
@@ -238,20 +264,36 @@ def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], Verif
     return verifier
 
 
-def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | None) -> None:
+def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None) -> list[Why]:
+    from dataflow.causes.why import reasons
+
+    if checked.report is None:
+        return []
+    say(f"[dim]looking for causes in {escape(', '.join(only or checked.report.culprits) or 'nothing')}[/]")
+    return reasons(checked.path, checked.report, only or (), graph)
+
+
+def _report(checked: list[Checked], reasons: list[list[Why]], *, single: bool, json: bool, junit: Path | None) -> None:
+    from dataflow.cli.support.causes import print_reasons
     from dataflow.cli.support.verdicts import explain, print_many, print_one, reservations
+
+    found = [{"why": [one.as_json() for one in each]} for each in reasons] or [{}] * len(checked)
 
     if single and checked[0].report is None:
         [one] = checked
         fail(one.error, details=own_traceback(one.details) if one.internal else one.details)
     elif single and json:
-        print_json(checked[0].as_json())
+        print_json(checked[0].as_json() | found[0])
     elif single:
         print_one(out, checked[0])
     elif json:
-        print_json({"passed": all(c.passed for c in checked), "recordings": [c.as_json() for c in checked]})
+        values = [c.as_json() | more for c, more in zip(checked, found, strict=True)]
+        print_json({"passed": all(c.passed for c in checked), "recordings": values})
     else:
         print_many(out, checked)
+    if not json:
+        for one, each in zip(checked, reasons, strict=False):
+            print_reasons(out, "" if single else one.name, each)
     if junit is not None:
         from dataflow.cli.support.junit import write_junit
 

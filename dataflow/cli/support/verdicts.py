@@ -170,7 +170,7 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
     if repeats is False and judged.verdict != "within tolerance":
         yield (
             f"{v.operator}: run a second time, it differed in another way: it does not repeat "
-            "(it may read the clock, draw numbers that are not self.rng's, or use several threads)"
+            "(it may read the clock, draw numbers that are not self.rng's, or use threads; --why finds the cause)"
         )
     elif repeats and judged.verdict == "culprit":
         yield f"{v.operator}: run a second time, it differed alike: its code, its libraries or the machine changed"

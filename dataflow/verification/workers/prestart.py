@@ -39,9 +39,9 @@ class Started:
         """Returns the descriptors that the worker inherits."""
         return self.theirs, self.letter, self.board, self.words.fileno()
 
-    def spawn(self, threads: int) -> None:
-        """Starts its process, for numerical libraries with so many threads."""
-        self._process = _spawn([self], threads)
+    def spawn(self, variables: Mapping[str, str]) -> None:
+        """Starts its process with an environment."""
+        self._process = _spawn([self], variables)
         self.pid = self._process.pid
 
     def hear(self) -> bool:
@@ -78,7 +78,7 @@ def _await_end(pid: int) -> None:
         os.close(handle)
 
 
-def _spawn(workers: list[Started], threads: int) -> subprocess.Popen[bytes]:
+def _spawn(workers: list[Started], variables: Mapping[str, str]) -> subprocess.Popen[bytes]:
     """Starts the process of one worker; or one that forks itself for each, and ends: they are this process's then."""
     handed = [worker.handed() for worker in workers]
     slots = [",".join(map(str, each)) for each in handed]
@@ -86,7 +86,7 @@ def _spawn(workers: list[Started], threads: int) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
             [sys.executable, "-P", "-m", "dataflow.verification.workers.worker", *slots],
             pass_fds=[descriptor for each in handed for descriptor in each],
-            env=environment(threads),
+            env=variables,
             stdin=subprocess.DEVNULL,
             stdout=workers[0].words,
             stderr=subprocess.STDOUT,
@@ -114,9 +114,9 @@ class EarlyWorkers:
         with contextlib.suppress(OSError):  # a caller that needs one tries again, and reports the error
             self._waiting = [Started() for _ in range(count)]
             if count == 1:
-                self._waiting[0].spawn(1)
+                self._waiting[0].spawn(self._environment)
             else:
-                self._maker = _spawn(self._waiting, 1)
+                self._maker = _spawn(self._waiting, self._environment)
 
     def foresee(self, modules: Iterable[str]) -> None:
         """Has them import modules that they will need, found as they are found here."""

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
@@ -31,11 +31,15 @@ LAST_WORDS = 4000
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A call for a worker: the function as `module:name`, plain values for it, and the operators it will run."""
+    """A call for a worker: the function as `module:name`, plain values for it, and the operators it will run.
+
+    `environment`: variables of its process besides those of `execution.threads`.
+    """
 
     function: str
     request: Mapping[str, Any]
     operators: tuple[str, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=dict)
 
 
 Locate = Callable[[Call, str, int], str]
@@ -108,9 +112,10 @@ class _Worker:
 
     def __init__(self, number: int, call: Call, started: Started | None, threads: int, locate: Locate) -> None:
         """`started`: a process that waits already."""
+        variables = {**environment(threads), **call.environment}
         if started is None:
             started = Started()
-            started.spawn(threads)
+            started.spawn(variables)
         self.number, self.call, self._locate, self._started = number, call, locate, started
         self.answered, self.answer = False, None
         self._letter, self.channel, self._words = started.letter, started.channel, started.words
@@ -121,7 +126,7 @@ class _Worker:
                 "function": call.function,
                 "request": dict(call.request),
                 "operators": list(call.operators),
-                "environment": as_bytes(environment(threads)),
+                "environment": as_bytes(variables),
             },
         )
         with suppress(ChannelClosed):  # it has died: its end is read, with its words

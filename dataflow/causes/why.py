@@ -1,0 +1,247 @@
+"""Answers why an operator does not make what was recorded of it: re-runs of that operator alone, from its records."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from dataflow.causes.ladder import MOST, Findings, Ladder
+from dataflow.causes.rerun import Rerun, Setting, fake_time, run_again
+from dataflow.causes.sources import COMPILED, FILE, INPUT, MODULE, SOURCES, kind_of, name_of
+from dataflow.causes.traps import Site
+from dataflow.graph.model import Graph
+from dataflow.recording import Recording
+from dataflow.records.comparison import Verification
+from dataflow.records.reading import FiringLog
+from dataflow.reexecution.recorded_run import graph_as_recorded, graph_that_is_here
+from dataflow.supervision.core.report import RunFailed
+from dataflow.verification.books import Books
+from dataflow.verification.choice import accountable, with_makers
+from dataflow.verification.ledger import incomplete_streams
+from dataflow.verification.report import VerifyReport
+from dataflow.verification.workers.processes import Call, Workers, call_workers
+
+CALLS_AFTER = 32
+"""Calls that are repeated after the first that differs."""
+FROM_THE_START = 500
+"""Calls before the first that differs up to which re-runs begin with the recording, not with a snapshot."""
+SECONDS = 60.0
+"""Time for the calls of one re-run."""
+SITES_SHOWN = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """A source on which the results were shown to depend: `source` with its name, if it has one; the lines that led to
+    it, most calls first; `calls` of them all."""
+
+    source: str
+    sites: tuple[Site, ...] = ()
+    calls: int = 0
+    left: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        return kind_of(self.source)
+
+    @property
+    def what(self) -> str:
+        """Returns the source in words."""
+        return f"{self.kind} {name_of(self.source) or ', '.join(self.left)}".rstrip()
+
+    @property
+    def instead(self) -> str:
+        return SOURCES[self.kind].instead
+
+    def as_json(self) -> dict[str, Any]:
+        return {"cause": self.kind, "name": name_of(self.source)} | {
+            "meaning": SOURCES[self.kind].meaning,
+            "sites": [asdict(site) for site in self.sites],
+            "calls": self.calls,
+            "left": list(self.left),
+            "instead": self.instead,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Why:
+    """The answer about one operator. `refused`: the reason for which nothing was tried; `repeats`: whether its re-runs
+    agree; `settled`: whether they do with all sources of chance fixed (None where that was not tried or needed).
+    `cleared` sources were tried without effect, of each group in `open` one has an effect, `left_out` could not be
+    tried, with the reason. `changed` are facts that the recording holds and that differ now. `seconds` in all."""
+
+    operator: str
+    refused: str = ""
+    repeats: bool | None = None
+    settled: bool | None = None
+    causes: tuple[Cause, ...] = ()
+    cleared: tuple[str, ...] = ()
+    open: tuple[tuple[str, ...], ...] = ()
+    left_out: Mapping[str, str] | None = None
+    changed: tuple[str, ...] = ()
+    reruns: int = 0
+    seconds: float = 0.0
+
+    def as_json(self) -> dict[str, Any]:
+        plain = asdict(replace(self, causes=(), left_out=dict(self.left_out or {})))
+        return plain | {"causes": [cause.as_json() for cause in self.causes]}
+
+
+def why(
+    path: Path,
+    report: VerifyReport,
+    operator: str,
+    *,
+    graph: Graph | None = None,
+    seconds: float = SECONDS,
+    stall_timeout: float = 120.0,
+    workers: Workers = call_workers,
+) -> Why:
+    """Finds the causes for which an operator does not repeat, by at most `MOST` re-runs of it alone.
+
+    `report`: that of verifying the recording (with `graph`, if it was verified against another). `seconds`: time for
+    the calls of one re-run; `stall_timeout`: seconds allowed without progress. An operator that cannot be re-run, or
+    that makes what was recorded, is refused, with the reason.
+    """
+    began = time.monotonic()
+    verification = next((v for v in report.operators if v.operator == operator), None)
+    if refused := refusal(report, operator, verification):
+        return Why(operator, refused=refused)
+    assert verification is not None
+    alone = _Alone(path, graph, verification, seconds=seconds, stall_timeout=stall_timeout, workers=workers)
+    changed = (*alone.changed, *(f"file {file}" for file in verification.files_changed))
+    changed += tuple(f"{fact}: {then or 'none'} → {now or 'none'}" for fact, then, now in report.facts)
+    try:
+        wrote = alone.lines() if verification.wrote else None
+        if verification.first is None:
+            made = Why(operator, causes=(_cause(INPUT, wrote),), reruns=1)
+        else:
+            ladder = Ladder(alone.fire, tuple(alone.left_out), MOST - (wrote is not None))
+            made = _answer(operator, ladder.climb(report.repeats(operator)), alone, wrote, verification)
+    except RunFailed as failure:
+        if failure.interrupted:
+            raise
+        return Why(operator, refused=f"it cannot be run again: {failure}")
+    return replace(made, left_out=alone.left_out, changed=changed, seconds=time.monotonic() - began)
+
+
+def refusal(report: VerifyReport, operator: str, found: Verification | None) -> str:
+    """Returns why there is nothing to find out about an operator; nothing where there is."""
+    if operator in report.absent:
+        return f"it cannot be run again: {report.absent[operator]}"
+    if found is None:
+        return "it was not verified: a source or external operator is not run again"
+    match report.verdict(found):
+        case "culprit":
+            return ""
+        case "downstream":
+            return "its inputs differ: look at the culprits before it"
+        case "unverifiable":
+            return f"it cannot be run again: {found.missing or 'its records are not whole'}"
+    return f"it repeats: {report.verdict(found)}"
+
+
+def _answer(operator: str, findings: Findings, alone: _Alone, wrote: Rerun | None, verification: Verification) -> Why:
+    causes = [_cause(source, findings.first, findings.left) for source in findings.causes]
+    causes = [cause for cause in causes if cause.kind != FILE or alone.is_newer(name_of(cause.source), verification)]
+    first = [] if wrote is None else [_cause(INPUT, wrote)]
+    return Why(
+        operator,
+        repeats=findings.repeats,
+        settled=findings.settled,
+        causes=(*first, *causes),
+        cleared=tuple(findings.cleared),
+        open=tuple(findings.open),
+        reruns=findings.reruns + len(first),
+    )
+
+
+def _cause(source: str, rerun: Rerun | None, left: tuple[str, ...] = ()) -> Cause:
+    sites = [] if rerun is None else [(site, count) for of, site, count in rerun.sites if of == source]
+    sites.sort(key=lambda one: -one[1])
+    shown = tuple(site for site, _ in sites[:SITES_SHOWN])
+    return Cause(source, shown, sum(count for _, count in sites), left if source == MODULE else ())
+
+
+class _Alone:
+    """Re-runs one operator, beside those that make what it takes and the recording does not hold."""
+
+    def __init__(
+        self,
+        path: Path,
+        graph: Graph | None,
+        found: Verification,
+        *,
+        seconds: float,
+        stall_timeout: float,
+        workers: Workers,
+    ) -> None:
+        name, self._workers, self._stall_timeout = found.operator, workers, stall_timeout
+        with Recording(path) as recording:
+            played = graph or graph_that_is_here(recording)[0]
+            log = FiringLog.read(recording)
+            books = Books(log, played)
+            told = [each for each in played.nodes if accountable(recording, played, books, each)]
+            incomplete = incomplete_streams(recording, played, books, told)
+            chosen = with_makers(recording.streams.keys() - incomplete, played, {name})
+            self.changed = () if graph is None else _changes(graph_as_recorded(recording), graph, name)
+        self.recorded = path.stat().st_mtime
+        self._operators = tuple(each for each in played.nodes if each in chosen)
+        self._threads = played.threads
+        at = 0 if found.first is None else found.first.index
+        far = found.first is not None and at > FROM_THE_START
+        self._request = {
+            "path": str(path),
+            "graph": played.to_json(),
+            "records": log.to_wire(),
+            "operators": list(self._operators),
+            "operator": name,
+            "modules": sorted({played.nodes[name].use.partition(":")[0]}),
+            "incomplete": sorted(incomplete),
+            "begin": found.first.stamp - 1 if far and found.first is not None else None,
+            "most": CALLS_AFTER if far else at + CALLS_AFTER,
+            "seconds": seconds,
+            "began": time.time_ns(),
+        }
+        self.left_out: dict[str, str] = {}
+        if not fake_time():
+            self.left_out[COMPILED] = "libfaketime is not installed (pip install libfaketime)"
+
+    def fire(self, setting: Setting) -> Rerun:
+        """Re-runs the operator in a new process. Raises `RunFailed`."""
+        call = Call(
+            f"{run_again.__module__}:{run_again.__name__}",
+            {**self._request, "setting": setting.to_wire()},
+            self._operators,
+            setting.environment(),
+        )
+        [answer] = self._workers([call], threads=self._threads, stall_timeout=self._stall_timeout)
+        return Rerun.from_wire(answer)
+
+    def lines(self) -> Rerun:
+        """Re-runs the operator to find the lines that write into its inputs."""
+        return self.fire(Setting(lines=True))
+
+    def is_newer(self, file: str, found: Verification) -> bool:
+        """Returns whether a file was changed after the recording was written, or is not the recorded one."""
+        return file in found.files_changed or Path(file).stat().st_mtime > self.recorded
+
+
+def _changes(recorded: Graph, graph: Graph, name: str) -> tuple[str, ...]:
+    """Returns what the graph that was named has otherwise than the recorded one, of one operator."""
+    if name not in recorded.nodes:
+        return (f"operator {name} is not in the recorded graph",)
+    then, now = recorded.nodes[name], graph.nodes[name]
+    found = [] if then.use == now.use else [f"class: {then.use} → {now.use}"]
+    for key in sorted(then.params.keys() | now.params.keys()):
+        if then.params.get(key) != now.params.get(key):
+            found.append(f"parameter {key}: {then.params.get(key)} → {now.params.get(key)}")
+    return tuple(found)
+
+
+def reasons(path: Path, report: VerifyReport, operators: Sequence[str], graph: Graph | None = None) -> list[Why]:
+    """Returns the answer for each of `operators`, or for the culprits where none are named."""
+    return [why(path, report, name, graph=graph) for name in operators or report.culprits]

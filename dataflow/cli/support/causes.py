@@ -1,0 +1,60 @@
+"""Prints why operators do not repeat: causes, the lines that led to them, and what to use instead."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.text import Text
+
+from dataflow.causes.sources import SOURCES, kind_of
+from dataflow.causes.why import Why
+from dataflow.cli.support.output import count, plural, seconds, table
+
+
+def print_reasons(console: Console, recording: str, reasons: Sequence[Why]) -> None:
+    """A table of all causes, then a line for each operator about what was tried."""
+    causes = table("operator", "depends on", "where", "calls", "instead", right=("calls",))
+    for found in reasons:
+        for cause in found.causes:
+            first, *more = [f"{Path(site.file).name}:{site.line} {site.call}".rstrip() for site in cause.sites] or ["–"]
+            calls = count(cause.calls) if cause.sites else ""
+            causes.add_row(*map(Text, (found.operator, cause.what, first, calls, cause.instead)))
+            for line in more:
+                causes.add_row("", "", Text(line), "", "")
+    if recording:
+        console.print(Text(recording, style="bold"))
+    if causes.row_count:
+        console.print(causes)
+    for found in reasons:
+        for line in _lines(found):
+            console.print(Text(line), soft_wrap=True)
+
+
+def _lines(found: Why) -> Iterator[str]:
+    if found.refused:
+        yield f"{found.operator}: no cause looked for: {found.refused}"
+        return
+    yield f"{found.operator}: {_outcome(found)} ({plural(found.reruns, 're-run')}, {seconds(found.seconds)})"
+    for group in found.open:
+        yield f"{found.operator}: not tried by itself, re-runs were used up: {_list(group)}"
+    for source, reason in (found.left_out or {}).items():
+        yield f"{found.operator}: not tried: {source}: {reason}"
+    if found.repeats:
+        for fact in found.changed:
+            yield f"{found.operator}: not as it was recorded: {fact}"
+
+
+def _outcome(found: Why) -> str:
+    if found.causes:
+        return "each cause shown by its effect: with it alone free or changed, the results differ"
+    if found.repeats:
+        return "it repeats, so its code, its parameters, its libraries or the machine changed"
+    if found.settled is False:
+        return "it does not repeat even with all known sources of chance fixed (a device, a service, a thread?)"
+    return "with all known sources of chance fixed it repeats, and with each of them free, too"
+
+
+def _list(sources: Sequence[str]) -> str:
+    return ", ".join(f"{kind_of(source)} ({SOURCES[kind_of(source)].meaning})" for source in sources)
