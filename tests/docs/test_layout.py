@@ -16,7 +16,7 @@ MOST_ARROWS_IN_ODOMETRY = 40
 MOST_LINES = 60
 LONG = {
     "dataflow.cli.commands.convert:convert": 122,
-    "dataflow.cli.commands.demo:demo": 66,
+    "dataflow.cli.commands.demo:demo": 65,
     "dataflow.cli.commands.live:hz": 63,
     "dataflow.cli.commands.logs:logs": 69,
     "dataflow.cli.commands.recording:record": 71,
