@@ -135,10 +135,12 @@ def main() -> int:
     wrong = total = 0
     with tempfile.TemporaryDirectory() as folder:
         for name, found in ask(Path(folder), names):
-            right = {c.kind for c in found.causes} if chosen.wild else FAULTY.get(name, set())
+            right = FAULTY.get(name, set())
             lines = [f"{Path(c.sites[0].file).name}:{c.sites[0].line}" for c in found.causes if c.sites]
             pointed = all(c.sites or c.kind in UNTRAPPED for c in found.causes)
-            mistaken = {c.kind for c in found.causes} != right or not pointed or bool(found.refused and not chosen.wild)
+            mistaken = not chosen.wild and (
+                {c.kind for c in found.causes} != right or not pointed or bool(found.refused)
+            )
             wrong, total = wrong + mistaken, total + 1
             said = found.refused or ", ".join(c.what for c in found.causes) or "–"
             cells = (f"{'! ' if mistaken else ''}{name}", said.replace(folder, "…"), ", ".join(lines), found.reruns)
