@@ -88,7 +88,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("doctor:doctor", LOOK),
     Command("completion:completion", LOOK),
     Command("inspection:operators", LOOK),
-    Command("messages:messages", LOOK),
+    Command("inspection:messages", LOOK),
     Command("demo:graphs", LOOK),
     Command("recordings:info", LOOK),
     Command("recordings:diff", LOOK),

@@ -29,7 +29,7 @@ class Call(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What came out of one port: now (`here`), and in the recorded run. `fields` differ."""
+    """Holds what came out of one port: now (`here`), and in the recorded run. `fields` differ."""
 
     port: str
     stream: str
@@ -62,7 +62,7 @@ class Fired:
 
     @property
     def outputs(self) -> Mapping[str, Message | None]:
-        """What came out now, by port."""
+        """Returns what came out now, by port."""
         return {made.port: made.here for made in self.made}
 
     def states(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:

@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+from dataflow.cli.support.debug_shell import Shell
+
 FOR_TESTS = {
     "pid_of",  # a process of a run, to stop it
     "SPATIAL",  # the page about the simulator is held against it
@@ -18,6 +20,9 @@ CALLED_BY_OTHERS = {
     "list_commands",  # Typer asks a group for the commands of its help
     "get_next",  # onnxruntime asks a calibration reader
     # click asks a group
+    *(name for name in vars(Shell) if name.startswith("do_")),  # the prompt's base class looks them up
+    "emptyline",
+    "completenames",
     "on_playback_control_request",  # Foxglove's server tells its listener
     "on_subscribe",
     "on_unsubscribe",

@@ -22,6 +22,7 @@ from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, p
 
 if TYPE_CHECKING:
     from dataflow.cli.support.debug_shell import Shell
+    from dataflow.graph import Graph
 
 
 def debug(
@@ -71,25 +72,29 @@ def debug(
             raise fail("--set changes a graph file: name it with --graph")
         find_modules_in(path)
         _take_environment(recording)
-        from dataflow.cli.support.debug_shell import Shell, WrongCommand
-        from dataflow.debugging.debugger import Debugger
         from dataflow.graph import load_graph
-        from dataflow.recording import Recording
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-        name, _, when = operator.partition("@")
-        with Recording(recording) as opened:
-            stamps = (info.first for info in opened.streams.values() if not info.static)
-            debugger = Debugger(opened, name, loaded)
-            shell = Shell(debugger, min((stamp for stamp in stamps if stamp is not None), default=0), json=json)
-            try:
-                first = shell.number(f"@{when}") if when else 0
-            except WrongCommand as error:
-                raise fail(str(error)) from None
-            try:
-                _converse(shell, [f"goto {first}", *(do or ())], interactive=do is None)
-            finally:
-                debugger.close()
+        _debug(recording, operator, loaded, do, json=json)
+
+
+def _debug(recording: Path, operator: str, graph: Graph | None, do: list[str] | None, *, json: bool) -> None:
+    from dataflow.cli.support.debug_shell import Shell, WrongCommand
+    from dataflow.debugging.debugger import Debugger
+    from dataflow.recording import Recording
+
+    name, _, when = operator.partition("@")
+    with Recording(recording) as opened:
+        stamps = (info.first for info in opened.streams.values() if not info.static)
+        debugger = Debugger(opened, name, graph)
+        shell = Shell(debugger, min((stamp for stamp in stamps if stamp is not None), default=0), json=json)
+        try:
+            first = shell.number(f"@{when}") if when else 0
+            _converse(shell, [f"goto {first}", *(do or ())], interactive=do is None)
+        except WrongCommand as error:
+            raise fail(str(error)) from None
+        finally:
+            debugger.close()
 
 
 def _converse(shell: Shell, lines: list[str], *, interactive: bool) -> None:

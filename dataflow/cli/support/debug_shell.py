@@ -40,7 +40,7 @@ class Shell(cmd.Cmd):
         super().__init__()
         self._debugger, self._origin, self._json = debugger, origin, json
         self.failed = False
-        """Whether the last line could not be done."""
+        """True when the last line could not be done."""
 
     @property
     def calls(self) -> int:
