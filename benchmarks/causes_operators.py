@@ -18,7 +18,7 @@ class Registration(Operator, abstract=True):
 
     def process(self, x: FeatureVector) -> FeatureVector:
         digest = xxhash.xxh3_64_intdigest(self.register()) & 0xFFFF
-        return FeatureVector(stamp=x.stamp, vectors=[[float(digest)]], model="registration")
+        return FeatureVector(stamp=x.stamp, vectors=np.array([[digest]], np.float32), model="registration")
 
     def register(self) -> bytes:
         raise NotImplementedError

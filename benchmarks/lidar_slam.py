@@ -66,7 +66,7 @@ def scored(drive: Drive, params: dict[str, Any]) -> dict[str, float]:
             R = block_diag(poses[-1][:3, :3], poses[-1][:3, :3])
             squares.append(float(off @ np.linalg.solve(R.T @ pose.pose_covariance @ R, off)) / 6)
     at = {cloud.stamp: T for cloud, T in zip(drive.clouds, drive.truth, strict=True)}
-    graph = operator._mapper.graph
+    graph = operator.state.mapper.graph
     nodes = list(graph.nodes.values())
     one, two = drift(np.array(odometry), drive.truth), drift(np.array(poses), drive.truth)
     return {
@@ -80,7 +80,7 @@ def scored(drive: Drive, params: dict[str, Any]) -> dict[str, float]:
 
 
 def _false_loops(operator: LidarSlam, at: dict[int, Array]) -> int:
-    graph, wrong = operator._mapper.graph, 0
+    graph, wrong = operator.state.mapper.graph, 0
     for edge in graph.graph.edges:
         if edge.loop:
             true = invert(at[graph.nodes[edge.first].stamp]) @ at[graph.nodes[edge.last].stamp]

@@ -96,7 +96,7 @@ class StoredCheck:
         return digest
 
     def _rest(self) -> Sequence[tuple[Place, bytes]]:
-        """Those read of `_ahead` and not passed over."""
+        """Returns the next of `_ahead` that was read already, if any."""
         return () if self._next is None else (self._next,)
 
     def result(self) -> StoredStream:

@@ -115,7 +115,7 @@ class LidarSlam(LidarOdometry):
         if self.save is not None:
             write_lidar_map(self.state.mapper.graph, FilePath(self.save).expanduser())
 
-    def summary(self) -> Mapping[str, int]:
+    def summary(self) -> Mapping[str, float | int | str]:
         """Returns the number of scans of each state, of loops, and of keyframes that were refused, by reason."""
         graph = self.state.mapper.graph
         return {**super().summary(), **self.state.places, **sizes(graph), "loops": graph.loops}
