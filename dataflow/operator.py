@@ -203,7 +203,10 @@ class Operator:
             reset_state(old, self.state)
 
     def on_parameter(self, name: str) -> None:
-        """A `tunable` parameter was changed between two firings; `self.<name>` holds the new value."""
+        """A `tunable` parameter was changed between two firings; `self.<name>` holds the new value.
+
+        Raises `ParameterError` for a value that cannot be taken over; then the one before stays.
+        """
 
     def snapshot(self) -> Mapping[str, Any] | None:
         """Returns the state, such that `restore` of it in a fresh operator goes on alike: by default `state` or None.
@@ -239,9 +242,14 @@ class Operator:
             raise ParameterError(f"{cls.__name__}.{name} cannot change while the graph runs{which}")
         if name not in fields:
             raise ParameterError(f"{cls.__name__} has no parameter {name!r}{which.replace('can', 'can change', 1)}")
-        self.params = validate_parameters(cls, {**self.params.model_dump(), name: value})
+        before, self.params = self.params, validate_parameters(cls, {**self.params.model_dump(), name: value})
         setattr(self, name, getattr(self.params, name))
-        self.on_parameter(name)
+        try:
+            self.on_parameter(name)
+        except ParameterError:
+            self.params = before
+            setattr(self, name, getattr(before, name))
+            raise
         return getattr(self, name)
 
     def summary(self) -> Mapping[str, float | int | str]:

@@ -23,6 +23,7 @@ NORMALIZATIONS: Mapping[str, tuple[tuple[float, float, float], tuple[float, floa
     "none": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
     "unit": ((0.0, 0.0, 0.0), (255.0, 255.0, 255.0)),
     "imagenet": ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375)),
+    "clip": ((122.7709383, 116.7460125, 104.09373615), (68.5005327, 66.6321579, 70.32316305)),
 }
 """Mean and scale of pixels from 0 to 255, red first, by their names."""
 
@@ -30,6 +31,7 @@ _TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
     "tensor(uint8)": np.uint8,
+    "tensor(int32)": np.int32,
 }
 _COLORED = re.compile(r"(?P<name>.*?\S)\s+(?P<red>\d{1,3})[\s,]+(?P<green>\d{1,3})[\s,]+(?P<blue>\d{1,3})")
 
@@ -40,7 +42,7 @@ class ImageInput:
 
     - `size`: (width, height) in pixels, `layout`: where its channels stand, `type`: of its numbers.
     - A number of the tensor is (pixel - `mean`) / `scale`, by channel in RGB order, pixels from 0 to 255; an input of
-      uint8 takes the pixels as they are.
+      uint8 or int32 takes the pixels as they are.
     """
 
     name: str
@@ -55,8 +57,8 @@ class ImageInput:
         """Returns the tensor of RGB pixels (H, W, 3) of the input's size."""
         channels = pixels[..., ::-1] if self.bgr else pixels
         ordered = channels.transpose(2, 0, 1) if self.layout == "nchw" else channels
-        if self.type is np.uint8:
-            return np.ascontiguousarray(ordered[None])
+        if issubclass(self.type, np.integer):
+            return np.ascontiguousarray(ordered[None], self.type)
         tensor = np.ascontiguousarray(ordered[None], np.float32)
         if any(self.mean):
             tensor -= self._by_channel(self.mean)
@@ -82,20 +84,21 @@ def image_input(
 ) -> ImageInput:
     """Reads what the model's input of an image takes; `free` is the (width, height) where an extent is left open.
 
-    The model may have so many `others` besides, after it.
+    The model may have so many `others` besides; the image is the first of four dimensions.
 
     Raises ModelError for a model whose input is no image of three channels in one of the layouts and types.
     """
     inputs = session.get_inputs()
-    found = [each for each in layouts if _is_image(inputs[0].shape, each)] if 1 <= len(inputs) <= 1 + others else []
-    if not found or inputs[0].type not in types:
+    image = next((each for each in inputs if len(each.shape) == 4), inputs[0])
+    found = [each for each in layouts if _is_image(image.shape, each)] if len(inputs) <= 1 + others else []
+    if not found or image.type not in types:
         described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
         shapes = " or ".join({"nchw": "[1, 3, H, W]", "nhwc": "[1, H, W, 3]"}[each] for each in layouts)
         raise ModelError(f"{file} must have one input {' or '.join(types)} {shapes}, has {described}")
-    layout, shape = found[0], inputs[0].shape
+    layout, shape = found[0], image.shape
     height, width = shape[2:] if layout == "nchw" else shape[1:3]
     size = (width if isinstance(width, int) else free[0], height if isinstance(height, int) else free[1])
-    return ImageInput(inputs[0].name, size, layout, _TYPES[inputs[0].type], bgr, tuple(mean), tuple(scale))
+    return ImageInput(image.name, size, layout, _TYPES[image.type], bgr, tuple(mean), tuple(scale))
 
 
 def _is_image(shape: Sequence[Any], layout: Layout) -> bool:

@@ -29,6 +29,7 @@ from dataflow.messages import (
     Boxes3D,
     CompressedDepth,
     Detections2D,
+    Keypoints2D,
     Mesh,
     Message,
     OccupancyGrid,
@@ -65,6 +66,22 @@ def boxes_over(m: Detections2D) -> ImageAnnotations:
             made.points.append(_rim(made, mask))
     for label, box, score in zip(m.labels(), m.boxes.tolist(), m.scores.tolist(), strict=True):
         _outline(made, box, f"{label} {score:.2f}")
+    return made
+
+
+def limbs_over(m: Keypoints2D) -> ImageAnnotations:
+    """Limbs between points that are likelier found than not."""
+    made = ImageAnnotations(timestamp=timestamp_of(m.stamp))
+    ends = [Point2(x=x, y=y) for x, y in m.limbs().reshape(-1, 2).tolist()]
+    made.points.append(
+        PointsAnnotation(
+            timestamp=made.timestamp,
+            type=PointsAnnotation.LINE_LIST,
+            points=ends,
+            outline_color=_GREEN,
+            thickness=2.0,
+        )
+    )
     return made
 
 
@@ -244,6 +261,7 @@ def _image(stamp: int, frame: str, encoding: str, pixels: Any) -> RawImage:
 
 DRAWN: dict[type[Message], Drawn] = {
     Detections2D: Drawn(ImageAnnotations, boxes_over),
+    Keypoints2D: Drawn(ImageAnnotations, limbs_over),
     Boxes3D: Drawn(SceneUpdate, scene),
     SceneGraph: Drawn(SceneUpdate, scene_graph),
     Mesh: Drawn(SceneUpdate, surface),

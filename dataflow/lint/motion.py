@@ -1,7 +1,7 @@
 """Checks that the motion in a recording is one motion, by what states it twice.
 
-An orientation turns as its angular velocity says, a position moves as its velocity does, an acceleration at rest points
-up, and a gyroscope turns with the body that it is mounted on. Where they contradict each other and one usual mistake
+An orientation turns by its angular velocity, a position moves by its velocity, an acceleration at rest points up, and
+a gyroscope turns with the body that it is mounted on. Where they contradict each other and one usual mistake
 (degrees, another order of a quaternion, an inverse, another frame) makes them agree, that mistake is named.
 """
 

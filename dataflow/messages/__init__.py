@@ -3,7 +3,7 @@
 from dataflow.messages.base import Message, MessageError, array, message_type, message_types, scalar
 from dataflow.messages.camera import CameraInfo
 from dataflow.messages.clouds import Clusters, PointCloud
-from dataflow.messages.detection import Boxes3D, Detections2D, pack_masks
+from dataflow.messages.detection import Boxes3D, Detections2D, Keypoints2D, pack_masks
 from dataflow.messages.diagnostics import Diagnostics, Level
 from dataflow.messages.images import (
     CompressedDepth,
@@ -42,6 +42,7 @@ __all__ = [
     "Image16",
     "Imu",
     "JointState",
+    "Keypoints2D",
     "LandmarkSightings",
     "LaserScan",
     "Level",

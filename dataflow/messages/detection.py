@@ -1,4 +1,4 @@
-"""Detections: boxes in the image and in space."""
+"""Detections: boxes in the image and in space, and keypoints."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ import numpy.typing as npt
 
 from dataflow.messages.arrays import F32, F64, I32, I64, U8
 from dataflow.messages.base import Message, MessageError, array, scalar
-from dataflow.messages.checks import ordered_boxes, positive, table_indices, unit_quaternions, within
+from dataflow.messages.checks import (
+    ordered_boxes,
+    parallel,
+    positive,
+    table_indices,
+    unit_quaternions,
+    within,
+    within_length,
+)
 
 
 class Detections2D(Message):
@@ -58,6 +66,38 @@ class Detections2D(Message):
     def labels(self) -> tuple[str, ...]:
         """Class name of each object, or its class id as text where classes have no names."""
         return _labels(self.class_ids, self.class_names)
+
+
+class Keypoints2D(Message):
+    """Named points of objects in one image, such as the joints of people."""
+
+    frame: str = scalar("str", "optical frame of the camera")
+    width: int = scalar("int", "columns of the image, pixels")
+    height: int = scalar("int", "rows of the image, pixels")
+    names: tuple[str, ...] = scalar("strs", "name of each point of an object, or empty", default=())
+    links: I32 = array("int32", "L 2", "pairs of points that are drawn as one limb")
+    points: F32 = array(
+        "float32", "N K 2", "(x, y) of each point, as in Detections2D; NaN for one that was not found", unit="px"
+    )
+    scores: F32 = array("float32", "N K", "confidence, [0, 1]")
+    ids: I64 | None = array("int64", "N", "what each row is about: detection or track", default=None)
+
+    def validate(self) -> None:
+        positive(self, "width", "height")
+        within(self, 0.0, 1.0, "scores")
+        parallel(self, "names", self.points.shape[1], "points", empty=True)
+        within_length(self, "links", self.points.shape[1], "index the points of an object")
+
+    @property
+    def count(self) -> int:
+        """Number of objects."""
+        return len(self.points)
+
+    def limbs(self, least: float = 0.5) -> F32:
+        """Returns the ends (M, 2, 2), in pixels, of all limbs whose two points have a score of `least`."""
+        sure = np.isfinite(self.points).all(axis=2) & (self.scores >= least)
+        ends: F32 = self.points[:, self.links][sure[:, self.links].all(axis=2)]
+        return ends
 
 
 class Boxes3D(Message):

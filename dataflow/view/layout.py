@@ -19,6 +19,7 @@ from dataflow.messages import (
     Detections2D,
     Image,
     Image16,
+    Keypoints2D,
     Mesh,
     Message,
     Planes,
@@ -32,7 +33,7 @@ from dataflow.view.pacing import Pace
 
 COLOR: tuple[type[Message], ...] = (Image, CompressedImage, CompressedVideo, Image16)
 DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth, RelativeDepth)
-OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
+OVERLAYS: tuple[type[Message], ...] = (Detections2D, Keypoints2D, SegmentationMap, Tracks)
 
 HEAVY: tuple[type[Message], ...] = (*COLOR, *DEPTH, *OVERLAYS, PointCloud)
 """Types that make up nearly all of a file: images, what is drawn over them, and clouds."""

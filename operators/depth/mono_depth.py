@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import DepthImage, Diagnostics, Image, RelativeDepth
+from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, RelativeDepth
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.depth.scaling import Scaling, fitted
+from operators.image.letterbox import Fit
 from operators.inference import ModelError, Provider, open_session
 from operators.models.use import use_model
 from operators.network_input import NORMALIZATIONS, image_input, three_channels
@@ -42,6 +43,7 @@ class MonoDepth(Operator):
         max_age="50ms",
         doc="metric depth at some pixels of the same view, which may have other sizes; 0 elsewhere",
     )
+    image_info: Sampled[CameraInfo] = Sampled(required=False, doc="the image's calibration, for `canonical_focal`")
     relative: Out[RelativeDepth] = Out(doc="nearness at the image's pixels")
     depth: Out[DepthImage] = Out(doc="depth in metres, where `sparse` gives a scale; 0 where it is beyond `max_range`")
     status: Out[Diagnostics] = Out(
@@ -59,6 +61,13 @@ class MonoDepth(Operator):
         None,
         doc="what the model gives: larger for nearer without a scale, or depth in metres; none takes the registry's, "
         "or nearness",
+    )
+    canonical_focal: float | None = Param(
+        None,
+        gt=0,
+        doc="the focal length, in pixels of the input, of the camera that the model's metres are of (Metric3D: 1000); "
+        "none takes the registry's, or that of the image",
+        unit="px",
     )
     input_size: tuple[int, int] | None = Param(
         None,
@@ -83,19 +92,28 @@ class MonoDepth(Operator):
         self._session = open_session(used.file, self.provider)
         mean, scale = NORMALIZATIONS[used.setting(self, "normalization", "none")]
         free = tuple(used.setting(self, "input_size", (518, 518)))
+        self._focal = used.setting(self, "canonical_focal", None)
         self._metric = used.setting(self, "answer", "nearness") == "metres"
         self._input = image_input(
             used.file, self._session, (free[0], free[1]), bgr=False, mean=mean, scale=scale, layouts=("nchw",)
         )
 
-    def process(self, image: Image, sparse: DepthImage | None = None) -> dict[str, Any]:
+    def process(
+        self, image: Image, sparse: DepthImage | None = None, image_info: CameraInfo | None = None
+    ) -> dict[str, Any]:
         """Raises ValueError where the given depths are of another view, ModelError for an output of another shape."""
         counts = {"given": 0, "agreeing": 0}
         if (flaw := _flaw(image.data)) is not None:
             self.state.counts.update({"images": 1, f"images {flaw}": 1})
             return {"status": counted_status("mono_depth", image.stamp, f"the image is {flaw}", Level.WARN, counts)}
-        nearness = self._answer(image.data)
+        if self._focal is not None and image_info is None:
+            self.state.counts.update({"images": 1, "images without": 1})
+            text = "no image_info: the model's metres are of another camera"
+            return {"status": counted_status("mono_depth", image.stamp, text, Level.WARN, counts)}
+        nearness, scale = self._answer(image.data)
         if self._metric:
+            if self._focal is not None and image_info is not None:
+                nearness = nearness * np.float32(image_info.K[0, 0] / scale / self._focal)
             self.state.counts.update({"images": 1, "images with a scale": 1})
             near = np.where(np.isfinite(nearness) & (nearness > 0) & (nearness <= self.max_range), nearness, 0)
             status = counted_status("mono_depth", image.stamp, "the model gives metres", Level.OK, counts)
@@ -116,19 +134,24 @@ class MonoDepth(Operator):
         )
         return messages | {"status": counted_status("mono_depth", image.stamp, text, level, counts)}
 
-    def _answer(self, pixels: NDArray[np.uint8]) -> Nearness:
-        """Returns the model's output (H, W) for pixels (H, W) or (H, W, 3), at their size."""
+    def _answer(self, pixels: NDArray[np.uint8]) -> tuple[Nearness, float]:
+        """Returns the model's output (H, W) for pixels (H, W) or (H, W, 3), and pixels of the image for one of input.
+
+        The image fills the input, or, for a canonical camera, lies in its middle with its proportions.
+        """
         color = three_channels(pixels)
-        height, width = color.shape[:2]
-        size = self._input.size
-        shrinking = width >= size[0] and height >= size[1]
-        fitting = cv2.resize(color, size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
-        tensor = self._input.tensor(np.asarray(fitting, np.uint8))
+        image, size = (color.shape[1], color.shape[0]), self._input.size
+        fit = Fit.plan("stretch" if self._focal is None else "letterbox", image, size)
+        smaller = image[0] >= fit.inner[0] and image[1] >= fit.inner[1]
+        inner = cv2.resize(color, fit.inner, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+        tensor = self._input.tensor(fit.framed(np.asarray(inner, np.uint8)))
         output = np.asarray(self._session.run(None, {self._input.name: tensor})[0])
-        if output.size != size[0] * size[1]:
+        width, height = size
+        if output.size != width * height:
             raise ModelError(f"{self.model} gave {output.shape}, but one value per pixel of {size} is needed")
-        small = output.reshape(size[1], size[0]).astype(np.float32)
-        return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+        (x, y), (w, h) = fit.offset, fit.inner
+        small = output.reshape(height, width)[y : y + h, x : x + w].astype(np.float32)
+        return np.asarray(cv2.resize(small, image, interpolation=cv2.INTER_LINEAR), np.float32), fit.scale[0]
 
     def _scaling(self, nearness: Nearness, sparse: DepthImage) -> tuple[Scaling | None, dict[str, int]]:
         height, width = nearness.shape

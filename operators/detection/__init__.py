@@ -8,7 +8,8 @@ if TYPE_CHECKING:
     from operators.detection.box_segmenter import BoxSegmenter
     from operators.detection.custom_detector import CustomDetector
     from operators.detection.drawing import draw_detections
-    from operators.detection.onnx_detector import OnnxDetector
+    from operators.detection.keypoint_detector import KeypointDetector
+    from operators.detection.onnx_detector import OnnxDetector, OnnxRigDetector
     from operators.detection.score_filter import ScoreFilter
     from operators.detection.torchvision_detector import TorchvisionDetector, TorchvisionRigDetector
 else:
@@ -18,7 +19,8 @@ else:
             "box_segmenter": ("BoxSegmenter",),
             "custom_detector": ("CustomDetector",),
             "drawing": ("draw_detections",),
-            "onnx_detector": ("OnnxDetector",),
+            "keypoint_detector": ("KeypointDetector",),
+            "onnx_detector": ("OnnxRigDetector", "OnnxDetector"),
             "score_filter": ("ScoreFilter",),
             "torchvision_detector": ("TorchvisionRigDetector", "TorchvisionDetector"),
         },
@@ -27,7 +29,9 @@ else:
 __all__ = [
     "BoxSegmenter",
     "CustomDetector",
+    "KeypointDetector",
     "OnnxDetector",
+    "OnnxRigDetector",
     "ScoreFilter",
     "TorchvisionDetector",
     "TorchvisionRigDetector",

@@ -56,6 +56,7 @@ class BoxSegmenter(Operator):
                 f"well they fit; it takes {described}"
             )
         self._points, self._labels = (each.name for each in beside)
+        self._kind = np.float16 if beside[0].type == "tensor(float16)" else np.float32
         self._at_once = not isinstance(beside[0].shape[1], int)
 
     def process(self, image: Image, detections: Detections2D) -> Detections2D:
@@ -83,7 +84,8 @@ class BoxSegmenter(Operator):
     def _best(self, tensor: NDArray[Any], prompts: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns the logits (Q, h, w) of the best mask of each prompt (Q, 2, 2)."""
         labels = np.tile(np.array(_CORNERS, np.float32), (1, len(prompts), 1))
-        given = {self._input.name: tensor, self._points: prompts[None], self._labels: labels}
+        beside = {self._points: prompts[None].astype(self._kind), self._labels: labels.astype(self._kind)}
+        given = {self._input.name: tensor, **beside}
         masks, fits = (np.asarray(answer, np.float32) for answer in self._session.run(None, given)[:2])
         if masks.ndim != 5 or masks.shape[:3] != (1, len(prompts), *fits.shape[2:]) or fits.ndim != 3:
             raise ModelError(

@@ -9,6 +9,7 @@ from operators.detection.instance_masks import by_planes, by_probabilities, by_p
 from operators.detection.suppressed import (
     decode_detr,
     decode_end2end,
+    decode_owlvit,
     decode_rfdetr,
     decode_rtdetr,
     decode_ssd,
@@ -37,11 +38,13 @@ DecoderName = Literal[
     "rtdetr",
     "detr",
     "rfdetr",
+    "owlvit",
     "torchvision",
     "tensorflow",
 ]
 
 _ONE = (1.0, 1.0, 1.0)
+_CLIP = NORMALIZATIONS["clip"]
 _MEAN, _DEVIATION = NORMALIZATIONS["imagenet"]
 
 LAYOUTS: dict[DecoderName, Layout] = {
@@ -91,6 +94,16 @@ LAYOUTS: dict[DecoderName, Layout] = {
         scale=_DEVIATION,
         nms_iou=1.0,
         draw=by_planes,
+    ),
+    "owlvit": Layout(
+        decode_owlvit,
+        bgr=False,
+        fit="stretch",
+        classes=lambda o: int(o[0].shape[2]),
+        mean=_CLIP[0],
+        scale=_CLIP[1],
+        nms_iou=1.0,
+        words=16,
     ),
     "torchvision": Layout(
         decode_torchvision, bgr=False, fit="stretch", classes=None, nms_iou=1.0, draw=by_probabilities

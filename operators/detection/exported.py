@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,18 @@ from operators.detection.decoders import LAYOUTS, DecoderName
 from operators.detection.nms import class_wise_nms
 from operators.image.letterbox import Fit, FitMode
 from operators.inference import ModelError, Provider, open_session
+from operators.language.bpe import Tokenizer
 from operators.model_metadata import told
 from operators.network_input import image_input
+
+_PROMPT = "a photo of a {}"
 
 
 class ExportedFinder:
     """Raises FileNotFoundError, or ModelError for a model whose inputs the decoder does not know.
 
-    `names`: of the classes; None takes those of the model's metadata (`names`), else COCO's.
+    `names`: of the classes; None takes those of the model's metadata (`names`), else COCO's. A network with an open
+    vocabulary finds whatever is named, by its `tokenizer`.
     """
 
     def __init__(
@@ -35,6 +40,7 @@ class ExportedFinder:
         fit: FitMode | None = None,
         free_side: int = 640,
         masks: bool = True,
+        tokenizer: Path | None = None,
     ) -> None:
         self._file, self._decoder = file, decoder
         self._layout: Layout = LAYOUTS[decoder]
@@ -46,28 +52,79 @@ class ExportedFinder:
             bgr=self._layout.bgr,
             mean=self._layout.mean,
             scale=self._layout.scale,
-            others=int(self._layout.sized),
+            others=2 if self._layout.words else int(self._layout.sized),
         )
-        self._feed = self._size_input()
+        self._feed = self._size_input() if self._layout.sized else {}
+        self._batch = next(each.shape[0] for each in self._session.get_inputs() if each.name == self._input.name)
         self._fit: FitMode = self._layout.fit if fit is None else fit
         self._masks = masks and self._layout.draw is not None
         labels = told(file, self._session.get_modelmeta().custom_metadata_map).labels if names is None else None
         self._given = names is not None or labels is not None
         self.names: tuple[str, ...] = names or (COCO_CLASSES if labels is None else labels.names)
+        self._tokenizer = None
+        if self._layout.words:
+            if names is None or tokenizer is None:
+                raise ModelError(
+                    f"{file} finds what is named to it: give names in OnnxDetector.classes (`mug, fire extinguisher`), "
+                    f"and take it by its name in `dataflow models list`, which has its tokenizer"
+                )
+            self._tokenizer = Tokenizer(tokenizer)
+            self.find_also(())
+
+    @property
+    def is_open(self) -> bool:
+        """True for a network that finds all that is named to it."""
+        return self._tokenizer is not None
+
+    def find_also(self, names: Sequence[str]) -> None:
+        """Adds names to those that a network with an open vocabulary finds. Raises ModelError for other networks."""
+        beside = [each for each in self._session.get_inputs() if each.name != self._input.name]
+        if self._tokenizer is None or not beside or any(each.type != "tensor(int64)" for each in beside):
+            described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in beside)
+            raise ModelError(f"{self._file} must take tokens of names and a mask, int64 [C, L]; it takes {described}")
+        self.names = (*self.names, *names)
+        length = beside[0].shape[1] if isinstance(beside[0].shape[1], int) else self._layout.words
+        tokens = self._tokenizer([_PROMPT.format(name) for name in self.names], length)
+        shown = np.arange(tokens.shape[1]) <= tokens.argmax(axis=1)[:, None]
+        values = (tokens, shown.astype(np.int64))
+        self._feed = {each.name: value for each, value in zip(beside, values, strict=False)}
 
     @property
     def nms_iou(self) -> float:
         """Overlap above which the family's authors drop the weaker box of a class."""
         return self._layout.nms_iou
 
-    def find(self, pixels: NDArray[np.uint8], threshold: float, nms_iou: float, most: int) -> Candidates:
-        """Finds the best `most` objects in an image (H, W, 3), RGB, in its pixels, by falling score.
+    def find_each(
+        self, images: Sequence[NDArray[np.uint8]], threshold: float, nms_iou: float, most: int
+    ) -> list[Candidates]:
+        """Finds the best `most` objects in each image (H, W, 3), RGB, in its pixels, by falling score.
 
-        Raises ModelError where the model's output is not what the decoder reads, or has other classes than names.
+        All images go in at once where the model takes so. Raises ModelError where the model's output is not what the
+        decoder reads, or has other classes than names.
         """
-        fit = Fit.plan(self._fit, (pixels.shape[1], pixels.shape[0]), self._input.size)
-        answers = self._session.run(None, {self._input.name: self._input.tensor(fit.apply(pixels)), **self._feed})
-        outputs = [a.astype(np.float32) if a.dtype == np.float16 else a for a in map(np.asarray, answers)]
+        fits = [Fit.plan(self._fit, (each.shape[1], each.shape[0]), self._input.size) for each in images]
+        tensors = [self._input.tensor(fit.apply(each)) for fit, each in zip(fits, images, strict=True)]
+        answers = self._answers(tensors)
+        return [self._read(each, fit, threshold, nms_iou, most) for each, fit in zip(answers, fits, strict=True)]
+
+    def _answers(self, tensors: Sequence[NDArray[Any]]) -> list[Outputs]:
+        """Returns the outputs for each image, with a batch axis of 1."""
+        count = len(tensors)
+        at_once = count > 1 and not self._feed and not isinstance(self._batch, int)
+        batches = [np.concatenate(tensors)] if at_once else tensors
+        runs = [self._session.run(None, {self._input.name: batch, **self._feed}) for batch in batches]
+        answers = [[a.astype(np.float32) if a.dtype == np.float16 else a for a in map(np.asarray, r)] for r in runs]
+        if not at_once:
+            return list(answers)
+        if any(a.ndim == 0 or len(a) != count for a in answers[0]):
+            shapes = ", ".join(str(a.shape) for a in answers[0])
+            raise ModelError(
+                f"{self._file} was given {count} images and answered {shapes}, which cannot be told apart by image; "
+                f"export it for one image at a time"
+            )
+        return [[a[k : k + 1] for a in answers[0]] for k in range(count)]
+
+    def _read(self, outputs: Outputs, fit: Fit, threshold: float, nms_iou: float, most: int) -> Candidates:
         try:
             found = self._layout.decode(outputs, self._input.size, threshold)
         except ValueError as error:

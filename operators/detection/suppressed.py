@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.decode import Candidates, Outputs, Size, corners, shapes_of, sigmoid
+from operators.detection.decode import Candidates, Outputs, Size, best_class, corners, shapes_of, sigmoid
 from operators.detection.yolo import prototypes_in
 
 
@@ -73,6 +73,20 @@ def decode_detr(outputs: Outputs, size: Size, threshold: float, boxes_first: boo
 def decode_rfdetr(outputs: Outputs, size: Size, threshold: float) -> Candidates:
     """RF-DETR's export: as `decode_detr`, the boxes first."""
     return decode_detr(outputs, size, threshold, boxes_first=True)
+
+
+def decode_owlvit(outputs: Outputs, size: Size, threshold: float) -> Candidates:
+    """OWL-ViT: logits (1, N, C) of the C names that were asked for, and boxes (1, N, 4); more outputs are not used.
+
+    Boxes are centre and size as shares of the input, a score is the sigmoid of the best logit. Source:
+    `post_process_object_detection` of Hugging Face's `OwlViTImageProcessor` (Apache-2.0), after Minderer et al.,
+    "Simple open-vocabulary object detection with vision transformers", 2022.
+    """
+    logits, boxes = outputs[0], outputs[1] if len(outputs) > 1 else outputs[0]
+    if logits.ndim != 3 or boxes.shape != (1, logits.shape[1], 4) or logits.shape[0] != 1:
+        raise ValueError(f"OWL-ViT's outputs are (1, N, C) and (1, N, 4), got {shapes_of(outputs)}")
+    scaled = boxes[0].astype(np.float32) * np.array([*size, *size], np.float32)
+    return best_class(scaled, sigmoid(logits[0].astype(np.float32)), threshold)
 
 
 def detr_pair(outputs: Outputs, boxes_first: bool) -> tuple[NDArray[Any], NDArray[Any]]:

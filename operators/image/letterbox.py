@@ -45,6 +45,10 @@ class Fit:
         resized: NDArray[np.uint8] = image
         if self.inner != self.image:
             resized = cv2.resize(image, self.inner, interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+        return self.framed(resized)
+
+    def framed(self, resized: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The input image of the image at its `inner` size, (h, w, 3)."""
         if self.inner == self.target:
             return resized
         padded = np.full((self.target[1], self.target[0], 3), _GREY, np.uint8)

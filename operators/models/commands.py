@@ -61,7 +61,7 @@ def list_models(
     for column in ("model", "task", "licence", "here", "what it is"):
         table.add_column(column)
     for model in rows:
-        here = "yes" if _place(model) is not None else "export" if model.source.export else "no"
+        here = "yes" if all(map(_place, model.files)) else "export" if model.source.export else "no"
         table.add_row(*map(escape, (model.name, model.task, str(model.licence), here, model.about)))
     _out().print(table)
 
@@ -94,6 +94,7 @@ def show_model(name: Name, json: Json = False) -> None:
         ("from", str(model.source)),
         ("sha256", model.sha256 or "differs by export"),
         ("file", str(place) if place is not None else missing(model)),
+        *((part.name, str(_place(part) or missing(part))) for part in model.files[1:]),
     ):
         table.add_row(f"[bold]{title}[/]", escape(text))
     out.print(table)
@@ -107,7 +108,9 @@ def get_model(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Bring a model's file into the cache, once, and check it. Prints its licence first.
+    """Bring a model's file into the cache, once, and check it, with those of its parts. Prints its licence first.
+
+    `--from` gives one file; a part is named as MODEL.PART then.
 
     A download that breaks off goes on where it stopped. A file in the cache whose sha256 is another is replaced.
     Proxies of the environment are used. Exit code 1 where the file cannot be had or is another one.
@@ -120,16 +123,17 @@ def get_model(
     model = _row(name)
     console = Console(stderr=True, highlight=False)
     console.print(escape(f"{model.name}: licence {model.licence} ({model.home}); from {model.source}"), soft_wrap=True)
+    files = []
     try:
-        if given is None and (found := damage(model)) is not None:
-            console.print(escape(f"{found}: it is got anew"), soft_wrap=True)
-        file = _fetched(model, console) if given is None else take(model, given)
+        for each in model.files if given is None else ():
+            if (found := damage(each)) is not None:
+                console.print(escape(f"{found}: it is got anew"), soft_wrap=True)
+            files.append(_fetched(each, console))
+        if given is not None:
+            files.append(take(model, given))
     except (ModelError, OSError) as error:
         raise _failed(str(error), code=1) from None
-    if json:
-        typer.echo(jsonlib.dumps(_described(model)))
-    else:
-        typer.echo(str(file))
+    typer.echo(jsonlib.dumps(_described(model)) if json else "\n".join(map(str, files)))
 
 
 @models.command("check")
@@ -144,8 +148,8 @@ def check_models(
       dataflow models check
       dataflow models check yolox_nano --json
     """
-    wanted = [_row(name) for name in names] if names else [m for m in _registry() if _place(m) is not None]
-    verdicts = {model.name: _verdict(model) for model in wanted}
+    wanted = [_row(name) for name in names] if names else [m for m in _registry() if any(map(_place, m.files))]
+    verdicts = {each.name: _verdict(each) for model in wanted for each in model.files}
     if json:
         typer.echo(jsonlib.dumps(verdicts))
     else:

@@ -16,6 +16,7 @@ from ruamel.yaml.error import YAMLError
 from operators.inference import ModelError
 
 Task = Literal["detection", "segmentation", "depth", "keypoints", "masks", "embedding"]
+PartName = Literal["text", "tokenizer"]
 
 REGISTRIES = "DATAFLOW_MODELS"
 """Environment variable: further registry files, separated as PATH is; their rows go before those of the project."""
@@ -79,6 +80,17 @@ class Licence(_Row):
         return self.code if self.code == self.weights else f"code {self.code}, weights {self.weights}"
 
 
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+class Part(_Row):
+    """A further file that a model needs: where it is from, and its digest."""
+
+    source: Source
+    sha256: Digest | None = None
+    bytes: Annotated[int, Field(gt=0)] | None = None
+
+
 class Model(_Row):
     """One row of the registry.
 
@@ -86,6 +98,7 @@ class Model(_Row):
     - `classes`: a list of names, the name of one (`coco`), or None for networks without.
     - `sha256` of the file; None where the user exports it. `bytes`: its size, where that is known. `exports`: sha256 of
       other files of the same network, exported otherwise, which the row describes as well.
+    - `parts`: further files, the tower of text or the tokenizer.
     - `published`: the authors' figure; `measured`: the one found here, with its command, or `not measured`.
     """
 
@@ -99,18 +112,32 @@ class Model(_Row):
     licence: Licence
     source: Source
     home: str
-    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
+    sha256: Digest | None = None
     bytes: Annotated[int, Field(gt=0)] | None = None
-    exports: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []
+    exports: list[Digest] = []
+    parts: dict[PartName, Part] = {}
     published: str
     measured: str = NOT_MEASURED
 
     @model_validator(mode="after")
     def _checked(self) -> Model:
-        fetched = self.source.url is not None or self.source.index is not None
-        if fetched and self.sha256 is None:
-            raise ValueError("sha256 must be given for a file that is downloaded")
+        for source, sha256 in ((self.source, self.sha256), *((p.source, p.sha256) for p in self.parts.values())):
+            if (source.url is not None or source.index is not None) and sha256 is None:
+                raise ValueError("sha256 must be given for a file that is downloaded")
         return self
+
+    @property
+    def files(self) -> list[Model]:
+        """Returns its row, and one for each of its parts."""
+        return [self, *map(self.part, self.parts)]
+
+    def part(self, name: PartName) -> Model:
+        """Returns the row of a part, named `MODEL.PART`. Raises ModelError where it has none."""
+        if name not in self.parts:
+            raise ModelError(f"the registry's row {self.name} has no {name} among its parts")
+        given = self.parts[name]
+        changed = {"source": given.source, "sha256": given.sha256, "bytes": given.bytes}
+        return self.model_copy(update={"name": f"{self.name}.{name}", "exports": [], "parts": {}, **changed})
 
     @property
     def file_name(self) -> str:
@@ -151,7 +178,11 @@ class Registry:
         return name in self._models
 
     def __getitem__(self, name: str) -> Model:
-        """Raises ModelError for a name that is not there, with the nearest one."""
+        """Returns a row, or that of a part, `MODEL.PART`. Raises ModelError for others, with the nearest name."""
+        for whole in self._models.values() if name not in self._models else ():
+            for each in whole.files[1:]:
+                if each.name == name:
+                    return each
         if name not in self._models:
             near = get_close_matches(name, self._models, 1)
             hint = f"did you mean {near[0]!r}? " if near else ""

@@ -11,7 +11,7 @@ from typing import Any
 
 from dataflow.operator import Operator
 from operators.inference import ModelError
-from operators.models.registry import Model, Registry
+from operators.models.registry import Model, PartName, Registry
 
 _OPERATOR = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
@@ -33,12 +33,13 @@ class Used:
         return self.default(name, default) if given is None else given
 
 
-def use_model(operator: Operator, given: str) -> Used:
+def use_model(operator: Operator, given: str, kind: str | None = None) -> Used:
     """Returns the file of a model for an operator, and notes its digest under the name or path that was given.
 
     A file of a row is known by its digest, wherever it lies; the digest of the row's parameters and classes is noted
-    beside it, under `NAME (row)`. Raises FileNotFoundError for a missing file, with how to get it, and ModelError for a
-    name of no row, a row that is for another operator, or a file in the cache that is not its row's.
+    beside it, under `NAME (row)`. A row is for operators of this class, or of the one named `kind`. Raises
+    FileNotFoundError for a missing file, with how to get it, and ModelError for a name of no row, a row that is for
+    another operator, or a file in the cache that is not its row's.
     """
     registry = Registry.load()
     if not names_a_model(given):
@@ -53,27 +54,42 @@ def use_model(operator: Operator, given: str) -> Used:
         model = registry[given]
         if not model.file.is_file():
             raise FileNotFoundError(missing(model))
-        file = operator.use_file(model.file, name=given)
-        if not model.accepts(operator.files[given]):
-            raise ModelError(
-                f"{file} is not the file of {given}: its sha256 is {operator.files[given]}, expected {model.sha256}. "
-                f"`dataflow models get {given}` brings the right one"
-            )
+        file = _right_file(operator, model)
     if model is not None:
-        _check_row(operator, model)
+        _check_row(operator, model, kind or type(operator).__name__)
         row = json.dumps({"params": model.params, "classes": model.classes}, sort_keys=True, default=str)
         operator.files[f"{given} (row)"] = hashlib.sha256(row.encode()).hexdigest()
     return Used(file, model)
 
 
-def _check_row(operator: Operator, model: Model) -> None:
-    kind = type(operator)
-    if not model.operator.endswith(f":{kind.__name__}"):
-        raise ModelError(f"{model.name} is run by {model.operator}, not by {kind.__name__}")
-    takes = [name for name, field in kind.spec.parameters.model_fields.items() if field.default is None]
+def use_part(operator: Operator, model: Model, name: PartName) -> Path:
+    """Returns the file of a part of a model for an operator, and notes its digest under the part's name.
+
+    Raises ModelError where the row has no such part or the file is another, FileNotFoundError with how to get it.
+    """
+    part = model.part(name)
+    if not part.file.is_file():
+        raise FileNotFoundError(missing(part))
+    return _right_file(operator, part)
+
+
+def _right_file(operator: Operator, model: Model) -> Path:
+    file = operator.use_file(model.file, name=model.name)
+    if not model.accepts(operator.files[model.name]):
+        raise ModelError(
+            f"{file} is not the file of {model.name}: its sha256 is {operator.files[model.name]}, expected "
+            f"{model.sha256}. `dataflow models get {model.name}` brings the right one"
+        )
+    return file
+
+
+def _check_row(operator: Operator, model: Model, kind: str) -> None:
+    if not model.operator.endswith(f":{kind}"):
+        raise ModelError(f"{model.name} is run by {model.operator}, not by {kind}")
+    takes = [name for name, field in type(operator).spec.parameters.model_fields.items() if field.default is None]
     if unknown := model.params.keys() - takes:
         raise ModelError(
-            f"the registry's row {model.name} sets {', '.join(sorted(unknown))}, but {kind.__name__} takes only "
+            f"the registry's row {model.name} sets {', '.join(sorted(unknown))}, but {kind} takes only "
             f"{', '.join(takes)} from it"
         )
 

@@ -2,8 +2,16 @@
 
 from operators.recognition.activity.recognizer import ActivityRecognizer
 from operators.recognition.feature_extractor import FeatureExtractor
+from operators.recognition.feature_memory import FeatureMemory
 from operators.recognition.image_classifier import ImageClassifier
 from operators.recognition.objects.learned_detector import LearnedDetector
 from operators.recognition.posture.recognizer import PostureRecognizer
 
-__all__ = ["ActivityRecognizer", "FeatureExtractor", "ImageClassifier", "LearnedDetector", "PostureRecognizer"]
+__all__ = [
+    "ActivityRecognizer",
+    "FeatureExtractor",
+    "FeatureMemory",
+    "ImageClassifier",
+    "LearnedDetector",
+    "PostureRecognizer",
+]

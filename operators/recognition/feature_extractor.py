@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, FeatureVector, Image
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.inference import ModelError
+from operators.inference import ModelError, Provider
+from operators.language.image_tower import ImageTower, unit_rows
+from operators.models.registry import Registry
+from operators.models.use import names_a_model, use_model
 from operators.recognition.crops import covering, letterboxed
 from operators.recognition.subjects import Per, Subjects
 from operators.weights import open_network
@@ -22,58 +25,90 @@ _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 _SIDE = 224
 
-Describe = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
-"""Pixels (h, w, 3) → features (D,) before they are normalised."""
+Describe = Callable[[list[NDArray[np.uint8]]], NDArray[np.float32]]
+"""Pixels (h, w, 3) of N views, N above 0 → features (N, D), of any length."""
 
 
 class FeatureExtractor(Operator):
     """Describes whole images, or each detected object with `per: object`, by one L2-normalised vector a row.
 
-    The network is one of `dataflow train classifier` (`weights`: its last hidden layer, 256 wide) or, without that, a
-    classification network of torchvision without its head (`model`: resnet50 gives 2048, mobilenet_v3_large 960). The
-    scalar product of two vectors of the same model is their similarity, 1 for equal. Method: features of a trained
-    classifier as descriptors, Sharif Razavian et al. 2014.
+    The network is one of `dataflow train classifier` (`weights`: its last hidden layer, 256 wide) or, without that, an
+    embedding of `dataflow models` or another ONNX file (`clip_vit_b32`, 512 wide, whose space text has too), or a
+    classification network of torchvision without its head (resnet50 gives 2048, mobilenet_v3_large 960). The scalar
+    product of two vectors of the same model is their similarity, 1 for equal. Methods: CLIP, Radford et al., "Learning
+    transferable visual models from natural language supervision", 2021; features of a trained classifier as
+    descriptors, Sharif Razavian et al. 2014.
     """
 
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
     detections: Sampled[Detections2D] = Sampled(required=False, doc="objects of the same image, for `per: object`")
-    features: Out[FeatureVector] = Out(doc="a vector of length 1 for the image or for each object")
+    features: Out[FeatureVector] = Out(doc="a vector of length 1 for the image or for each object; 0 beyond `most`")
 
     weights: str | None = Param(None, doc="network file of `dataflow train classifier`")
-    model: str = Param("resnet50", doc="without `weights`: a classification model of torchvision")
-    checkpoint: str | None = Param(None, doc="your weights for `model`: a file of torch.save; none: its cache's")
-    device: str = Param("cpu", doc="for `model`: cpu, cuda, cuda:1 or mps")
+    model: str = Param(
+        "resnet50",
+        min_length=1,
+        doc="without `weights`: an embedding of `dataflow models list`, an ONNX file, or a classification model of "
+        "torchvision",
+    )
+    normalization: Literal["none", "unit", "imagenet", "clip"] | None = Param(
+        None, doc="of pixels for an ONNX file: its mean and scale by name; none takes the registry's, or CLIP's"
+    )
+    input_size: int | None = Param(
+        None, ge=8, doc="side of an ONNX file's input where it is open; none takes the registry's, or 224", unit="px"
+    )
+    provider: Provider = Param(
+        "cpu", doc="onnxruntime's execution provider for an ONNX file; results repeat bit for bit on the CPU"
+    )
+    checkpoint: str | None = Param(None, doc="your weights for torchvision's: a file of torch.save; none: its cache's")
+    device: str = Param("cpu", doc="for torchvision's: cpu, cuda, cuda:1 or mps")
     per: Per = Param("image", doc="what a row is about: the image, or each detected object")
+    most: int | None = Param(
+        None, ge=1, tunable=True, doc="describe so many objects of an image, drawn anew for each; none means all"
+    )
 
     def setup(self) -> None:
         """Loads the network. Raises FileNotFoundError, NetworkFileError or ModelError."""
         self._subjects = Subjects(self.per)
-        self._name, self._describe = self._trained() if self.weights is not None else self._torchvision()
+        if self.weights is not None:
+            self._name, self._describe = self._trained(self.weights)
+        elif names_a_model(self.model) and self.model not in Registry.load():
+            self._name, self._describe = self._torchvision()
+        else:
+            self._name, self._describe = self._exported()
 
     def process(self, image: Image, detections: Detections2D | None) -> FeatureVector:
         shown, ids = self._subjects.of(image, detections)
-        rows = [_normalised(self._describe(view)) for view in shown]
-        return FeatureVector(
-            stamp=image.stamp,
-            frame=image.frame,
-            model=self._name,
-            vectors=np.array(rows, np.float32) if rows else np.zeros((0, 0), np.float32),
-            ids=ids,
-        )
+        rows = np.arange(len(shown))
+        if self.most is not None and len(shown) > self.most:
+            rows = np.sort(self.rng.choice(len(shown), self.most, replace=False))
+        found = unit_rows(self._describe([shown[k] for k in rows])) if len(rows) else np.zeros((0, 0), np.float32)
+        vectors = np.zeros((len(shown), found.shape[1]), np.float32)
+        vectors[rows] = found
+        return FeatureVector(stamp=image.stamp, frame=image.frame, model=self._name, vectors=vectors, ids=ids)
 
     def summary(self) -> Mapping[str, float | int | str]:
         """Counts the images without detections of the same stamp."""
         return self._subjects.summary()
 
-    def _trained(self) -> tuple[str, Describe]:
-        assert self.weights is not None
-        network = open_network(self.use_file(self.weights), "classifier")
-        digest = self.files[self.weights][:12]
+    def _trained(self, weights: str) -> tuple[str, Describe]:
+        network = open_network(self.use_file(weights), "classifier")
 
-        def describe(view: NDArray[np.uint8]) -> NDArray[np.float32]:
-            return np.asarray(network.run(letterboxed(view, network.size))[1][0], np.float32)
+        def describe(views: list[NDArray[np.uint8]]) -> NDArray[np.float32]:
+            return np.array([network.run(letterboxed(view, network.size))[1][0] for view in views], np.float32)
 
-        return f"classifier-{digest}", describe
+        return f"classifier-{self.files[weights][:12]}", describe
+
+    def _exported(self) -> tuple[str, Describe]:
+        used = use_model(self, self.model)
+        normalization = used.setting(self, "normalization", "clip")
+        tower = ImageTower(used.file, normalization, used.setting(self, "input_size", _SIDE), self.provider)
+        name = used.file.stem if used.model is None else used.model.name
+
+        def describe(views: list[NDArray[np.uint8]]) -> NDArray[np.float32]:
+            return tower([covering(view, tower.side) for view in views])
+
+        return f"{name}-{self.files[self.model][:12]}", describe
 
     def _torchvision(self) -> tuple[str, Describe]:
         from operators.torch_models import DEFAULT, Runner, load
@@ -82,7 +117,7 @@ class FeatureExtractor(Operator):
         loaded = load("classification", self.model, DEFAULT, file, self.device)
         run = Runner(_headless(loaded.model, self.model), loaded.device, half=False)
 
-        def describe(view: NDArray[np.uint8]) -> NDArray[np.float32]:
+        def one(view: NDArray[np.uint8]) -> NDArray[np.float32]:
             import torch
 
             scaled = (covering(view, _SIDE).astype(np.float32) / 255 - _MEAN) / _DEVIATION
@@ -91,7 +126,7 @@ class FeatureExtractor(Operator):
             return found
 
         origin = "own" if self.checkpoint is not None else "imagenet"
-        return f"torchvision-{self.model}-{origin}", describe
+        return f"torchvision-{self.model}-{origin}", lambda views: np.array([one(view) for view in views], np.float32)
 
 
 def _headless(model: nn.Module, name: str) -> nn.Module:
@@ -103,9 +138,3 @@ def _headless(model: nn.Module, name: str) -> nn.Module:
             setattr(model, head, nn.Identity())
             return model
     raise ModelError(f"{name} has no head that can be left out (fc, classifier, heads or head): choose another model")
-
-
-def _normalised(vector: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The vector with length 1; one of zeros, which has no direction, stays as it is."""
-    length = float(np.linalg.norm(vector.astype(np.float64)))
-    return vector if length == 0 else (vector / np.float32(length)).astype(np.float32)

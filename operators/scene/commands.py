@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from dataflow.messages import Activity, SceneGraph
+from dataflow.messages import Activity, FeatureVector, SceneGraph
 from dataflow.messages.scene_summary import (
     agents_in_words,
     carriers_in_words,
@@ -20,11 +20,15 @@ from dataflow.messages.scene_summary import (
 )
 from dataflow.recording import Recording, RecordingError
 from operators.scene.graph.history import Event, history
-from operators.scene.graph.query import QueryError, as_json, ask
+from operators.scene.graph.meaning import by_meaning, how_to_embed
+from operators.scene.graph.query import Match, QueryError, as_json, ask
 from operators.scene.graph.spark import as_spark_dsg
 
 _OLD = 1.0
 """Seconds by which a graph may be older than what is asked for, without a word."""
+
+_LIKEST = 10
+"""Nodes that a question by meaning is answered with."""
 
 scene = typer.Typer(name="scene", add_completion=False)
 
@@ -36,7 +40,8 @@ def show(
         float | None, typer.Option(metavar="SECONDS", min=0, help="So long after its first message. Default: its end.")
     ] = None,
     query: Annotated[
-        str | None, typer.Option(help="Whatever fits, such as 'mug on table near person'; 'not' denies a relation.")
+        str | None,
+        typer.Option(help="Whatever fits: 'mug on table near person', or by meaning: 'something to drink from'."),
     ] = None,
     story: Annotated[
         str | None, typer.Option("--history", metavar="NODE", help="What happened to a node, such as 'mug 12', so far.")
@@ -53,7 +58,8 @@ def show(
     node's history up to then.
 
     A question names a class and conditions on it: `mug on table near person` is a mug that is on a table and near a
-    person. A class may be `anything` or have a number, as in `on table 3`. Exit code 1 where nothing fits.
+    person; `not` denies a relation. A class may be `anything` or have a number, as in `on table 3`. Any other text
+    names the ten nodes that are most like it in meaning, where nodes have embeddings. Exit code 1 where nothing fits.
 
     Examples:
 
@@ -70,13 +76,12 @@ def show(
         if at is not None and since < at - _OLD:
             note = f"note: nothing is newer than {since:.1f} s, so this is of then, not of {at:g} s"
             Console(stderr=True).print(note, highlight=False, soft_wrap=True)
-        matches = None if query is None else ask(graph, query)
+        matches = None if query is None else _asked(recording, stream, graph, query)
         if export is not None:
             _write(graph, export, overwrite=overwrite)
     except (QueryError, RecordingError, ValueError, OSError) as error:
         Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None
-    names = graph.names()
     if json:
         content = as_json(graph, activities)
         if matches is not None:
@@ -88,17 +93,40 @@ def show(
     elif matches is None:
         _tell(recording, graph, activities, since)
     else:
-        out = Console()
-        for m in matches:
-            place = ", ".join(f"{v:.2f}" for v in graph.positions[m.node])
-            reasons = "; ".join(
-                f"{p.replace('_', ' ')} {names[o] if s == m.node else names[s]}" for s, p, o in m.because
-            )
-            out.print(f"{names[m.node]} at ({place}) m, score {m.score:.2f}" + (f": {reasons}" if reasons else ""))
+        _answer(graph, matches)
         if not matches:
-            out.print(f"nothing at {since:.1f} s is {query}", highlight=False)
+            Console().print(f"nothing at {since:.1f} s is {query}", highlight=False)
     if matches is not None and not matches:
         raise typer.Exit(1)
+
+
+def _answer(graph: SceneGraph, matches: list[Match]) -> None:
+    out, names = Console(), graph.names()
+    for m in matches:
+        place = ", ".join(f"{v:.2f}" for v in graph.positions[m.node])
+        reasons = "; ".join(f"{p.replace('_', ' ')} {names[o] if s == m.node else names[s]}" for s, p, o in m.because)
+        out.print(f"{names[m.node]} at ({place}) m, score {m.score:.2f}" + (f": {reasons}" if reasons else ""))
+
+
+def _asked(path: Path, stream: str | None, graph: SceneGraph, query: str) -> list[Match]:
+    """Returns what fits a question, or, where that is none of classes and relations, what is like it in meaning."""
+    try:
+        return ask(graph, query)
+    except QueryError as error:
+        reason = str(error)
+    with _opened(path) as recording:
+        built, _ = _built(recording, stream)
+        room = built.rpartition("/")[0].rpartition("/")[0]
+        known = [n for n, info in recording.streams.items() if info.message_type is FeatureVector]
+        means = [n for n in known if n.endswith("/means") and n.startswith(f"{room}/" if room else "")]
+        if len(means) != 1:
+            found = f"there are several of embeddings: {', '.join(means)}" if means else "nodes have no embeddings"
+            raise QueryError(f"{reason}. By meaning it cannot be asked: {found}; {how_to_embed()}")
+        records = recording.messages(means, end=graph.stamp)
+        vectors = (record.message for record in records if isinstance(record.message, FeatureVector))
+        matches = by_meaning(graph, vectors, query)[:_LIKEST]
+    Console(stderr=True).print(f"note: by meaning, since {reason}", highlight=False, soft_wrap=True, markup=False)
+    return matches
 
 
 def _write(graph: SceneGraph, file: Path, *, overwrite: bool) -> None:

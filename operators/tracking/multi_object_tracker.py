@@ -44,6 +44,9 @@ class MultiObjectTracker(Operator):
         required=False, doc="one vector for each detection, in their order and with their stamp; others are not used"
     )
     tracks: Out[Tracks] = Out(doc="tentative, confirmed, coasting and just ended tracks, by rising id")
+    looks: Out[FeatureVector] = Out(
+        doc="mean direction of the vectors of each track that was matched now, by its id; where `features` are used"
+    )
     status: Out[Diagnostics] = Out(doc="tracks by state; a warning where boxes are unusable or the image size changes")
 
     strong: float = Param(0.5, ge=0, le=1, doc="weaker detections continue confirmed tracks and do nothing else")
@@ -88,13 +91,14 @@ class MultiObjectTracker(Operator):
         boxes = detections.boxes.astype(np.float64)
         usable = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
         rows = np.flatnonzero(usable)
+        vectors = self._vectors(detections, features, rows)
         tracks = self.state.tracker.update(
             detections.stamp,
             boxes[rows],
             detections.scores[rows].astype(np.float64),
             self._class_ids(detections)[rows],
             view[1:],
-            self._vectors(detections, features, rows),
+            vectors,
         )
         counts = Counter(t.state.name.lower() for t in tracks)
         counts["unusable boxes"] = detections.count - len(rows)
@@ -102,7 +106,8 @@ class MultiObjectTracker(Operator):
             {"images": 1, "detections": detections.count, "unusable boxes": counts["unusable boxes"]}
         )
         self.state.counts["tracks ended"] += counts["ended"]
-        return {"tracks": self._message(detections, tracks), "status": _status(detections.stamp, counts, resized)}
+        made = {"tracks": self._message(detections, tracks), "status": _status(detections.stamp, counts, resized)}
+        return made if vectors is None or features is None else made | {"looks": _looks(features, tracks)}
 
     def on_reset(self, input: str) -> None:
         """The clock behind an input began anew: tracks of the time before mean nothing now."""
@@ -143,6 +148,13 @@ class MultiObjectTracker(Operator):
             unseen=np.array([(now - t.seen) * 1e-9 for t in tracks], np.float32),
             boxes=boxes_of([t.filter for t in tracks]).astype(np.float32),
         )
+
+
+def _looks(features: FeatureVector, tracks: list[BoxTrack]) -> FeatureVector:
+    now = [t for t in tracks if t.seen == features.stamp]
+    known = [(t.id, t.feature) for t in now if t.feature is not None and t.feature.any()]
+    vectors = np.array([mean for _, mean in known], np.float32).reshape(len(known), -1 if known else 0)
+    return features.replace(labels=(), vectors=vectors, ids=np.array([i for i, _ in known], np.int64))
 
 
 def _status(stamp: int, counts: Mapping[str, int], resized: bool) -> Diagnostics:

@@ -127,8 +127,8 @@ def train_second(second: Second, data: Any, first: Path, options: ImageTraining,
 def add_second(task: Task, first: Path, out: Path, options: ImageTraining) -> Outcome:
     """Trains a second network, and writes the file of the first with it to `out`, which may be the same.
 
-    Beside `out` stays its checkpoint, `.refiner.pt` or `.borders.pt`, from which `resume` goes on where it is there; one
-    of a training that had ended leaves `out` as it is.
+    Beside `out` stays its checkpoint, `.refiner.pt` or `.borders.pt`, from which `resume` goes on where it is there;
+    one of a training that had ended leaves `out` as it is.
     """
     from operators.learning.export import attach_second
     from operators.learning.files import TrainingFileError

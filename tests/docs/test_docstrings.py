@@ -51,7 +51,7 @@ def test_no_public_docstring_opens_with_a_question_word(repository: Path) -> Non
 WITHOUT_A_METHOD = {
     "CustomDetector", "DepthDecoder", "DepthSelfFilter",
     "DepthWatch", "ImageClassifier", "ImageDecoder", "ImageWatch", "MotionCheck", "OnnxDetector",
-    "OnnxSegmenter", "ScanWatch", "SceneGraphMetrics", "ScoreFilter", "Segmenter", "SelfFilter",
+    "OnnxRigDetector", "OnnxSegmenter", "ScanWatch", "SceneGraphMetrics", "ScoreFilter", "Segmenter", "SelfFilter",
     "TorchvisionRigDetector", "TorchvisionRigSegmenter", "TrajectoryPlots", "VideoDecoder",
 }  # fmt: skip
 """Operators that apply a definition or a network of any make, or what this project thought of itself."""

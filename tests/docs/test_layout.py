@@ -16,7 +16,7 @@ MOST_ARROWS_IN_ODOMETRY = 40
 MOST_LINES = 60
 LONG = {
     "dataflow.cli.commands.convert:convert": 122,
-    "dataflow.cli.commands.demo:demo": 66,
+    "dataflow.cli.commands.demo:demo": 65,
     "dataflow.cli.commands.live:hz": 63,
     "dataflow.cli.commands.logs:logs": 69,
     "dataflow.cli.commands.recording:record": 71,
@@ -26,7 +26,7 @@ LONG = {
     "dataflow.process.operator_process:OperatorProcess.__init__": 80,
     "dataflow.supervision.plan:process_plans": 69,
     "dataflow.verification.verify:verify": 78,
-    "operators.scene.commands:show": 69,
+    "operators.scene.commands:show": 64,
     "operators.scene.map.cuboid:fit_cuboid": 81,
     "operators.scene.lifting.frustums:lift": 61,
     "operators.training.learning:learn_object": 71,

@@ -8,7 +8,7 @@ from example_messages import example
 
 from dataflow.foxglove.drawing import data_of, drawing_of, schema_of
 from dataflow.foxglove.topics import FRAMES, Topics
-from dataflow.messages import Detections2D, Mesh, Odometry, SceneGraph, SegmentationMap, Tracks, pack_masks
+from dataflow.messages import Detections2D, Keypoints2D, Mesh, Odometry, SceneGraph, SegmentationMap, Tracks, pack_masks
 from dataflow.messages.base import message_types
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
@@ -61,6 +61,16 @@ def test_a_mask_is_drawn_by_the_pixels_at_its_rim():
     )  # fmt: skip
     drawn = {(p.x, p.y) for p in over.points[0].points}
     assert drawn == {(x + 0.5, y + 0.5) for y in range(1, 5) for x in range(2, 6) if x in (2, 5) or y in (1, 4)}
+
+
+def test_keypoints_are_drawn_as_limbs():
+    drawn = decoded(
+        Keypoints2D(
+            stamp=1, frame="camera", width=9, height=6, links=[[0, 1], [1, 2]],
+            points=[[[1, 2], [3, 4], [5, 6]]], scores=[[1, 0.6, 0.4]],
+        )
+    )  # fmt: skip
+    assert [(p.x, p.y) for p in drawn.points[0].points] == [(1, 2), (3, 4)]
 
 
 def tracks(**fields):

@@ -111,3 +111,12 @@ def test_real_frames_become_a_scene_graph_that_verifies(
     last = dataflow.open(file)["robot1/perception/scene/graph"][-1]
     assert isinstance(last, SceneGraph)
     assert must <= {last.class_names[c] for c in last.class_ids.tolist()}
+
+
+@pytest.mark.parametrize("name", ["perception", "perception_rgbd", "perception_kitti"])
+def test_one_parameter_says_where_networks_compute(name: str) -> None:
+    nodes = load_graph(
+        REPOSITORY / "graphs" / f"{name}.yaml", settings=["provider=cuda", "perception.embed=true"]
+    ).nodes
+    networks = ("perception/detector", "perception/embedder")
+    assert [nodes[each].params["provider"] for each in networks] == ["cuda", "cuda"]

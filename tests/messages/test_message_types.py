@@ -24,7 +24,7 @@ def test_the_families_cover_what_a_robot_needs() -> None:
     wanted = """
         Image Image16 CompressedImage CompressedVideo DepthImage CompressedDepth RelativeDepth CameraInfo
         PointCloud Imu MagneticField LaserScan RadarScan RangeReading NavSatFix Point Pose Transforms Odometry Twist
-        WheelTicks JointState Detections2D Boxes3D
+        WheelTicks JointState Detections2D Keypoints2D Boxes3D
         SegmentationMap Tracks FeatureVector SceneGraph Activity Diagnostics LandmarkSightings Path OccupancyGrid Mesh
         Planes Clusters Classification ParticleSet Number Measurement Text Switch Alarm"""
     assert {cls.SCHEMA for cls in TYPES} == set(wanted.split())

@@ -246,6 +246,13 @@ def _detections(values: Values, rng: Rng) -> None:
         values.update(width=width, height=height, masks=pack_masks(pixels))
 
 
+def _keypoints(values: Values, rng: Rng) -> None:
+    count = values["points"].shape[1]
+    values["names"] = _distinct(count, rng) if values["names"] else ()
+    values["links"] = rng.integers(0, max(count, 1), values["links"].shape).astype(np.int32)[: count * 9]
+    values["scores"] = rng.random(values["points"].shape[:2]).astype(np.float32)
+
+
 def _segmentation_map(values: Values, rng: Rng) -> None:
     classes = values["classes"]
     values["classes"] = rng.integers(0, len(values["class_names"]), classes.shape, dtype=classes.dtype)
@@ -370,6 +377,7 @@ _REPAIRS: dict[str, Callable[[Values, Rng], None]] = {
     "Diagnostics": _diagnostics,
     "FeatureVector": _feature_vector,
     "JointState": _named("positions", "velocities", "efforts"),
+    "Keypoints2D": _keypoints,
     "LandmarkSightings": _landmark_sightings,
     "LaserScan": _laser_scan,
     "Mesh": _mesh,

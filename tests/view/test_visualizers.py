@@ -25,6 +25,7 @@ from dataflow.messages import (
     Diagnostics,
     Image,
     Imu,
+    Keypoints2D,
     Message,
     Number,
     OccupancyGrid,
@@ -213,6 +214,19 @@ def test_masks_are_a_layer_that_goes_when_a_message_has_none(tmp_path: Path) -> 
     np.testing.assert_array_equal(alpha > 0, pixels[0])
     (cleared,) = at(found, "/d/x/overlay/masks", "Clear:is_recursive")
     assert cleared.stamp == STAMP + 1
+
+
+def test_limbs_are_drawn_between_points_that_were_found(tmp_path: Path) -> None:
+    points = [[[1, 2], [3, 4], [5, 6]], [[7, 8], [np.nan, np.nan], [9, 10]]]
+    message = Keypoints2D(
+        stamp=STAMP, frame="optical", width=64, height=48, links=[[0, 1], [1, 2], [0, 2]], points=points,
+        scores=[[0.9, 0.6, 0.2], [0.9, 0.9, 0.9]],
+    )  # fmt: skip
+    found = draw(tmp_path, ("k/x", message))
+    (limbs,) = at(found, "/k/x/overlay/limbs", "LineStrips2D:strips")
+    assert limbs.values == [[[1, 2], [3, 4]], [[7, 8], [9, 10]]]
+    (shown,) = at(found, "/k/x/overlay/points", "Points2D:positions")
+    assert shown.values == [[1, 2], [3, 4], [7, 8], [9, 10]]
 
 
 def test_a_class_has_one_colour_whatever_its_number(tmp_path: Path) -> None:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import time
 from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.padding import Padding
 from rich.text import Text
 
-from dataflow.cli.support.arguments import Json, number, output_file, span, window
+from dataflow.cli.support.arguments import Json, number, output_file, span
 from dataflow.cli.support.execution import Outputs, execute, plan_options
 from dataflow.cli.support.output import fail, friendly_errors, out, print_json, say, seconds
 from dataflow.cli.support.run_options import Quiet
+
+if TYPE_CHECKING:
+    from dataflow.graph import Graph
 
 GRAPH, RECORDING = "perception", "demo"
 SHOWN = "dataflow-demo.rrd"
@@ -58,8 +61,6 @@ def demo(
     import dataflow.shipped as shipped
     from dataflow.cli.support.execution import checked_outputs
     from dataflow.graph import load_graph
-    from dataflow.recording import Recording
-    from dataflow.supervision.replay import plan_replay
     from dataflow.supervision.run import replay as replay_recording
 
     with friendly_errors():
@@ -71,16 +72,12 @@ def demo(
         loaded = load_graph(graph.path)
         rate = None if outputs.view_file is not None else 1.0
         options = plan_options(loaded, outputs, False, False, None, rate, False, 120.0)
-        with Recording(recording) as opened:
-            whole = span(opened, plan_replay(opened, loaded).streams)
-            _, finish = window(whole, None, duration, recording)
-        pace = "as fast as this machine computes it" if rate is None else "in real time; Ctrl-C ends it"
-        say(f"plays {seconds(duration)} of a drive {pace}, once the processes have started, which takes some 10 s")
+        shown = _announced(recording, loaded, duration, in_real_time=rate is not None)
         execute(
             lambda watch: replay_recording(recording, graph=loaded, end=duration, watch=watch, **options),
             loaded,
             outputs,
-            None if whole is None or finish is None else (whole[0], min(whole[1], finish)),
+            shown,
             began=began,
             json=json,
             quiet=quiet,
@@ -92,6 +89,18 @@ def demo(
     again = f"dataflow replay {recording} --graph {GRAPH} --record demo.mcap"
     out.print(Text(f"the same, recorded: {again}; then what it found: dataflow scene demo.mcap"), soft_wrap=True)
     out.print(Text(f"the graph: dataflow graphs {GRAPH}; all graphs: dataflow graphs"), soft_wrap=True)
+
+
+def _announced(recording: Path, graph: Graph, duration: float, *, in_real_time: bool) -> tuple[int, int] | None:
+    """Says how long it takes; returns the first and the last stamp (ns) that are played."""
+    from dataflow.recording import Recording
+    from dataflow.supervision.replay import plan_replay
+
+    with Recording(recording) as opened:
+        whole = span(opened, plan_replay(opened, graph).streams)
+    pace = "in real time; Ctrl-C ends it" if in_real_time else "as fast as this machine computes it"
+    say(f"plays {seconds(duration)} of a drive {pace}, once the processes have started, which takes some 10 s")
+    return None if whole is None else (whole[0], min(whole[1], whole[0] + round(duration * 1e9)))
 
 
 def _outputs() -> Outputs:

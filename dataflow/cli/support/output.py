@@ -269,7 +269,7 @@ _PARTS = {"@log": "recording", "@recorder": "recorder", "@view": "viewer's file"
 
 
 def called(name: str) -> str:
-    """What an operator or a process is called: by its name, the runtime's own parts by what they are."""
+    """Returns the name of an operator or a process for people; parts of the runtime are named by what they do."""
     return _PARTS.get(name, name)
 
 

@@ -6,6 +6,7 @@ A message that several parts hold, since firings of both take it, is read once.
 from __future__ import annotations
 
 import re
+from bisect import bisect_right
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -88,7 +89,8 @@ class PartedFile:
         self._numbers = numbers
         self._bases = [0, *accumulate(file.chunks for file in self._files)]
         once = {number for number, c in self.channels.items() if c.metadata.get("kind") in _ONCE}
-        indexes = [(f.index, {n: own for own, n in m.items()}) for f, m in zip(self._files, numbers, strict=True)]
+        self._owns = [{number: own for own, number in of.items()} for of in numbers]
+        indexes = list(zip((file.index for file in self._files), self._owns, strict=True))
         self.index: MessageIndex = _JoinedIndex(indexes, self._bases, once)
 
     def _joined_metadata(self) -> list[tuple[str, dict[str, str]]]:
@@ -134,9 +136,12 @@ class PartedFile:
 
     def read(self, channel: int, chunk: int, offset: int, log_time: int) -> RawMessage:
         """The message that an entry of the index points to. Raises `DamagedError` where another one is there."""
-        part = int(np.searchsorted(self._bases, chunk, "right")) - 1
-        own = next(own for own, number in self._numbers[part].items() if number == channel)
-        return self._files[part].read(own, chunk - self._bases[part], offset, log_time)._replace(channel=channel)
+        part = bisect_right(self._bases, chunk) - 1
+        return (
+            self._files[part]
+            .read(self._owns[part][channel], chunk - self._bases[part], offset, log_time)
+            ._replace(channel=channel)
+        )
 
     def close(self) -> None:
         """Closes the files. Idempotent."""

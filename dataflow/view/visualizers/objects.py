@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from dataflow.messages import Boxes3D, Detections2D, LandmarkSightings, SegmentationMap, Tracks, TrackState
+from dataflow.messages import Boxes3D, Detections2D, Keypoints2D, LandmarkSightings, SegmentationMap, Tracks, TrackState
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 from dataflow.view.visualizers.clouds import finite_rows
@@ -20,6 +20,8 @@ _BACKDROP = frozenset(
 )
 _BACKDROP_ALPHA = 60  # of 255: the image stays readable
 _MASK_ALPHA = 110  # of 255
+_FOUND = 0.5
+_LIMB = (80, 230, 120)
 _RAY = 10.0  # metres: how far a bearing without a range is drawn
 _PATH_VERTICES = 200
 _STILL = 0.05  # m/s
@@ -48,6 +50,15 @@ def _masks(canvas: Canvas, message: Detections2D, names: Sequence[str]) -> None:
     for k in np.argsort(message.scores, kind="stable").tolist():
         layer[message.mask(k)] = (*colors.of_class(names[k]), _MASK_ALPHA)
     canvas.draw("overlay/masks", canvas.plane, rr.Image(layer, color_model="RGBA", draw_order=1.0))
+
+
+@visualizer(Keypoints2D, "overlay")
+def keypoints_2d(canvas: Canvas, message: Keypoints2D) -> None:
+    """Points over the image and the limbs between them, those that are likelier found than not."""
+    sure = np.isfinite(message.points).all(axis=2) & (message.scores >= _FOUND)
+    canvas.draw("overlay/limbs", canvas.plane, rr.LineStrips2D(message.limbs(_FOUND), colors=_LIMB))
+    points = rr.Points2D(message.points[sure], colors=_LIMB, radii=rr.Radius.ui_points(3))
+    canvas.draw("overlay/points", canvas.plane, points)
 
 
 @visualizer(SegmentationMap, "overlay")

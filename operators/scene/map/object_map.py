@@ -62,8 +62,11 @@ class ObjectMap:
         self.floor: float | None = None
         """Height of the floor, where it is known: what stands on it reaches down to it."""
 
-    def update(self, stamp: int, seen: Sequence[Observation], view: RangeView) -> None:
-        """Takes the observations of one time and the view that they come from."""
+    def update(self, stamp: int, seen: Sequence[Observation], view: RangeView) -> list[int]:
+        """Takes the observations of one time and the view that they come from. Returns the object's id of each.
+
+        An object that was found to be a double of another, or one that is known, keeps its id no longer.
+        """
         s = self._settings
         seconds = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
         self._stamp = stamp
@@ -74,6 +77,7 @@ class ObjectMap:
         seen = [self._alone(each, view) for each in seen]
         cells = Cells.of_each([each.points for each in seen], s.voxel)
         joined = self._joined(seen, cells, stamp, view)
+        ids: dict[int, int] = {}
         in_hands = carried(seen, cells, joined, view, self.objects, self._kinds, s.views)
         for k, each in enumerate(seen):
             if k in in_hands:
@@ -82,17 +86,24 @@ class ObjectMap:
             elif k in joined:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
-                self._begin(each, cells[k], stamp, view.origin)
+                ids[k] = self._begin(each, cells[k], stamp, view.origin)
         shown = {i: cells[k] for k, i in joined.items()}
         self._note_beside(seen, [joined.get(k) for k in range(len(seen))])
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
+        return [joined[k] if k in joined else ids[k] for k in range(len(seen))]
 
     @property
     def heading(self) -> float | None:
         """Heading of most things around, in [0, pi / 2); None where none stands out."""
         return self._heading
+
+    def widen(self, classes: int, kinds: Kinds) -> None:
+        """Takes in classes that were added after those before."""
+        self._classes, self._kinds = classes, kinds
+        for object in (*self.objects.values(), *(old for _, old in self.gone.values())):
+            object.votes = np.pad(object.votes, (0, classes - len(object.votes)))
 
     def confirmed(self) -> list[MapObject]:
         """Returns the objects that were seen often enough, whatever their size and class, by rising id."""
@@ -188,7 +199,7 @@ class ObjectMap:
     def _is_sure(self, object: MapObject) -> bool:
         return object.evidence >= self._settings.confirm and object.sightings >= self._settings.views
 
-    def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
+    def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> int:
         votes = np.zeros(self._classes)
         votes[each.class_id] = each.score
         made = MapObject(self._next, cells, votes, _log_odds(each.score, self._settings.gain), stamp, stamp)
@@ -202,6 +213,7 @@ class ObjectMap:
         self._fit(made)
         self.objects[made.id] = made
         self._next += 1
+        return made.id
 
     def _look_around(
         self, view: RangeView, objects: Sequence[MapObject], shown: Mapping[int, Cells], seconds: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,6 +96,9 @@ class SemanticMap(Operator):
         doc="the same objects as nodes without relations, with when each was last seen; and the surfaces, whose ids "
         "are 0 (the floor) and from -11 down"
     )
+    seen: Out[Detections2D] = Out(
+        doc="of `images` those of objects that are given, with the ids of their nodes; where there are any images"
+    )
     status: Out[Diagnostics] = Out(
         doc="objects by what became of them, doubted ones too; a warning for a view without points"
     )
@@ -177,7 +180,7 @@ class SemanticMap(Operator):
         ]
         known.floor = self.state.surfaces.floor
         view = RangeView(points[:: 1 + len(points) // 20_000], T, 0.012)
-        known.update(cloud.stamp, [each for each in seen if each is not None], view)
+        joined = known.update(cloud.stamp, [each for each in seen if each is not None], view)
         if surfaces is not None and surfaces.stamp == cloud.stamp:
             parts = seen_surfaces(surfaces, cloud, T, self.max_range)
             self.state.surfaces.update(cloud.stamp, parts, view, known.heading)
@@ -196,11 +199,15 @@ class SemanticMap(Operator):
         self.state.counts["views without points"] += not len(points)
         self.state.counts["objects"], self.state.counts["moved"] = len(objects), known.moved
         self.state.counts["doubted"], self.state.counts["surfaces"] = counts["doubted"], len(planes)
-        return {
+        made = {
             "objects": self._boxes(cloud.stamp, objects, scores),
             "nodes": nodes_of(cloud.stamp, self.state.frame, self.state.classes, objects, scores, planes),
             "status": _status(cloud.stamp, counts),
         }
+        if images is not None and images.stamp == boxes.stamp and images.count == boxes.count:
+            used = [k for k, each in enumerate(seen) if each is not None]
+            made["seen"] = _of_nodes(images, dict(zip(used, joined, strict=True)), {o.id for o in objects})
+        return made
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -221,7 +228,11 @@ class SemanticMap(Operator):
         if pose.frame != self.state.frame:
             raise ValueError(f"the pose is in {pose.frame!r}, the map in {self.state.frame!r}")
         if boxes.class_names != self.state.classes:
-            raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self.state.classes}")
+            if boxes.class_names[: len(self.state.classes)] != self.state.classes:
+                raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self.state.classes}")
+            self.state.classes = boxes.class_names
+            self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, self.state.classes)
+            self.state.map.widen(len(self.state.classes), Kinds.of(self._labels, self.state.classes))
         return self.state.map
 
     def _take_up(self, saved: SavedMap, stamp: int) -> None:
@@ -314,6 +325,22 @@ def _images(
     rows = images.boxes.astype(np.float64)
     whole = np.where(np.arange(4) < 2, rows > _BORDER, rows < size - _BORDER)
     return [ImageView(P, box - 0.5, edges, eye) for box, edges in zip(rows, whole, strict=True)]
+
+
+def _of_nodes(images: Detections2D, joined: Mapping[int, int], given: Collection[int]) -> Detections2D:
+    """Returns the rows of images that show given nodes, by the node of each row that has one."""
+    rows = [k for k, i in joined.items() if i in given]
+    return Detections2D(
+        stamp=images.stamp,
+        frame=images.frame,
+        width=images.width,
+        height=images.height,
+        class_names=images.class_names,
+        boxes=images.boxes[rows],
+        scores=images.scores[rows],
+        class_ids=images.class_ids[rows],
+        ids=np.array([joined[k] for k in rows], np.int64),
+    )
 
 
 def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:

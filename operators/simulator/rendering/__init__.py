@@ -1,1 +1,1 @@
-"""What a camera or a lidar sees of a world: meshes, light, rays."""
+"""Rendering of a world for cameras and lidars: meshes, light, rays."""

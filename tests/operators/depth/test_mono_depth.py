@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import DepthImage, Diagnostics, Image, RelativeDepth
+from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, RelativeDepth
 from dataflow.testing import Played, play
 from operators.depth import MonoDepth
 from operators.depth.scaling import fitted
@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 64, 48
 GAIN, BASE = 100.0, 30.0  # brightness of 1/depth
 
 
-def network(file: Path, shape: tuple[Any, ...] = (1, 3, HEIGHT, WIDTH), kept: int = 1) -> Path:
+def network(file: Path, shape: tuple[Any, ...] = (1, 3, HEIGHT, WIDTH), kept: int = 1, kind: str = "FLOAT") -> Path:
     """Writes a network whose output is the mean of the three channels."""
     from onnx import TensorProto, helper
 
@@ -31,8 +31,8 @@ def network(file: Path, shape: tuple[Any, ...] = (1, 3, HEIGHT, WIDTH), kept: in
     graph = helper.make_graph(
         [node],
         "mean",
-        [helper.make_tensor_value_info("input", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info("output", TensorProto.FLOAT, None)],
+        [helper.make_tensor_value_info("input", getattr(TensorProto, kind), shape)],
+        [helper.make_tensor_value_info("output", getattr(TensorProto, kind), None)],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
     onnx.save(model, str(file))
@@ -190,6 +190,36 @@ def test_a_model_that_answers_in_metres_gives_depth_by_itself(model: Path) -> No
     assert (depth.data == 0).any()
     assert not played["relative"]
     assert status_of(played) == ("the model gives metres", 0)
+
+
+def test_half_precision_gives_the_same(tmp_path: Path, model: Path) -> None:
+    image = photograph(scene())
+    half = network(tmp_path / "half.onnx", kind="FLOAT16")
+    (found,), (expected,) = (estimated(file, image, None)["relative"] for file in (half, model))
+    np.testing.assert_array_equal(found.data, expected.data)  # whole levels below 2048
+
+
+def canonical(model: Path, fx: float, data: np.ndarray, **params: Any) -> Played:
+    height, width = data.shape[:2]
+    info = CameraInfo.from_intrinsics(
+        stamp=0, frame="camera", width=width, height=height, fx=fx, fy=fx, cx=width / 2, cy=height / 2
+    )
+    operator = MonoDepth(model=str(model), answer="metres", canonical_focal=1000.0, max_range=1000.0, **params)
+    return play(operator, {"image": [Image(stamp=1, frame="camera", data=data)], "image_info": [info]})
+
+
+def test_metres_of_a_canonical_camera_become_those_of_the_images(model: Path) -> None:
+    """As Metric3D's hubconf does: the image keeps its proportions, and depths go by the focal length in the input."""
+    data = np.repeat(photograph(scene()).data[:, 16:48], 2, axis=0).repeat(2, axis=1)  # 64x96: half as wide as high
+    (depth,) = canonical(model, 800.0, data)["depth"]
+    assert depth.data.shape == data.shape[:2]
+    scale = min(WIDTH / 64, HEIGHT / 96)
+    expected = data[..., 0] * (800.0 * scale / 1000.0)
+    inner = np.abs(cv2.Laplacian(data[..., 0].astype(np.float32), cv2.CV_32F, ksize=3)) < 12  # apart from edges
+    np.testing.assert_allclose(depth.data[inner], expected[inner], rtol=0.06)
+    played = estimated(model, photograph(scene()), None, answer="metres", canonical_focal=1000.0)
+    assert not played["depth"]
+    assert status_of(played) == ("no image_info: the model's metres are of another camera", 1)
 
 
 def test_an_open_input_takes_the_given_size_and_pixels_are_normalised(tmp_path: Path) -> None:

@@ -32,12 +32,13 @@ def prompted() -> torch.nn.Module:
     return Prompted()
 
 
-def exported(file: Path, *, many: bool) -> str:
+def exported(file: Path, *, many: bool, half: bool = False) -> str:
     queries = 2 if many else 1
-    given = (torch.rand(1, 3, 48, 64), torch.rand(1, queries, 2, 2), torch.rand(1, queries, 2))
+    shapes = ((1, 3, 48, 64), (1, queries, 2, 2), (1, queries, 2))
+    given = tuple(torch.rand(shape, dtype=torch.float16 if half else torch.float32) for shape in shapes)
     names = ["batched_images", "batched_point_coords", "batched_point_labels"]
     torch.onnx.export(
-        prompted(),
+        prompted().half() if half else prompted(),
         given,
         str(file),
         input_names=names,
@@ -68,9 +69,10 @@ def detections(width: int = WIDTH) -> Detections2D:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+@pytest.mark.parametrize("half", [False, True], ids=["float32", "float16"])
 @pytest.mark.parametrize("many", [True, False], ids=["all boxes at once", "one by one"])
-def test_each_box_gets_what_is_bright_in_it(tmp_path: Path, many: bool) -> None:
-    made = BoxSegmenter(model=exported(tmp_path / "m.onnx", many=many), most=2)
+def test_each_box_gets_what_is_bright_in_it(tmp_path: Path, many: bool, half: bool) -> None:
+    made = BoxSegmenter(model=exported(tmp_path / "m.onnx", many=many, half=half), most=2)
     made.setup()
     given = detections()
     found = made.process(image(), given)

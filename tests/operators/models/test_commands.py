@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from made_towers import write_row
 from served_models import CONTENT, Served, model_of
 from typer.testing import CliRunner
 
@@ -136,3 +137,24 @@ def test_an_unknown_name_is_refused(words: tuple[str, ...], cache: Path) -> None
     code, _, err = run(*words)
     assert code == 2
     assert "did you mean 'yolox_nano'?" in err
+
+
+def test_get_brings_the_parts_of_a_model_too_and_check_names_each(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tmp_path / "made"
+    monkeypatch.setenv(registry.REGISTRIES, str(write_row(made)))
+    assert run("check", "colors")[:2] == (1, "colors: missing\ncolors.text: missing\ncolors.tokenizer: missing\n")
+    code, out, _ = run("get", "colors")
+    assert code == 0
+    assert [Path(line).name for line in out.splitlines()] == ["colors.onnx", "colors.text.onnx", "colors.tokenizer.txt"]
+    assert run("check", "colors")[0] == 0
+    (cache / "colors.tokenizer.txt").unlink()
+    code, out, _ = run("check")
+    assert (code, "colors.tokenizer: missing" in out) == (1, True)
+    assert " no " in next(line for line in run("list", "--task", "embedding")[1].splitlines() if "colors" in line)
+    assert "colors.tokenizer is not on this machine" in " ".join(run("show", "colors")[1].split())
+    code, out, _ = run("get", "colors.tokenizer", "--from", str(made / "cache" / "colors.tokenizer.txt"))
+    assert (code, out.strip()) == (0, str(cache / "colors.tokenizer.txt"))
+    code, _, error = run("get", "colors.text", "--from", str(made / "cache" / "colors.onnx"))
+    assert (code, "colors.text: what arrived is another file" in " ".join(error.split())) == (1, True)

@@ -9,6 +9,7 @@ import pytest
 
 from operators.detection.coco import CLASS_LISTS
 from operators.detection.decoders import LAYOUTS
+from operators.detection.keypoints import KEYPOINT_LAYOUTS
 from operators.inference import ModelError
 from operators.models.registry import Model, Registry
 
@@ -46,7 +47,7 @@ def test_every_row_fits_its_operator(model: Model) -> None:
     given = {name for name, field in fields.items() if field.default is None or model.source.torchvision is not None}
     assert model.params.keys() <= given
     if "decoder" in model.params:
-        assert model.params["decoder"] in (*LAYOUTS, "grid")
+        assert model.params["decoder"] in (*LAYOUTS, *KEYPOINT_LAYOUTS, "grid")
     if isinstance(model.classes, str):
         assert model.classes in CLASS_LISTS
     assert model.licence.code
@@ -80,6 +81,12 @@ def test_a_name_that_is_not_there_is_answered_with_the_nearest() -> None:
         ("http://127.0.0.1/crates.onnx", "ftp://somewhere", "url must begin with https://"),
         ("    published: nothing\n", "", "published: Field required"),
         ("models:", "networks:", "it must hold `models:`"),
+        (
+            "    published: nothing\n",
+            "    published: nothing\n    parts: {text: {source: {url: file:///t.onnx}}}\n",
+            "sha256 must be given for a file that is downloaded",
+        ),
+        ("    published: nothing\n", "    published: nothing\n    parts: {voice: {}}\n", "parts.voice"),
         ("{url:", "{torchvision: COCO_V1, url:", "one of url, index with package and member"),
     ],
 )
@@ -96,3 +103,19 @@ def test_a_file_is_known_by_its_digest_whatever_its_name() -> None:
     assert row.sha256 is not None
     assert registry.with_digest(row.sha256) == registry.with_digest(row.exports[0]) == row
     assert registry.with_digest("1" * 64) is None
+
+
+def test_a_part_is_a_row_with_a_file_of_its_own() -> None:
+    registry = Registry.load()
+    model = registry["clip_vit_b32"]
+    text = registry["clip_vit_b32.text"]
+    assert text == model.part("text")
+    assert [each.file.name for each in model.files] == [
+        "clip_vit_b32.onnx", "clip_vit_b32.text.onnx", "clip_vit_b32.tokenizer.gz"
+    ]  # fmt: skip
+    assert text.accepts(str(model.parts["text"].sha256))
+    assert not text.accepts(str(model.sha256))
+    with pytest.raises(ModelError, match="row yolox_nano has no text among its parts"):
+        registry["yolox_nano"].part("text")
+    with pytest.raises(ModelError, match=r"there is no model 'clip_vit_b32\.voice'; did you mean 'clip_vit_b32"):
+        registry["clip_vit_b32.voice"]

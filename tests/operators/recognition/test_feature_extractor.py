@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_pictures import SHAPES, image, picture, scene
+from made_towers import write_row
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.testing import play
@@ -72,6 +73,27 @@ def test_a_network_of_torchvision_describes_without_its_head(tmp_path: Path) -> 
     assert found.vectors.shape == (2, 576)
     assert found.model == "torchvision-mobilenet_v3_small-own"
     np.testing.assert_allclose(np.linalg.norm(found.vectors, axis=1), 1.0, rtol=1e-5)
+
+
+def test_an_embedding_by_name_describes_what_text_describes_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DATAFLOW_MODELS", str(write_row(tmp_path)))
+    monkeypatch.setenv("DATAFLOW_MODEL_CACHE", str(tmp_path / "cache"))
+    shown = image(
+        np.concatenate([np.full((64, 64, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255))], axis=1)
+    )
+    operator = FeatureExtractor(model="colors", per="object")
+    (found,) = play(operator, {"image": [shown], "detections": [scene()[1]]})["features"]
+    assert found.model.startswith("colors-")
+    assert "colors (row)" in operator.files
+    np.testing.assert_allclose(found.vectors, [[1, 0, 0], [0, 0, 1]], atol=0.05)  # boxes are cut out with a rim
+    few = FeatureExtractor(model=str(tmp_path / "cache" / "colors.onnx"), per="object", most=1)
+    played = play(few, {"image": [shown.replace(stamp=k) for k in range(12)],
+                        "detections": [scene()[1].replace(stamp=k) for k in range(12)]})  # fmt: skip
+    described = np.array([message.vectors.any(axis=1) for message in played["features"]])
+    assert (described.sum(axis=1) == 1).all()
+    assert described.any(axis=0).all(), "each is described in some image"
 
 
 def test_weights_that_are_missing_are_said_to_be_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -111,6 +111,25 @@ def test_appearance_keeps_apart_what_overlap_alone_confuses() -> None:
     assert last.boxes is not None
     assert ids(last) == [1, 2]
     assert last.boxes[0, 0] > last.boxes[1, 0]
+    looks = played["looks"][-1]
+    assert isinstance(looks, FeatureVector)
+    assert (looks.model, looks.ids.tolist()) == ("colour", [1, 2])
+    np.testing.assert_allclose(looks.vectors, [red, blue])
+
+
+def test_tracks_carry_the_mean_direction_of_what_was_described_of_them() -> None:
+    rows = ([[1, 0], [0, 0]], [[0, 0], [0, 1]], [[0, 1], [0, 1]])
+    images = [image(k, [walker(100), walker(200)]) for k in range(3)]
+    features = [
+        FeatureVector(stamp=each.stamp, model="m", vectors=np.array(row, np.float32))
+        for each, row in zip(images, rows, strict=True)
+    ]
+    played = play(MultiObjectTracker(), {"detections": images, "features": features})
+    first, second, third = played["looks"]
+    assert first.ids.tolist() == [1], "rows of zeros were not described"
+    np.testing.assert_allclose(second.vectors, [[1, 0], [0, 1]])
+    np.testing.assert_allclose(third.vectors, [np.array([0.9, 0.1]) / np.hypot(0.9, 0.1), [0, 1]], rtol=1e-6)
+    assert not play(MultiObjectTracker(), {"detections": images})["looks"]
 
 
 def test_unusable_boxes_are_counted_and_survived() -> None:

@@ -44,8 +44,8 @@ TRIED: tuple[str, ...] = (
     f"train classifier CLASSES --out OUT/c.onnx --size 32x32 --residual {IMAGES} --overwrite",
     f"train classifier CLASSES --out OUT/c.onnx --size 32x32 --residual {IMAGES} --resume",
     f"train classifier CLASSES --out OUT/f.onnx --size 32x32 --residual {IMAGES} --from OUT/c.pt",
-    "learn object chair DATA --out OUT/chair.npz --weights OUT/pair/detector.onnx --background CLASSES/disc --seed 1 --json"
-    " --overwrite",
+    "learn object chair DATA --out OUT/chair.npz --weights OUT/pair/detector.onnx --background CLASSES/disc --seed 1"
+    " --json --overwrite",
     "evaluate graph synthetic_rgbd --set frames=3 --all --json",
     "scene SCENE --at 0.5 --query shelf --json --export OUT/scene.json --overwrite",
     "scene SCENE --nodes --stream scene/graph",

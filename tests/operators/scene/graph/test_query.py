@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_towers import write_row
 from typer.testing import CliRunner
 
-from dataflow.messages import SceneGraph
+from dataflow.messages import FeatureVector, SceneGraph
 from dataflow.recording import RecordingWriter
 from operators.scene.commands import scene
 from operators.scene.graph.query import _MEANT, _PHRASES, Clause, QueryError, as_json, ask, parse
@@ -182,6 +183,68 @@ def test_the_command_says_what_is_wrong(recording: Path, tmp_path: Path) -> None
     assert (code, "there is no file" in out) == (2, True)
     code, out = asked(str(recording), "--stream", "other")
     assert (code, "robot1/scene/graph" in " ".join(out.split())) == (2, True)
+
+
+def embedded(folder: Path, model: str = "colors-0123") -> Path:
+    """The recording with vectors: mug 2 becomes blue, mug 3 is red, table 1 green and red; tracks have others."""
+    seen = [{2: (1, 0, 0), 3: (1, 0, 0)}, {1: (0.6, 0.8, 0)}, {2: (0, 0, 1)}, {3: (0, 0, 1)}]
+    file = folder / f"{model}.mcap"
+    with RecordingWriter(file, metadata={}) as writer:
+        writer.add_stream("robot1/scene/graph", SceneGraph)
+        for name in ("robot1/meaning/means", "robot1/tracker/looks", "robot2/meaning/means"):
+            writer.add_stream(name, FeatureVector)
+        for k, known in enumerate(seen):
+            stamp = (k + 1) * 1_000_000_000
+            vectors = np.array([*known.values()], np.float32)
+            made = FeatureVector(stamp=stamp, model=model, vectors=vectors, ids=np.array([*known], np.int64))
+            writer.write("robot1/meaning/means", made, seq=k)
+            for other in ("robot1/tracker/looks", "robot2/meaning/means"):
+                writer.write(other, made.replace(vectors=-vectors), seq=k)
+            if k < 3:
+                writer.write("robot1/scene/graph", graph(stamp), seq=k)
+    return file
+
+
+@pytest.fixture
+def colors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A registry with an image-text network, and its cache."""
+    pytest.importorskip("onnx")
+    monkeypatch.setenv("DATAFLOW_MODELS", str(write_row(tmp_path)))
+    monkeypatch.setenv("DATAFLOW_MODEL_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_any_text_ranks_the_nodes_by_what_it_means(tmp_path: Path, colors: Path) -> None:
+    file = embedded(tmp_path)
+    code, out = asked(str(file), "--query", "something red to drink from", "--json")
+    assert code == 0
+    matches = json.loads(out[out.index("{") :])["matches"]
+    assert matches == [{"id": 3, "score": 1.0}, {"id": 1, "score": 0.6}, {"id": 2, "score": 0.0}]
+    code, out = asked(str(file), "--query", "blue thing")
+    assert code == 0
+    assert "note: by meaning, since 'blue' is no class of this graph" in " ".join(out.split())
+    assert "mug 2 at (9.00, 10.00, 11.00) m, score 1.00" in out
+    assert "by meaning" not in asked(str(file), "--query", "mug on table")[1]
+    _, out = asked(str(file), "--at", "0.5", "--query", "red one", "--json")  # when mug 2 was red, and the table unseen
+    assert [m["id"] for m in json.loads(out[out.index("{") :])["matches"]] == [2, 3]
+
+
+def test_a_question_by_meaning_without_embeddings_names_what_to_get(recording: Path, tmp_path: Path) -> None:
+    code, out = asked(str(recording), "--query", "something to drink from")
+    words = " ".join(out.split())
+    assert code == 2
+    assert "'to' is no relation" in words
+    assert (
+        "nodes have no embeddings; dataflow models get clip_vit_b32, then run the graph with --set embed=true" in words
+    )
+
+
+def test_a_model_without_text_and_one_that_is_not_here_are_named(tmp_path: Path, colors: Path) -> None:
+    code, out = asked(str(embedded(tmp_path, "torchvision-resnet50-own")), "--query", "red one")
+    assert (code, "no row of `dataflow models list` has text in that space" in " ".join(out.split())) == (2, True)
+    (colors / "colors.text.onnx").unlink()
+    code, out = asked(str(embedded(tmp_path)), "--query", "red one")
+    assert (code, "dataflow models get colors.text" in " ".join(out.split())) == (2, True)
 
 
 def test_a_surface_is_asked_for_by_its_name_and_has_its_layer() -> None:

@@ -203,6 +203,34 @@ def test_boxes_of_the_image_keep_neighbours_apart_and_a_restored_map_goes_on_the
     assert min(best_iou(message, solid) for solid in pair) > 0.5
 
 
+def test_boxes_in_the_image_bear_the_ids_of_their_nodes() -> None:
+    operator = SemanticMap(labels=MUGS_MOVE)
+    operator.setup()
+    given = with_images([CRATE, OTHER])
+    made = [operator.process(*view) for view in given]
+    assert made[0]["seen"].count == 0, "nothing is sure yet"
+    seen, nodes = made[-1]["seen"], made[-1]["nodes"]
+    assert sorted(seen.ids.tolist()) == sorted(nodes.ids.tolist())
+    places = dict(zip(nodes.ids.tolist(), nodes.positions[:, 1].tolist(), strict=True))
+    from_left = [seen.ids.tolist()[k] for k in np.argsort(seen.boxes[:, 0])]
+    assert from_left == sorted(places, key=lambda id: -places[id]), "y points to the left"
+    assert {tuple(box) for box in seen.boxes.tolist()} == {tuple(box) for box in given[-1][5].boxes.tolist()}
+    boxes, clusters, cloud, pose, *_ = given[-1]
+    assert "seen" not in operator.process(boxes, clusters, cloud.replace(stamp=cloud.stamp + 1), pose)
+
+
+def test_classes_may_be_added_and_not_be_exchanged() -> None:
+    given = views([[CRATE, OTHER]] * 6)
+    wider = [(b.replace(class_names=(*b.class_names, "lamp")), *rest) for b, *rest in given[3:]]
+    lamps = [(b.replace(class_ids=np.full(b.count, len(b.class_names) - 1, np.int32)), *rest) for b, *rest in wider]
+    plain, grown, renamed = (mapped([*given[:3], *more]) for more in (given[3:], wider, lamps))
+    assert last(grown).class_names == (*given[0][0].class_names, "lamp")
+    assert last(grown).replace(class_names=last(plain).class_names).digest() == last(plain).digest()
+    assert ids(last(renamed)) == ids(last(plain)), "votes for a new class join those for old ones"
+    with pytest.raises(OperatorFailure, match="boxes have the classes"):
+        mapped([given[0], (given[1][0].replace(class_names=("lamp", "mug")), *given[1][1:])])
+
+
 def test_images_of_another_camera_are_refused() -> None:
     (view,) = with_images([CRATE], 1)
     operator = SemanticMap()

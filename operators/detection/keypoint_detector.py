@@ -1,0 +1,116 @@
+"""Keypoints of people in an image, by a network in an ONNX file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Detections2D, Image, Keypoints2D
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.detection.keypoints import (
+    COCO_KEYPOINTS,
+    COCO_LINKS,
+    KEYPOINT_LAYOUTS,
+    Cut,
+    KeypointDecoderName,
+)
+from operators.inference import ModelError, Provider, open_session
+from operators.models.use import use_model
+from operators.network_input import image_input, three_channels
+
+
+class KeypointDetector(Operator):
+    """Finds the keypoints of each detected person, or of the one person in the image where there are no detections.
+
+    The model is one of `dataflow models` by name, or an ONNX file: RTMPose and others of SimCC, which see each box, or
+    MoveNet, made for one person. On the CPU it runs with one thread, so equal images give equal points. Inputs are
+    (N, 3, H, W) or (N, H, W, 3) of float32, float16, uint8 or int32; where N is open all boxes go in at once.
+
+    Sources: Jiang et al., "RTMPose", 2023; Google, "MoveNet", 2021.
+    """
+
+    stateless = True
+
+    image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
+    detections: Sampled[Detections2D] = Sampled(
+        required=False, doc="boxes in the same image; those of another stamp are not used, and nothing is found then"
+    )
+    keypoints: Out[Keypoints2D] = Out(doc="points in the image's pixels, a row for each person, in the boxes' order")
+
+    model: str = Param(min_length=1, doc="a name of `dataflow models list`, or an ONNX file")
+    decoder: KeypointDecoderName | None = Param(None, doc="family of the network; none takes the registry's")
+    input_size: tuple[int, int] | None = Param(
+        None,
+        doc="(width, height) where the model leaves it open; none takes the registry's, or 192 x 256",
+        unit="px",
+    )
+    provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
+    classes: tuple[str, ...] = Param(("person",), doc="names of the detections that have keypoints")
+    min_score: float = Param(0.3, ge=0, le=1, tunable=True, doc="weaker detections are not looked at")
+
+    def setup(self) -> None:
+        """Loads the model. Raises FileNotFoundError or ModelError."""
+        used = use_model(self, self.model)
+        decoder = used.setting(self, "decoder", None)
+        if decoder is None:
+            raise ModelError(
+                f"{used.file} is no file of a model that `dataflow models list` prints, so KeypointDetector.decoder "
+                f"must name its family: {', '.join(KEYPOINT_LAYOUTS)}"
+            )
+        self._layout = KEYPOINT_LAYOUTS[decoder]
+        self._session = open_session(used.file, self.provider)
+        mean, scale = self._layout.scaling
+        free = tuple(used.setting(self, "input_size", (192, 256)))
+        self._input = image_input(used.file, self._session, (free[0], free[1]), bgr=False, mean=mean, scale=scale)
+        self._at_once = not isinstance(self._session.get_inputs()[0].shape[0], int)
+
+    def process(self, image: Image, detections: Detections2D | None = None) -> Keypoints2D:
+        """Raises ModelError for outputs of another shape than the decoder reads."""
+        boxes, ids = np.array([[0.0, 0.0, image.width, image.height]]), None
+        if detections is not None:
+            boxes, ids = self._persons(image, detections)
+        cuts = [Cut.around(box, self._input.size, self._layout.padding) for box in boxes.tolist()]
+        points, scores = self._points(image, cuts)
+        known = points.shape[1] == len(COCO_KEYPOINTS)
+        return Keypoints2D(
+            stamp=image.stamp,
+            frame=image.frame,
+            width=image.width,
+            height=image.height,
+            names=COCO_KEYPOINTS if known else (),
+            links=np.array(COCO_LINKS if known else np.zeros((0, 2)), np.int32),
+            points=points,
+            scores=np.clip(scores, 0, 1),
+            ids=ids,
+        )
+
+    def _persons(self, image: Image, detections: Detections2D) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Returns the boxes (N, 4) to look into, and the ids of what is in them, or their rows."""
+        names = np.array(detections.labels(), object)
+        wide = (detections.boxes[:, 2:] > detections.boxes[:, :2]).all(axis=1)
+        rows = np.flatnonzero(np.isin(names, self.classes) & (detections.scores >= self.min_score) & wide)
+        if detections.stamp != image.stamp:
+            rows = rows[:0]
+        ids = np.arange(detections.count) if detections.ids is None else detections.ids
+        return detections.boxes[rows].astype(np.float64), ids[rows].astype(np.int64)
+
+    def _points(self, image: Image, cuts: list[Cut]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Returns points (N, K, 2) of the image and their scores (N, K)."""
+        if not cuts:
+            count = len(COCO_KEYPOINTS)
+            return np.zeros((0, count, 2), np.float32), np.zeros((0, count), np.float32)
+        pixels = three_channels(image.data)
+        tensors = [self._input.tensor(cut.of(pixels)) for cut in cuts]
+        batches = [np.concatenate(tensors)] if self._at_once else tensors
+        answers = [self._decoded(batch) for batch in batches]
+        points, scores = (np.concatenate(parts) for parts in zip(*answers, strict=True))
+        return np.stack([cut.restore(each) for cut, each in zip(cuts, points, strict=True)]), scores
+
+    def _decoded(self, batch: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        outputs = [np.asarray(each) for each in self._session.run(None, {self._input.name: batch})]
+        try:
+            return self._layout.decode(outputs, self._input.size)
+        except ValueError as error:
+            raise ModelError(f"KeypointDetector.decoder does not fit {self.model}: {error}") from None

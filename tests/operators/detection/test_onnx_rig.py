@@ -1,0 +1,111 @@
+"""An exported network for several cameras: the boxes of each alone, with one call where its batch is open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dataflow.messages import Image
+from dataflow.testing import play
+from operators.detection import OnnxDetector, OnnxRigDetector
+from operators.inference import ModelError
+
+onnx = pytest.importorskip("onnx")
+
+CAMERAS = ("front", "left", "rear")
+
+
+def image(camera: str, red: int, size: tuple[int, int] = (48, 64), stamp: int = 5) -> Image:
+    data = np.full((*size, 3), 90, np.uint8)
+    data[..., 0] = red
+    return Image(stamp=stamp, frame=camera, data=data)
+
+
+IMAGES = [image("front", 255), image("left", 120, (90, 70)), image("rear", 10)]
+
+
+def network(file: Path, *, batch: bool = True, joined: bool = False) -> str:
+    """A model of YOLOv8's signature that finds one box, whose score and middle are the mean of the image.
+
+    With `joined` its answers are not apart by image.
+    """
+    make, real = onnx.helper, onnx.TensorProto.FLOAT
+    nodes = [
+        make.make_node("ReduceMean", ["images"], ["mean"], axes=[1, 2, 3], keepdims=0),
+        make.make_node("Unsqueeze", ["mean", "behind"], ["share"]),
+        make.make_node("Mul", ["share", "factors"], ["scaled"]),
+        make.make_node("Add", ["scaled", "added"], ["row"]),
+        make.make_node("Reshape", ["row", "shape"], ["output"]),
+    ]
+    values = {
+        "behind": np.array([1]),
+        "factors": np.array([32, 32, 0, 0, 1], np.float32),
+        "added": np.array([16, 16, 12, 20, 0], np.float32),
+        "shape": np.array([1, 5, -1] if joined else [-1, 5, 1]),
+    }
+    count = "n" if batch else 1
+    shapes = {"images": [count, 3, 64, 64]}, {"output": [1 if joined else count, 5, "m"]}
+    ports = [[make.make_tensor_value_info(n, real, s) for n, s in each.items()] for each in shapes]
+    kept = [onnx.numpy_helper.from_array(value, name) for name, value in values.items()]
+    graph = make.make_graph(nodes, "mean", *ports, kept)
+    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
+    return str(file)
+
+
+class Counted:
+    """A session that counts the images of each call."""
+
+    def __init__(self, session: Any) -> None:
+        self.session, self.calls = session, list[int]()
+
+    def run(self, names: None, given: dict[str, np.ndarray]) -> Any:
+        self.calls.append(len(given["images"]))
+        return self.session.run(names, given)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.session, name)
+
+
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[Counted]:
+    from operators.detection import exported
+
+    made: list[Counted] = []
+    whole = exported.open_session
+    monkeypatch.setattr(exported, "open_session", lambda *given: made.append(Counted(whole(*given))) or made[-1])
+    return made
+
+
+@pytest.mark.parametrize("batch", [True, False], ids=["open batch", "one image"])
+def test_each_camera_has_its_own_boxes(tmp_path: Path, batch: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    sessions = opened(monkeypatch)
+    model = network(tmp_path / "m.onnx", batch=batch)
+    options: dict[str, Any] = {"model": model, "decoder": "yolov8", "classes": "thing", "score_threshold": 0.05}
+    rig = play(OnnxRigDetector(cameras=CAMERAS, **options), {"images": {each.frame: [each] for each in IMAGES}})
+    assert sessions[0].calls == ([3] if batch else [1, 1, 1])
+    for k, each in enumerate(IMAGES):
+        alone = OnnxDetector(**options)
+        alone.setup()
+        (found,) = rig[f"detections_{k + 1}"]
+        assert found.count == 1
+        assert found.digest() == alone.process(each).digest()
+    assert rig["detections_4"] == []
+
+
+def test_answers_that_are_not_apart_by_image_are_refused(tmp_path: Path) -> None:
+    model = network(tmp_path / "m.onnx", joined=True)
+    made = OnnxRigDetector(cameras=CAMERAS, model=model, decoder="yolov8", classes="a")
+    made.setup()
+    with pytest.raises(ModelError, match=r"was given 3 images and answered \(1, 5, 3\), .* export it for one image"):
+        made.process({each.frame: each for each in IMAGES})
+
+
+def test_rows_of_detectors_are_for_rigs_too() -> None:
+    made = OnnxRigDetector(cameras=("front",), model="simulated")
+    made.setup()
+    assert "simulated (row)" in made.files
+    alone = OnnxDetector(model="simulated")
+    alone.setup()
+    assert made.process({"a": IMAGES[0]})["detections_1"].digest() == alone.process(IMAGES[0]).digest()
