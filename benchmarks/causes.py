@@ -65,10 +65,11 @@ import sys
 sys.path += {folders!r}
 import dataflow
 from dataflow.graph import load_text
+from dataflow.supervision.core.report import RunFailed
 for path, text in {runs!r}.items():
     try:
         dataflow.run(load_text(text), record=path)
-    except dataflow.RunFailed as failure:
+    except RunFailed as failure:  # one that fails to close
         print(failure, file=sys.stderr)
 """
 UNTRAPPED = {sources.COMPILED, sources.HASHES, sources.ADDRESSES, sources.MODULE}
