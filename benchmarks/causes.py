@@ -51,8 +51,9 @@ FAULTY = {
     "Leaves": {sources.MODULE},
     "Two": {sources.WALL, sources.ENTROPY},
     "ClockAndMemory": {sources.WALL, sources.HEAP},
+    "Sets, repeats": {sources.HASHES},
 }
-"""The kinds of causes of each operator of `zoo.faulty`."""
+"""The kinds of causes of each operator of `zoo.faulty`; and of one that repeats only since every run fixes hashes."""
 WILD = {
     f"{library}{threads}": f"use: 'causes_operators:{library}', params: {{threads: {threads}}}"
     for library in ("KissIcp", "SmallGicp", "Open3dIcp")
@@ -64,10 +65,11 @@ import sys
 sys.path += {folders!r}
 import dataflow
 from dataflow.graph import load_text
+from dataflow.supervision.core.report import RunFailed
 for path, text in {runs!r}.items():
     try:
         dataflow.run(load_text(text), record=path)
-    except dataflow.RunFailed as failure:
+    except RunFailed as failure:  # one that fails to close
         print(failure, file=sys.stderr)
 """
 UNTRAPPED = {sources.COMPILED, sources.HASHES, sources.ADDRESSES, sources.MODULE}
@@ -127,7 +129,7 @@ def main() -> int:
     which.add_argument("--sound", action="store_true", help="ask about operators that repeat")
     which.add_argument("--wild", action="store_true", help="ask about registrations by other libraries")
     chosen = parser.parse_args()
-    ask, able = (wild, list(WILD)) if chosen.wild else (faulty, list(FAULTY))
+    ask, able = (wild, list(WILD)) if chosen.wild else (faulty, [name for name in FAULTY if "," not in name])
     if chosen.sound:
         ask, able = sound, [*REPEATS, "Sound"]
     names = [name for name in able if not chosen.only or name in chosen.only]
