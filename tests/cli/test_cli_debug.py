@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
 LIVE = KEPT / "live.mcap"
@@ -38,7 +40,7 @@ def test_a_call_is_shown_with_what_was_given_made_and_changed() -> None:
 
 
 def test_the_hashes_and_threads_are_those_of_a_run() -> None:
-    told = debug("busy", "--do", "print __import__('os').environ['PYTHONHASHSEED']")
+    told = debug("busy", "--do", "goto 0", "--do", "print __import__('os').environ['PYTHONHASHSEED']")
 
     assert told.endswith("0\n")
 
@@ -69,7 +71,7 @@ def test_pdb_that_is_left_leaves_the_call_as_it_was() -> None:
 
 
 def test_calls_are_json() -> None:
-    told = debug("tally", "--do", "next", "--do", "diff", "--json")
+    told = debug("tally", "--do", "next", "--do", "next", "--do", "diff", "--json")
 
     first, second, last = told.splitlines()
     assert json.loads(first)["number"] == 0
@@ -80,3 +82,19 @@ def test_calls_are_json() -> None:
 def test_what_cannot_begin_is_named() -> None:
     assert "there are: busy, look, smooth, tally" in debug("none", code=2)
     assert "expected the number of a call, or @SECONDS" in debug("busy@x", code=2)
+
+
+def test_verify_prints_the_command_that_goes_to_the_difference(
+    dataflow: Any, small: Path, recorded: tuple[Path, Any], tmp_path: Path
+) -> None:
+    changed = tmp_path / "changed.yaml"
+    changed.write_text(small.read_text().replace("runtime_operators:Smooth", "verified_operators:Nudged"))
+
+    told = dataflow("verify", recorded[0], "--graph", changed, "--one-process", "-q", code=1).stdout
+    words = shlex.split(told.rpartition("next: dataflow ")[2])
+    shown = dataflow(*words).stdout
+
+    assert words[:3] == ["debug", str(recorded[0]), "smooth"]
+    assert "not as recorded" in shown
+    assert "  given    x" in shown
+    assert "vectors[0, 2]: recorded 0.0" in shown

@@ -28,7 +28,7 @@ TRIED: tuple[str, ...] = (
     " --quiet --json",
     "verify RECORDING --graph GRAPH --set count=30 --process-each --jobs 2",
     "verify RECORDING --baseline OUT.json --accept",
-    "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do state --json",
+    "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json",
     "check GRAPH --path HERE --set count=4 --json",
     "show GRAPH --path HERE --set count=4 --json",
     "show GRAPH --mermaid",

@@ -29,9 +29,7 @@ def debug(
     recording: RecordingFile,
     operator: Annotated[
         str,
-        typer.Argument(
-            metavar="OPERATOR[@SECONDS]", help="The operator, and when to begin: at its last call by then (else 0)."
-        ),
+        typer.Argument(metavar="OPERATOR[@SECONDS]", help="The operator, and when to begin: at its last call by then."),
     ],
     do: Annotated[
         list[str] | None,
@@ -90,7 +88,8 @@ def _debug(recording: Path, operator: str, graph: Graph | None, do: list[str] | 
         shell = Shell(debugger, min((stamp for stamp in stamps if stamp is not None), default=0), json=json)
         try:
             first = shell.number(f"@{when}") if when else 0
-            _converse(shell, [f"goto {first}", *(do or ())], interactive=do is None)
+            begun = [f"goto {first}"] if when or do is None else []
+            _converse(shell, [*begun, *(do or ())], interactive=do is None)
         except WrongCommand as error:
             raise fail(str(error)) from None
         finally:

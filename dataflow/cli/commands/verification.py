@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
+from rich.text import Text
 
 from dataflow.cli.support.arguments import (
     FLAG,
@@ -190,7 +192,7 @@ def verify(
             single = len(recordings) == 1 and recordings[0] == found[0][0]
             checked = _check(found, known, options, quiet=quiet, single=single)
             reasons = [_reasons(one, only, loaded) for one in checked] if why else []
-            _report(checked, reasons, single=single, json=json, junit=junit)
+            _report(checked, reasons, _options(graph, settings, path), single=single, json=json, junit=junit)
             if known is not None:
                 _mind_baseline(known, checked, accept=accept, whole=not single)
     raise typer.Exit(_exit_code(checked, known if accept else None))
@@ -273,7 +275,21 @@ def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None) -> l
     return reasons(checked.path, checked.report, only or (), graph)
 
 
-def _report(checked: list[Checked], reasons: list[list[Why]], *, single: bool, json: bool, junit: Path | None) -> None:
+def _options(graph: Path | None, settings: list[str] | None, path: list[Path] | None) -> list[str]:
+    """The words by which another command is given the same graph and modules."""
+    named = (("--graph", [] if graph is None else [graph]), ("--set", settings or ()), ("--path", path or ()))
+    return [word for option, values in named for value in values for word in (option, shlex.quote(str(value)))]
+
+
+def _report(
+    checked: list[Checked],
+    reasons: list[list[Why]],
+    options: list[str],
+    *,
+    single: bool,
+    json: bool,
+    junit: Path | None,
+) -> None:
     from dataflow.cli.support.causes import print_reasons
     from dataflow.cli.support.verdicts import explain, print_many, print_one, reservations
 
@@ -286,6 +302,9 @@ def _report(checked: list[Checked], reasons: list[list[Why]], *, single: bool, j
         print_json(checked[0].as_json() | found[0])
     elif single:
         print_one(out, checked[0])
+        for name in checked[0].culprits[:1]:
+            words = ["dataflow debug", shlex.quote(str(checked[0].path)), name, *options, "--do diff"]
+            out.print(Text(f"next: {' '.join(words)}", style="dim"), soft_wrap=True)
     elif json:
         values = [c.as_json() | more for c, more in zip(checked, found, strict=True)]
         print_json({"passed": all(c.passed for c in checked), "recordings": values})
