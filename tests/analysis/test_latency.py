@@ -174,6 +174,7 @@ def test_a_message_that_was_not_sent_causes_nothing(diamond: Graph) -> None:
     assert [s.operator for s in path.shares] == ["camera", "fast", "join"]
 
 
+@pytest.mark.long
 def test_the_command_prints_every_path_of_a_recording(tmp_path: Path, repository: Path) -> None:
     recording = tmp_path / "run.mcap"
     graph = repository / "graphs" / "synthetic_rgbd.yaml"

@@ -27,6 +27,7 @@ def watch() -> dataflow.Graph:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("only", "operators"),
     [("meter", ["meter"]), (["judge"], ["judge"]), (["meter", "judge"], ["meter", "judge"]), (("meter",), ["meter"])],

@@ -46,6 +46,7 @@ def completed(program: Path, line: str) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash here")
 def test_bash_completes_commands_options_and_graphs(program: Path) -> None:
     assert {"verify", "view"} <= set(completed(program, "dataflow ve")) | set(completed(program, "dataflow vi"))

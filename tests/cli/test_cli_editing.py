@@ -13,6 +13,7 @@ from dataflow.recording import Recording
 Recorded = tuple[Path, dict[str, Any]]
 
 
+@pytest.mark.long
 def test_a_cut_is_written_and_says_what_goes_along(dataflow, recorded: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "part.mcap"
 

@@ -68,6 +68,7 @@ def test_both_times_are_told_and_options_that_are_gone_are_noted(dataflow, folde
     assert "--process-each is deprecated" in outcome.stderr
 
 
+@pytest.mark.long
 def test_a_broken_file_ends_with_2_and_the_others_are_verified_all_the_same(
     dataflow, folder: Path, tmp_path: Path
 ) -> None:
@@ -222,6 +223,7 @@ def test_an_operator_that_cannot_run_is_2_and_not_a_difference(dataflow, folder:
     assert "verified_operators.py" in told.stderr  # the operator's own traceback
 
 
+@pytest.mark.long
 def test_recorded_operators_that_the_graph_does_not_have_are_named(dataflow, folder: Path, tmp_path: Path) -> None:
     fewer = graph_of(tmp_path, "fewer.yaml", SMOOTH)
     fewer.write_text("".join(line for line in fewer.read_text().splitlines(True) if "two" not in line))

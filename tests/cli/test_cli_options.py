@@ -85,7 +85,10 @@ ELSEWHERE: dict[str, tuple[str, str]] = {
     "replay": ("--step --map --clock --strict", "a terminal, bags: test_cli_bags.py"),
     "view": ("--import", "another file of Rerun: tests of the view"),
     "foxglove": ("--start --end --clock --speed --stream", "a server that goes on until Ctrl-C: tests/foxglove"),
-    "verify": ("--from", "the state before a moment: tests/verification"),
+    "verify": (
+        "--from --why",
+        "the state before a moment: tests/verification; causes: tests/causes",
+    ),
 }
 """By command, options that are not tried here, and why."""
 

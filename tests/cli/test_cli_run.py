@@ -283,6 +283,7 @@ class Slow(Operator):
 """
 
 
+@pytest.mark.long
 def test_ctrl_c_while_the_graph_starts_is_a_stop_and_no_failure(tmp_path: Path) -> None:
     (tmp_path / "slow_setup.py").write_text(SLOW)
     (tmp_path / "slow.yaml").write_text(
@@ -346,6 +347,7 @@ def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
     assert noted.read_text().strip() == str(saved)
 
 
+@pytest.mark.long
 def test_a_viewer_that_fails_does_not_end_the_run(dataflow, small: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("RERUN_CLI_PATH", str(tmp_path / "absent"))
 

@@ -31,6 +31,7 @@ def swaying(t: np.ndarray) -> np.ndarray:
     return np.abs(np.sin(0.7 * t) + 0.6 * np.sin(1.9 * t + 1) + 0.3 * np.sin(4.3 * t))
 
 
+@pytest.mark.long
 @settings(max_examples=25)
 @given(st.floats(-0.4, 0.4), st.floats(-0.003, 0.003), st.sampled_from([0.03, 0.05, 0.1]))
 def test_any_offset_and_drift_is_found_with_its_sign(offset: float, drift: float, period: float) -> None:

@@ -30,6 +30,7 @@ def chain(source: Source) -> tuple[Played, Played, TrajectoryMetrics]:
     return cloud, odometry, metrics
 
 
+@pytest.mark.long
 def test_the_made_up_sequence_is_tracked_and_every_pose_scored() -> None:
     cloud, odometry, metrics = chain(SyntheticRgbd(frames=30))
     figures = metrics.summary()

@@ -148,6 +148,7 @@ def test_the_disk_that_the_ring_takes_does_not_grow_with_the_run(recorded: Path,
     assert not list(tmp_path.glob("*.mcap"))  # nobody asked
 
 
+@pytest.mark.long
 def test_the_ring_keeps_less_time_where_it_may_take_less_of_the_disk(
     recorded: Path, graph: Graph, tmp_path: Path
 ) -> None:

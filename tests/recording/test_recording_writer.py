@@ -339,6 +339,7 @@ def test_close_is_idempotent_and_ends_writing(tmp_path: Path, pose: Callable[...
         writer.write("a", pose(1), seq=0)
 
 
+@pytest.mark.long
 def test_the_index_of_a_long_run_takes_no_more_memory_than_its_bytes(tmp_path: Path, pose: Callable[..., Pose]) -> None:
     streams = [f"s/{i}" for i in range(20)]
 

@@ -112,6 +112,7 @@ UNCHANGED = {"perception/image_watch", "perception/depth_watch", "perception/sca
 """Operators that only count and compare. Others round as the kernels for a CPU do, or have changed since."""
 
 
+@pytest.mark.long
 def test_the_kept_perception_verifies_but_for_operators_that_were_deleted() -> None:
     report = verify(HERE / "perception.mcap")
 

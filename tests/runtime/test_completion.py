@@ -71,6 +71,7 @@ def test_the_completed_recording_of_a_live_run_is_equal_to_the_full_one_and_veri
     assert [p.name for p in tmp_path.iterdir() if p.name.endswith(".part")] == []
 
 
+@pytest.mark.long
 def test_a_graph_that_records_its_sensors_only_gives_a_thin_recording_that_can_be_completed(tmp_path: Path) -> None:
     graph = _recording_sensors_only(load_graph(HERE / "mixed.yaml", settings=["count=40"]))
     path, out = tmp_path / "thin.mcap", tmp_path / "out.mcap"

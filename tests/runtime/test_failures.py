@@ -117,6 +117,7 @@ def test_a_process_that_dies_is_named_with_the_signal_and_how_far_it_was() -> No
     assert "process 'bad' was killed by SIGKILL while running" in str(failure)
 
 
+@pytest.mark.long
 def test_a_run_whose_nursery_is_killed_says_so_and_leaves_no_process(tmp_path: Path) -> None:
     graph = chain(
         "bad: {use: runtime_operators:Broken, params: {how: children}, inputs: {x: left/fast}}",
@@ -299,6 +300,7 @@ def test_ctrl_c_drains_and_completes_the_recording(long_run: Running, tmp_path: 
         assert counts["test/left/fast"] > 0
 
 
+@pytest.mark.long
 def test_killing_the_supervisor_leaves_no_process_and_a_readable_recording(long_run: Running, tmp_path: Path) -> None:
     long_run.process.kill()
     long_run.end()

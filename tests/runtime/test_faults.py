@@ -120,6 +120,7 @@ def test_a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on(path: Path)
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is(path: Path) -> None:
     ran = Ran(robot(SMOOTH, count=250), path, {"kind": "kill", "operator": "left", "at": "300ms"})
 
@@ -294,6 +295,7 @@ def test_a_source_that_stops_holds_up_no_other(path: Path) -> None:
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_flood_is_dropped_where_it_is_too_much_and_counted(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, params: {sleep: 0.01}, inputs: {x: left/fast}, "
@@ -411,6 +413,7 @@ def test_a_stamp_in_the_past_is_dropped_and_a_malformed_message_from_outside_rea
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_a_device_runs_by_the_clock_and_is_repeated(path: Path) -> None:
     graph = graph_of(
         f"device: {{use: faulty_operators:Device, live: {{{AGAIN}}}}}",

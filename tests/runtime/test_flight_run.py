@@ -40,6 +40,7 @@ def flown(tmp_path: Path, **options: Any) -> Any:
     return report, sorted(folder.glob("*.mcap"))
 
 
+@pytest.mark.long
 def test_what_somebody_asks_for_is_kept_and_verifies(tmp_path: Path) -> None:
     asked: list[str] = []
 

@@ -221,6 +221,7 @@ def breaking(folder: Path, use: str, how: str) -> Graph:
     return load_graph(file, live=True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["raise", "exit", "stamp"])
 def test_a_recorded_error_is_repeated_whatever_was_raised(tmp_path: Path, how: str) -> None:
     path = tmp_path / "run.mcap"

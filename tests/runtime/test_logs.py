@@ -131,6 +131,7 @@ def test_lines_of_a_recording_are_drawn_with_the_rest(recorded, tmp_path: Path) 
     assert b"ready to" in saved.read_bytes()  # the first time: later words are packed
 
 
+@pytest.mark.long
 def test_a_running_graph_shows_its_log_and_leaves_none_behind(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     background = Background(graph(every=1, wait=0.05), view_file=tmp_path / "talk.rrd")

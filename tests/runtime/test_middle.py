@@ -134,6 +134,7 @@ def test_a_replay_that_begins_where_a_state_was_recorded_gives_nothing_twice(rec
     assert part["test/tuned/y"].items() <= whole["test/tuned/y"].items()
 
 
+@pytest.mark.long
 def test_a_re_execution_from_the_middle_reads_only_what_it_needs(tmp_path: Path) -> None:
     text = (
         (HERE / "chaos.yaml")

@@ -56,6 +56,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str,
     return path, report.digests()
 
 
+@pytest.mark.long
 def test_a_run_gives_the_same_digests_in_one_process_and_in_a_process_each(mixed: Graph) -> None:
     together = run(mixed, placement="one_process")
     apart = run(mixed, placement="process_each")
@@ -137,6 +138,7 @@ def test_large_messages_arrive_whole(mixed: Graph) -> None:
     assert run(graph, placement="one_process").digests() == run(graph, placement="process_each").digests()
 
 
+@pytest.mark.long
 def test_operators_of_nested_graphs_run_in_processes_of_their_own_and_are_seen_by_tools(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

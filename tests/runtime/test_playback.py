@@ -73,6 +73,7 @@ def test_pauses_and_steps_change_no_digest_and_outlast_the_timeout(recorded: Pat
     assert report.streams == expected
 
 
+@pytest.mark.long
 def test_a_script_pauses_and_steps_from_outside(recorded: Path) -> None:
     answers: list[dict[str, Any]] = []
 

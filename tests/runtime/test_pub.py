@@ -63,6 +63,7 @@ def _registry_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_registry_of_its_own")
 def test_messages_from_outside_are_taken_recorded_and_verified(tmp_path: Path) -> None:
     path = tmp_path / "taken.mcap"

@@ -75,6 +75,7 @@ def test_a_replay_leaves_the_recorded_network_alone(
         assert not graph_as_recorded(recording).network.loopback_only
 
 
+@pytest.mark.long
 def test_it_is_obeyed_when_asked_for_and_else_reported(
     recorded: tuple[Path, str, str], spawned: list[Mapping[str, Any]]
 ) -> None:

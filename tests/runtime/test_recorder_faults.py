@@ -74,6 +74,7 @@ def test_a_recorder_that_is_killed_is_followed_by_another_and_the_run_goes_on(tm
     assert not [v for v in verify(tmp_path / "run_001.mcap", jobs=1).operators if v.verdict == "culprit"]
 
 
+@pytest.mark.long
 def test_a_recorder_that_is_killed_ends_a_run_that_is_to_end(tmp_path: Path) -> None:
     with pytest.raises(RunFailed, match="'@recorder' was killed by SIGKILL"):
         ran(robot(250), kill_recorder, record=tmp_path / "run.mcap", storage=Storage(on_failure="end"))

@@ -33,6 +33,7 @@ def slow_graph(count: int = 200, sleep: float = 0.02) -> Graph:
     )
 
 
+@pytest.mark.long
 def test_a_tap_sees_the_statics_first_and_then_the_messages_of_a_running_graph() -> None:
     running = Background(slow_graph(), window=(8, 1 << 20))
     found = find_running("chain", wait=30)

@@ -192,7 +192,7 @@ def test_a_process_that_stands_still_longer_than_the_pause_is_started_again(memo
     assert result.outcome.report.restarts == {"relay": 1}
 
 
-@pytest.mark.parametrize("first", range(0, 200, 25))
+@pytest.mark.parametrize("first", [0, 25, *(pytest.param(at, marks=pytest.mark.long) for at in range(50, 200, 25))])
 def test_seeds(first: int, memory: Path) -> None:
     """No hang, no loss without a count, recordings that verify, replays that are equal."""
     for seed in range(first, first + 25):

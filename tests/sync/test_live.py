@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -164,6 +165,7 @@ def with_restarts(says: dict[str, list[Step]], spec: AlignSpec, rng: random.Rand
     return changed
 
 
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(scenarios(), seeds)
 def test_firings_of_a_live_run_can_be_had_again_from_their_refs(scenario: Scenario, seed: int) -> None:

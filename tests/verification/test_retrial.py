@@ -42,6 +42,7 @@ def test_operators_that_share_a_module_are_identical_when_they_ran_apart(tmp_pat
     assert report.messages == 16
 
 
+@pytest.mark.long
 def test_an_operator_is_no_culprit_for_what_another_one_sets_in_a_library(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "strict: Strict\ndivide: Divide")
 

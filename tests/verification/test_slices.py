@@ -126,6 +126,7 @@ def test_one_that_differs_is_named_with_its_first_difference_as_if_it_were_not_d
     assert told(parts) == told(whole)
 
 
+@pytest.mark.long
 def test_one_with_a_state_that_it_denies_is_verified_as_a_whole(kept: Path, divided: list[dict[str, Any]]) -> None:
     report = verify(kept, graph=with_look(kept, "Forgetful"), jobs=3)
 

@@ -181,6 +181,7 @@ def test_an_empty_symmetric_room_is_not_believed() -> None:
     assert reason(outputs).startswith("failed: ")
 
 
+@pytest.mark.long
 def test_a_bare_passage_is_not_believed() -> None:
     nothing = np.zeros((0, 6))
     passage = np.array([200.0, 1.0, 1.2])

@@ -114,6 +114,7 @@ def test_weights_in_the_cache_bring_their_own_names(tmp_path: Path, monkeypatch:
     assert "N/A" not in found.labels()
 
 
+@pytest.mark.long
 def test_weights_of_another_model_or_no_weights_at_all_are_refused(checkpoint: Path, tmp_path: Path) -> None:
     with pytest.raises(OperatorFailure, match=r"mine\.pt do not fit ssd300_vgg16"):
         play(TorchvisionDetector(model="ssd300_vgg16", checkpoint=str(checkpoint)), {"image": [image()]})

@@ -83,6 +83,7 @@ def streams(*images: Image) -> dict[str, Mapping[str, list[Image]]]:
     return {"images": by_camera}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", [SSD, RCNN])
 def test_boxes_are_those_of_each_camera_alone_and_the_network_is_called_once(
     checkpoints: dict[str, str], model: str, monkeypatch: pytest.MonkeyPatch

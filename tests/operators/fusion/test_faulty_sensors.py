@@ -134,6 +134,7 @@ class Run:
         return float((self.errors[chosen] <= 3 * self.claimed[chosen]).mean())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known", [True, False], ids=["heading known", "heading unknown"])
 @pytest.mark.parametrize(
     ("off", "start"),
@@ -160,6 +161,7 @@ def test_a_first_place_far_from_the_origin_waits_for_a_second_that_agrees() -> N
     assert int(run.operator.summary()["robot/fix, unconfirmed"]) >= 2
 
 
+@pytest.mark.long
 def test_fixes_later_than_the_window_are_counted_and_a_warning_names_them() -> None:
     drive = Drive(4.0)
     run = Run(drive, drive.fixes(late=1.5))
@@ -199,6 +201,7 @@ def made_room(run: Run) -> int:
     return sum(int(n) for name, n in run.operator.summary().items() if name.endswith("making room"))
 
 
+@pytest.mark.long
 def test_a_jump_that_a_sensor_of_another_kind_sees_too_is_believed() -> None:
     """The robot was carried while its inertial sensor slept; two receivers alone would not prove it."""
     drive = Drive(10.0)

@@ -93,6 +93,7 @@ def test_the_nearest_rotation_is_never_a_reflection() -> None:
         assert np.linalg.det(R) > 0
 
 
+@pytest.mark.long
 def test_covariance_about_fixed_axes_is_that_of_perturbed_poses() -> None:
     rng = np.random.default_rng(3)
     A = rng.normal(0, 0.003, (6, 6))

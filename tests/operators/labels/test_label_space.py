@@ -92,6 +92,7 @@ def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
         LabelSpace.read(tmp_path / "none.yaml")
 
 
+@pytest.mark.long
 @given(st.sampled_from(COCO_CLASSES), st.sampled_from([str.upper, str.title, lambda s: f" {s.replace(' ', '_')} "]))
 def test_case_blanks_and_underscores_of_a_name_do_not_matter(name: str, written: object) -> None:
     assert callable(written)

@@ -93,6 +93,7 @@ def test_landmarks_without_identity_and_positions_localize_too() -> None:
     assert errors(drive, played["position_pose"], since=4.0)[0] < 0.2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
 @pytest.mark.parametrize("known", [True, False])
 def test_a_landmark_of_the_map_that_is_nowhere_is_as_if_it_were_not_in_it(wrong: float, known: bool) -> None:
@@ -123,6 +124,7 @@ def said(played: Played, sensor: str, seconds: float) -> float:
     return float(dict(status.pairs(row))["counts"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [{"turned": 0.2}, {"longer": 0.4}])
 def test_a_lidar_that_degrades_loses_its_say_and_the_pose_stays_right(wrong: dict[str, float]) -> None:
     drive = Drive(8.0)
@@ -146,6 +148,7 @@ def test_landmarks_that_degrade_lose_their_say_to_the_lidar() -> None:
     assert errors(drive, played["pose"])[0] < 0.1
 
 
+@pytest.mark.long
 def test_a_modality_that_contradicts_the_fused_estimate_is_named() -> None:
     drive = Drive(6.0)
     sensors = {"scan": drive.scans(turned=0.2, after=2.0), "seen": drive.sightings(), "place": drive.positions()}
@@ -238,6 +241,7 @@ def test_a_bad_measurement_beside_good_scans_is_counted_and_the_robot_is_followe
     assert errors(drive, played["pose"])[0] < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
 def test_an_object_of_the_map_that_is_nowhere_is_as_if_it_were_not_in_it(wrong: float) -> None:
     drive = Drive(3.0)

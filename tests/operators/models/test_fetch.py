@@ -214,6 +214,7 @@ def test_a_file_that_was_brought_by_hand_is_checked_too(cache: Path, tmp_path: P
     assert given.is_file()
 
 
+@pytest.mark.long
 def test_torchvisions_hub_keeps_its_own_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("torchvision")

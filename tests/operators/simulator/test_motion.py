@@ -71,6 +71,7 @@ def test_speed_and_turning_stay_within_limits(name: str) -> None:
         assert np.linalg.norm(motion.acceleration, axis=1).max() < 1.0
 
 
+@pytest.mark.long
 def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> None:
     path, imu = world("office", 0).path, Inertial(mount=(0.2, -0.1, 0.4, 0.0, 0.0, 0.5))
     drive, lever = Drive(path), np.array([0.2, -0.1])

@@ -64,6 +64,7 @@ def everything() -> dict[str, list[Message]]:
     return run(**EVERYTHING)
 
 
+@pytest.mark.long
 def test_every_declared_port_is_fed_when_everything_is_on(everything: dict[str, list[Message]]) -> None:
     assert set(everything) == set(SimulatedRobot.spec.outputs)
 

@@ -80,6 +80,7 @@ def _placed(word: str, places: dict[str, Path]) -> str:
     return str(places[first] / rest) if first in places else word
 
 
+@pytest.mark.long
 def test_commands_take_their_options(worlds: Path, classes: Path, repository: Path, tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="training needs the extra [train]")
     places = {
@@ -98,6 +99,7 @@ def test_every_option_of_commands_of_other_packages_is_tried() -> None:
     assert untried(commands(built_in=False), TRIED, ELSEWHERE) == {}
 
 
+@pytest.mark.long
 def test_training_with_other_layers_frozen_is_not_resumed(worlds: Path, tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="training needs the extra [train]")
     words = f"train segmenter {worlds} --out {tmp_path / 's.onnx'} {SMALL} --border-epochs 0 {ALL}".split()

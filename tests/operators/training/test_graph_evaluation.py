@@ -33,6 +33,7 @@ operators:
 """
 
 
+@pytest.mark.long
 def test_a_graph_is_run_and_its_figures_are_printed(tmp_path: Path) -> None:
     (tmp_path / "scored.yaml").write_text(GRAPH)
     ran = CliRunner().invoke(evaluate, ["graph", str(tmp_path / "scored.yaml"), "--set", "frames=5", "--json"])

@@ -74,6 +74,7 @@ def picture() -> Image:
     return Image(stamp=0, frame="camera", data=np.random.default_rng(2).integers(0, 255, (96, 128, 3), np.uint8))
 
 
+@pytest.mark.long
 def test_a_trained_detector_is_loaded_with_its_own_classes(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.pth"
     told = trained(DETECTOR, data, out)

@@ -29,6 +29,7 @@ def played(robot: Robot, imu: list[Any]) -> Played:
     return fused(streams, sensors=sensors, heading=None)[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["dropped", "off"])
 def test_poses_go_on_where_the_inertial_sensor_is_silent_and_it_is_said(kind: str) -> None:
     robot, imu = Robot(8.0), []

@@ -83,6 +83,7 @@ def test_the_position_is_followed_and_the_biases_found() -> None:
     np.testing.assert_allclose(at.gyro_bias, [0.01, -0.02, 0.015], atol=5e-3)
 
 
+@pytest.mark.long
 @settings(max_examples=8)
 @given(st.lists(st.integers(0, 12), min_size=22, max_size=22))
 def test_late_measurements_give_the_bits_of_those_in_time(lateness: list[int]) -> None:

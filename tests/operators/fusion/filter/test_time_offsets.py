@@ -64,6 +64,7 @@ def estimated(kind: str, offset: float, seconds: float = 6.0) -> tuple[float, fl
     return *filter.offsets()["wrong"], filter
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["position", "orientation", "velocity"])
 @pytest.mark.parametrize("offset", [0.08, -0.06])
 def test_an_unknown_offset_is_found(kind: str, offset: float) -> None:

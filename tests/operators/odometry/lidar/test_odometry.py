@@ -284,6 +284,7 @@ def test_a_car_that_moves_metres_between_scans_is_followed(seed: int) -> None:
     assert np.linalg.norm(errors(played, car)[:, :3], axis=1).max() < 0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_step_of_metres_that_is_wrong_comes_with_a_doubt(seed: int) -> None:
     played = driven(seed)
@@ -293,6 +294,7 @@ def test_a_step_of_metres_that_is_wrong_comes_with_a_doubt(seed: int) -> None:
     assert True not in wrong or any(doubted[: first + 1])
 
 
+@pytest.mark.long
 def test_a_fast_sensor_that_is_lost_is_searched_for_in_bounded_work(monkeypatch: pytest.MonkeyPatch) -> None:
     searched = []
 

@@ -77,6 +77,7 @@ def said(played: Played) -> list[str]:
     return [status.messages[0] for status in played["status"]]  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_a_depth_image_now_and_then_gives_metres() -> None:
     played = run(streams({k: measured(k) for k in range(0, COUNT, 8)}))
     estimate, truth, poses = in_metres(played)

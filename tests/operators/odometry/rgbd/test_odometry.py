@@ -346,6 +346,7 @@ def test_keyframes_are_renewed_where_depth_reaches_less_far() -> None:
     assert errors(results, poses)[0] < 0.01
 
 
+@pytest.mark.long
 def test_old_map_is_found_again_after_a_gap() -> None:
     frames, poses = sequence(60, 1.5)
     blind = [black(without_depth(frames[0]))] * 30
@@ -370,6 +371,7 @@ def at_a_wrong_place(state: RgbdState, since: int, T_wrong: NDArray[np.float64])
     return replace(state, motion=wrong, map=known, trials=with_trial(state.trials, trial))
 
 
+@pytest.mark.long
 def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
     frames, poses = sequence(60, 1.5)
     stamps = [int(i * 1e9 / 30) for i in range(len(frames))]
@@ -412,6 +414,7 @@ def test_a_find_that_moves_nothing_leaves_the_place_that_is_on_trial() -> None:
     assert len(with_trial(running, Trial.of(1, 1, there, np.eye(6), there @ far))) == 2
 
 
+@pytest.mark.long
 def test_a_right_place_is_not_taken_back() -> None:
     frames, poses = sequence(60, 1.5)
     stamps = [int(i * 1e9 / 30) for i in range(len(frames))]

@@ -66,6 +66,7 @@ def test_an_old_view_after_a_gap_is_found_at_its_place() -> None:
     assert np.sqrt(np.trace(after[0].covariance[:3, :3])) < 0.5 * np.sqrt(np.trace(results[27].covariance[:3, :3]))
 
 
+@pytest.mark.long
 def test_a_camera_that_stood_still_in_the_dark_goes_on_where_it_was() -> None:
     pairs, poses = sequence(25)
     results = follow([*pairs[:18], *[DARK] * GAP, *seen([poses[17]] * 3, noise=9)])
@@ -177,6 +178,7 @@ def test_a_pose_elsewhere_than_shape_and_brightness_say_is_not_believed() -> Non
     assert not relocalizer.believed(kept(poses[6], 6, other), known, 4.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", [2.0, 4.0, 8.0])
 def test_a_view_is_found_in_any_unit_near_to_that_of_the_scene(unit: float) -> None:
     pairs, poses = sequence(25)

@@ -98,6 +98,7 @@ def test_adjustment_finds_poses_and_points_again() -> None:
 # -- failures ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_black_and_frozen_images_are_noticed_and_bridged() -> None:
     pairs, poses = sequence(25)
     dark = (np.zeros_like(pairs[0][0]), pairs[0][1])

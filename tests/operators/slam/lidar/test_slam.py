@@ -270,6 +270,7 @@ def test_the_same_scans_give_the_same_bytes(around: Played) -> None:
     assert run(clouds(on_round(ROUND + 5))).digests() == around.digests()
 
 
+@pytest.mark.long
 def test_a_restored_state_goes_on_alike() -> None:
     given = clouds(on_round(ROUND + 4))
     one, other = LidarSlam(**NEAR), LidarSlam(**NEAR)  # type: ignore[arg-type]
