@@ -22,7 +22,7 @@ from dataflow.records.cuts import Taken, cut_record
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog, Maker
 from dataflow.reexecution.engine import Recomputation, plan_feeding
-from dataflow.reexecution.recorded_run import ReplayError, recorded_graph, recorded_message
+from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, recorded_message
 from dataflow.sync import Firing
 
 MOST_BYTES = 2**28
@@ -43,7 +43,7 @@ class Debugger:
 
     def __init__(self, recording: Recording, operator: str, graph: Graph | None = None) -> None:
         self._recording = recording
-        self._graph = recorded_graph(recording) if graph is None else graph
+        self._graph = graph_that_is_here(recording)[0] if graph is None else graph
         log = _ResumedLog(recording)
         self.node = node = self._graph.nodes[_named(operator, self._graph, log)]
         self._log = log
@@ -55,6 +55,8 @@ class Debugger:
         self._work: Recomputation | None = None
         self._probe: Probe | None = None
         self._reached = -1
+        self._same = True
+        """True when the last call gave what was recorded."""
         self.at: Fired | None = None
 
     # ------------------------------------------------------------------------------------------------- going
@@ -169,8 +171,8 @@ class Debugger:
         stateless = self.node.operator.stateless
         kept = max((n for n in self._kept if n <= number), default=None)
         begin: int | None = call.stamp if stateless else call.stamp - 1
-        if any(c.stamp >= call.stamp for c in self.calls[:number]) or (number and number == len(self.calls) - 1):
-            begin = None  # stamps went back, or `finish()` has the stamp of a firing: they do not tell where it is
+        if any(c.stamp >= call.stamp for c in self.calls[:number]):
+            begin = None  # stamps went back: they do not show where it is
         cut = self._kept[kept] if kept is not None and not stateless else None
         if cut is not None:
             begin = cut.stamp
@@ -184,18 +186,25 @@ class Debugger:
         runner = work.runners[self.node.name]
         self._probe = runner.calls = Probe(runner)
         self._work, self._reached = work, -1
-        work.begin()
+        try:
+            work.begin()
+        except BaseException:
+            self._leave()
+            raise
 
     def _onwards(self) -> Iterator[int]:
         """Makes one call after the other; yields their numbers."""
         assert self._work is not None
         assert self._probe is not None
         runner, probe = self._work.runners[self.node.name], self._probe
-        done = runner.result.verified
+        result = runner.result
+        done, differing = result.verified, result.differing - result.states
         while self._work.turn():
-            if runner.result.verified == done:
+            if result.verified == done:
                 continue
-            done = runner.result.verified
+            done = result.verified
+            self._same = result.differing - result.states == differing
+            differing = result.differing - result.states
             if isinstance(probe.raised, KeyboardInterrupt):
                 self._leave()
                 raise KeyboardInterrupt
@@ -231,7 +240,6 @@ class Debugger:
         recorded = record.detail.get("error", "") if record.outcome == "error" else None
         error = None if injected else probe.error
         made = tuple(self._made(record, {} if injected else probe.outputs))
-        raised = None if probe.raised is None else readable(probe.raised)
         return Fired(
             number=self._reached,
             call=call,
@@ -242,7 +250,7 @@ class Debugger:
             error=error,
             recorded_error=recorded,
             injected=injected,
-            same=injected or (all(m.same for m in made) and raised == recorded),
+            same=self._same,
         )
 
     def _made(self, record: FiringRecord, outputs: Mapping[str, Message]) -> Iterator[Made]:
@@ -255,13 +263,12 @@ class Debugger:
             if here is not None and emission is not None and here.digest() == emission.digest:
                 yield Made(port, stream, same=True, here=here, recorded=here)
                 continue
-            place = None if emission is None else (record.incarnation, emission.seq)
-            then = None if emission is None or place is None else self._recorded(stream, place, emission.stamp)
+            then = None
+            if emission is not None:
+                place = record.incarnation, emission.seq
+                then = recorded_message(self._recording, stream, place, emission.stamp)
             fields = () if here is None or then is None else tuple(differences(then, here, None)[0])
             yield Made(port, stream, same=False, here=here, recorded=then, fields=fields)
-
-    def _recorded(self, stream: str, place: tuple[int, int], stamp: int) -> Message | None:
-        return recorded_message(self._recording, stream, place, stamp)
 
     def _unreached(self, number: int) -> str:
         assert self._work is not None

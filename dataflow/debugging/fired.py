@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from dataflow.execution.calls import Calls, value_of
 from dataflow.execution.failure import RAISED
 from dataflow.execution.recorded import RecordedRunner
-from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.execution.snapshots import changes, unpack_state
 from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import FieldDifference
 from dataflow.records.firing import FiringRecord
@@ -58,7 +58,7 @@ class Fired:
     recorded_error: str | None
     injected: bool
     same: bool
-    """Outputs and the error are the recorded ones."""
+    """Outputs and the error are the recorded ones, as verification compares them."""
 
     @property
     def outputs(self) -> Mapping[str, Message | None]:
@@ -73,8 +73,7 @@ class Fired:
     def changed(self) -> tuple[str, ...]:
         """Names of the parts of the state that the call changed."""
         before, after = (state or {} for state in self.states())
-        names = sorted({*before, *after})
-        return tuple(n for n in names if pack_state({n: before.get(n)}) != pack_state({n: after.get(n)}))
+        return tuple(dict.fromkeys(place.partition(".")[0] for place, _, _ in changes(before, after)))
 
     def names(self) -> dict[str, Any]:
         """Names for an expression about the call: `inp` and `out` by input and port, `stamp`, `number`, `same`,

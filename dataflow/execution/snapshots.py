@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import msgpack
@@ -58,6 +58,15 @@ def _other_version(before: Any, now: Any, place: str = "") -> str | None:
         return f"the recorded one lacks {lacks} and has {more} besides{f' in {place}' if place else ''}"
     found = (_other_version(before[name], now[name], f"{place}.{name}".lstrip(".")) for name in sorted(now))
     return next((each for each in found if each), None)
+
+
+def changes(before: Any, after: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Place, value before and after of what differs in two unpacked states, as deep as mappings go."""
+    if isinstance(before, Mapping) and isinstance(after, Mapping):
+        for name in sorted({*before, *after}):
+            yield from changes(before.get(name), after.get(name), f"{place}.{name}" if place else name)
+    elif pack_state({"": before}) != pack_state({"": after}):
+        yield place, before, after
 
 
 def _plain(value: Any, place: str) -> Any:

@@ -13,6 +13,7 @@ import pytest
 import dataflow
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import SPACING
+from dataflow.execution.failure import OperatorFailure
 from dataflow.recording import Recording
 
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
@@ -216,3 +217,23 @@ def test_an_error_is_shown_with_its_line(added: Recording, tmp_path: Path) -> No
     assert "ZeroDivisionError" in (fired.error or "")
     assert "debugged_adder.py" in (fired.error or "")
     assert fired.recorded_error is None
+
+
+def test_setup_that_fails_is_tried_anew(added: Recording, tmp_path: Path) -> None:
+    debugger = Debugger(added, "adder")
+    debugger.goto(2)
+    written(tmp_path, RIGHT, more_imports="def broken(self): raise OSError('no camera')")
+    (tmp_path / "debugged_adder.py").open("a").write("\n    setup = broken\n")
+    debugger.reload()
+    for number in (2, 5, 5):
+        with pytest.raises(OperatorFailure, match="no camera"):
+            debugger.goto(number)
+    written(tmp_path, RIGHT)
+    debugger.reload()
+    assert debugger.goto(5).same
+
+
+def test_other_operators_that_are_gone_do_not_matter() -> None:
+    with Recording(KEPT / "perception.mcap") as recording:
+        debugger = Debugger(recording, "tracker")
+        assert debugger.goto(1).same

@@ -17,6 +17,7 @@ from dataflow.cli.support.arguments import (
     existing_recording,
     find_modules_in,
     graph_file,
+    span,
 )
 from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural
 
@@ -83,9 +84,9 @@ def _debug(recording: Path, operator: str, graph: Graph | None, do: list[str] | 
 
     name, _, when = operator.partition("@")
     with Recording(recording) as opened:
-        stamps = (info.first for info in opened.streams.values() if not info.static)
         debugger = Debugger(opened, name, graph)
-        shell = Shell(debugger, min((stamp for stamp in stamps if stamp is not None), default=0), json=json)
+        begin, _ = span(opened, opened.streams) or (0, 0)
+        shell = Shell(debugger, begin, json=json)
         try:
             first = shell.number(f"@{when}") if when else 0
             begun = [f"goto {first}"] if when or do is None else []

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from dataflow.cli.support.output import out, plural, print_json_line
 from dataflow.cli.support.verdicts import difference_text
-from dataflow.execution.snapshots import pack_state
+from dataflow.execution.snapshots import changes
 from dataflow.messages.base import Message
 from dataflow.messages.display.text import field_text
 
@@ -277,15 +277,6 @@ def _each(value: Any) -> Iterator[Message]:
             yield from value
         case _:
             return
-
-
-def changes(before: Any, after: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Place, value before and after of what differs in two states, as deep as mappings go."""
-    if isinstance(before, Mapping) and isinstance(after, Mapping):
-        for name in sorted({*before, *after}):
-            yield from changes(before.get(name), after.get(name), f"{place}.{name}" if place else name)
-    elif pack_state({"": before}) != pack_state({"": after}):
-        yield place, before, after
 
 
 def _difference(here: Message | None, recorded: Message | None) -> str:
