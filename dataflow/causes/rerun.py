@@ -32,8 +32,8 @@ from dataflow.verification.workers.board import Board
 
 _PATTERN, _OTHER_PATTERN = "90", "85"
 """Of `MALLOC_PERTURB_`: glibc fills fresh memory with its complement."""
-_MOMENT, _OTHER_MOMENT = "2026-01-02 03:04:05", "2027-10-11 12:13:14"
-"""Of libfaketime."""
+_MOMENT, _OTHER_MOMENT = "2026-01-02 03:04:05", "2027-10-11 12:13:14.567891234"
+"""Of libfaketime: they differ in each digit that an operator may take of a clock, below the second too."""
 
 
 @dataclass(frozen=True, slots=True)
