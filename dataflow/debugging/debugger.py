@@ -35,14 +35,17 @@ class DebugError(ReplayError):
 
 class Debugger:
     """One operator of a recorded run. `calls` are its recorded calls, in order; `at` is the one that was made last.
+    `live_effects`: a call outside that is not recorded is made.
 
     Runs the operator in this process, which should have the environment of operators (`threads.environment`): what
     depends on the hashes of strings else repeats only by chance. Raises `DebugError`, `ReplayError`, `RecordingError`,
     `GraphError`.
     """
 
-    def __init__(self, recording: Recording, operator: str, graph: Graph | None = None) -> None:
-        self._recording = recording
+    def __init__(
+        self, recording: Recording, operator: str, graph: Graph | None = None, *, live_effects: bool = False
+    ) -> None:
+        self._recording, self._live_effects = recording, live_effects
         self._graph = graph_that_is_here(recording)[0] if graph is None else graph
         log = _ResumedLog(recording)
         self.node = node = self._graph.nodes[_named(operator, self._graph, log)]
@@ -181,7 +184,13 @@ class Debugger:
     def _start(self, begin: int | None, cut: FiringRecord | None) -> None:
         self._log.cut = cut
         work = Recomputation(
-            self._recording, self._graph, self._feeding, self._log, made=lambda stream, entry: None, begin=begin
+            self._recording,
+            self._graph,
+            self._feeding,
+            self._log,
+            made=lambda stream, entry: None,
+            begin=begin,
+            live_effects=self._live_effects,
         )
         runner = work.runners[self.node.name]
         self._probe = runner.calls = Probe(runner)

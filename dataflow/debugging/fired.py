@@ -105,7 +105,7 @@ class Probe(Calls):
 
     def __init__(self, runner: RecordedRunner) -> None:
         calls = runner.calls
-        super().__init__(calls.node, calls.operator, calls.seed, version=calls.version)
+        super().__init__(calls.node, calls.operator, calls.seed, version=calls.version, effects=calls.effects)
         self._runner = runner
         self._looked_at = 0
         self.target: Call | None = None

@@ -20,6 +20,7 @@ from dataflow.cli.support.arguments import (
     span,
 )
 from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural
+from dataflow.cli.support.run_options import LiveEffects
 
 if TYPE_CHECKING:
     from dataflow.cli.support.debug_shell import Shell
@@ -42,6 +43,7 @@ def debug(
     ] = None,
     settings: Settings = None,
     path: ModuleFolders = None,
+    live_effects: LiveEffects = False,
     json: Json = False,
 ) -> None:
     """Go to any recorded call of an operator: what it was given, what it made, its state before and after.
@@ -74,17 +76,19 @@ def debug(
         from dataflow.graph import load_graph
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-        _debug(recording, operator, loaded, do, json=json)
+        _debug(recording, operator, loaded, do, live_effects=live_effects, json=json)
 
 
-def _debug(recording: Path, operator: str, graph: Graph | None, do: list[str] | None, *, json: bool) -> None:
+def _debug(
+    recording: Path, operator: str, graph: Graph | None, do: list[str] | None, *, live_effects: bool, json: bool
+) -> None:
     from dataflow.cli.support.debug_shell import Shell, WrongCommand
     from dataflow.debugging.debugger import Debugger
     from dataflow.recording import Recording
 
     name, _, when = operator.partition("@")
     with Recording(recording) as opened:
-        debugger = Debugger(opened, name, graph)
+        debugger = Debugger(opened, name, graph, live_effects=live_effects)
         begin, _ = span(opened, opened.streams) or (0, 0)
         shell = Shell(debugger, begin, json=json)
         try:
