@@ -83,6 +83,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("replay:replay", MAKE),
     Command("verification:verify", MAKE),
     Command("debug:debug", MAKE),
+    Command("debug:capture", MAKE),
     Command("inspection:check", LOOK),
     Command("inspection:show", LOOK),
     Command("doctor:doctor", LOOK),

@@ -46,12 +46,12 @@ class Debugger:
         self, recording: Recording, operator: str, graph: Graph | None = None, *, live_effects: bool = False
     ) -> None:
         self._recording, self._live_effects = recording, live_effects
-        self._graph = graph_that_is_here(recording)[0] if graph is None else graph
+        self.graph = graph_that_is_here(recording)[0] if graph is None else graph
         log = _ResumedLog(recording)
-        self.node = node = self._graph.nodes[_named(operator, self._graph, log)]
+        self.node = node = self.graph.nodes[_named(operator, self.graph, log)]
         self._log = log
         self.calls: Sequence[Call] = [call_of(record) for record in log.ordered(node) if record.kind in CALLS]
-        self._feeding = plan_feeding(recording, self._graph, [node.name])
+        self._feeding = plan_feeding(recording, self.graph, [node.name])
         self._kept: dict[int, FiringRecord] = {}
         """States before calls, by the call's number, as `cut` records."""
         self._sources = Sources(node.operator)
@@ -185,7 +185,7 @@ class Debugger:
         self._log.cut = cut
         work = Recomputation(
             self._recording,
-            self._graph,
+            self.graph,
             self._feeding,
             self._log,
             made=lambda stream, entry: None,
@@ -259,6 +259,10 @@ class Debugger:
             error=error,
             recorded_error=recorded,
             injected=injected,
+            record=record,
+            firing=None if injected else probe.firing,
+            raised=None if injected else probe.raised,
+            parameters=dict(self._work.runners[self.node.name].changed),
             same=self._same,
         )
 

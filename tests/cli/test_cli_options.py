@@ -29,6 +29,8 @@ TRIED: tuple[str, ...] = (
     "verify RECORDING --graph GRAPH --set count=30 --process-each --jobs 2",
     "verify RECORDING --baseline OUT.json --accept --repeat 1 --live-effects",
     "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json --live-effects",
+    "capture RECORDING --op sum --firing 3 --predicate stamp --graph GRAPH --set count=30 --path HERE --to OUT.py"
+    " --overwrite --json",
     "check GRAPH --path HERE --set count=4 --json",
     "show GRAPH --path HERE --set count=4 --json",
     "show GRAPH --mermaid",

@@ -320,7 +320,10 @@ def _report(
     elif single:
         print_one(out, checked[0])
         for name in checked[0].culprits[:1]:
-            words = ["dataflow debug", shlex.quote(str(checked[0].path)), name, *options, "--do diff"]
+            path = shlex.quote(str(checked[0].path))
+            words = ["dataflow capture", path, "--op", name, *options]
+            out.print(Text(f"as a test: {' '.join(words)}", style="dim"), soft_wrap=True)
+            words = ["dataflow debug", path, name, *options, "--do diff"]
             out.print(Text(f"next: {' '.join(words)}", style="dim"), soft_wrap=True)
     elif json:
         values = [c.as_json() | more for c, more in zip(checked, found, strict=True)]
