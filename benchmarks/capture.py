@@ -3,8 +3,8 @@
 python benchmarks/capture.py
 
 The ten bugs of `tests/support/zoo/bugs.py`, stateless and with a state, are recorded and captured; the recordings are
-deleted; pytest runs the tests with the bugs and without. Exit code 1 where a test does not fail, does not pass, holds more
-than 1 % of the calls (one at least) or 1 MB, or took more than 60 s (5 min with a state).
+deleted; pytest runs the tests with the bugs and without. Exit code 1 where a test does not fail, does not pass, holds
+more than 1 % of the calls (one at least) or 1 MB, or took more than 60 s (5 min with a state).
 """
 
 from __future__ import annotations
@@ -41,9 +41,8 @@ def main() -> int:
         fails, passes = not with_bug[test], without[test]
         wrong += [] if fails and passes else [bug]
         told = f"{'fails' if fails else 'passes'} | {'passes' if passes else 'fails'}"
-        print(
-            f"| {bug} | {found.wrong} | {found.calls} | {found.left} | {found.begins} | {nbytes} | {seconds:.1f} | {told} |"
-        )
+        size = f"{found.calls} | {found.left} | {found.begins} | {nbytes}"
+        print(f"| {bug} | {found.wrong} | {size} | {seconds:.1f} | {told} |")
     return int(bool(wrong))
 
 
