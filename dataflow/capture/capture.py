@@ -46,8 +46,8 @@ class Found:
 
 
 class Wrong:
-    """What is wrong with a call: an expression is true of it, it raises an error (the class and line count), or its
-    outputs are not the recorded ones."""
+    """The fault of a call: an expression is true of it, it raises an error (the class and line count), or its outputs
+    are not the recorded ones."""
 
     def __init__(self, fired: Fired, predicate: str) -> None:
         self.predicate, self.error, self.digests = predicate, None, None

@@ -104,7 +104,7 @@ def capture(
         typer.Option(
             "--predicate",
             metavar="EXPRESSION",
-            help="What is wrong: Python that sees inp, out, stamp, error. Default: not as recorded, or an error.",
+            help="Python that is true of a wrong call; it sees inp, out, stamp, error. Default: not as recorded, or error.",
         ),
     ] = "",
     to: Annotated[
@@ -131,7 +131,7 @@ def capture(
     Examples:
 
       dataflow capture run.mcap --op tracker
-      dataflow capture run.mcap --op tracker --firing 412 --to tests/test_lost_track.py
+      dataflow capture run.mcap --op tracker --firing 412 --to test_lost_track.py
       dataflow capture run.mcap --op detector --predicate "len(out.detections.boxes) > 100"
     """
     with friendly_errors():
