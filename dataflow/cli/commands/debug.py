@@ -104,7 +104,7 @@ def capture(
         typer.Option(
             "--predicate",
             metavar="EXPRESSION",
-            help="Python that is true of a wrong call; it sees inp, out, stamp, error. Default: not as recorded, or error.",
+            help="True of a wrong call; sees inp, out, stamp, error. Default: not as recorded, or an error.",
         ),
     ] = "",
     to: Annotated[
