@@ -83,6 +83,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("replay:replay", MAKE),
     Command("verification:verify", MAKE),
     Command("debug:debug", MAKE),
+    Command("sweep:sweep", MAKE),
     Command("inspection:check", LOOK),
     Command("inspection:show", LOOK),
     Command("doctor:doctor", LOOK),
@@ -102,15 +103,15 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("lint:lint", LOOK),
     Command("viewing:view", LOOK),
     Command("foxglove:foxglove", LOOK),
-    Command("live:list_running", FOLLOW, "list"),
-    Command("live:echo", FOLLOW),
-    Command("live:hz", FOLLOW),
-    Command("top:top", FOLLOW),
-    Command("logs:logs", FOLLOW),
-    Command("pub:pub", FOLLOW),
-    Command("recording:record", FOLLOW),
+    Command("following.live:list_running", FOLLOW, "list"),
+    Command("following.live:echo", FOLLOW),
+    Command("following.live:hz", FOLLOW),
+    Command("following.top:top", FOLLOW),
+    Command("following.logs:logs", FOLLOW),
+    Command("following.pub:pub", FOLLOW),
+    Command("following.recording:record", FOLLOW),
     Command("playback:playback", FOLLOW),
-    Command("recording:trigger", FOLLOW),
+    Command("following.recording:trigger", FOLLOW),
     Family(
         "new",
         MAKE,
@@ -136,11 +137,11 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow param dump tuned.yaml
         """,
         (
-            Command("param:set_", name="set", ignore_unknown_options=True),  # so that -1 is a value
-            Command("param:get"),
-            Command("param:list_", name="list"),
-            Command("param:dump"),
-            Command("param:load"),
+            Command("following.param:set_", name="set", ignore_unknown_options=True),  # so that -1 is a value
+            Command("following.param:get"),
+            Command("following.param:list_", name="list"),
+            Command("following.param:dump"),
+            Command("following.param:load"),
         ),
     ),
 )
