@@ -28,8 +28,11 @@ def main() -> None:
     options.add_argument("--parts", type=int, default=10)
     parts = options.parse_args().parts
     with tempfile.TemporaryDirectory() as folder:
-        runs = Path(folder) / "runs"
-        call("split", "recordings/demo.mcap", "--every", f"{21 / parts}s", "--out", runs / "part.mcap")
+        runs, pieces = Path(folder) / "runs", Path(folder) / "pieces"
+        call("split", "recordings/demo.mcap", "--every", f"{21 / parts}s", "--out", pieces)
+        for piece in sorted(pieces.glob("*.mcap")):  # apart, or they would be one recording
+            (runs / piece.stem).mkdir(parents=True)
+            piece.rename(runs / piece.stem / "run.mcap")
         print("| sweep | runs | s |\n| --- | ---: | ---: |")
         took = {}
         for name, jobs, out in (("one core", 1, "one"), ("two cores", 2, "two"), ("two cores, again", 2, "two")):

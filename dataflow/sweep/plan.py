@@ -1,4 +1,4 @@
-"""What a sweep has to do: recordings by settings, each with the digest by which its outcome is known again."""
+"""The tasks of a sweep: recordings by settings, each with the digest by which its outcome is found again."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ from dataflow.reexecution.recorded_run import recorded_graph
 from dataflow.verification.gate import recordings_in
 
 What = Literal["replay", "verify", "evaluate"]
+Choice = tuple[tuple[str, str], ...]
+"""Settings, as pairs of name and value."""
 SUFFIXES = (".mcap", ".bag", ".db3")
 CHUNK = 1 << 20
 _OPENS, _CLOSES, _QUOTES = "([{", ")]}", "\"'"
 
 
 class SweepError(ValueError):
-    """Raised for what cannot be swept; the message names it and says what would be right."""
+    """Raised for what cannot be swept; the message names it and what would be right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +52,12 @@ class Task:
 
     source: Source
     what: What
-    settings: tuple[tuple[str, str], ...]
+    settings: Choice
     words: tuple[str | None, ...]
     key: str
 
 
-def grid(words: Sequence[str]) -> list[tuple[tuple[str, str], ...]]:
+def grid(words: Sequence[str]) -> list[Choice]:
     """Returns every combination of "NAME=VALUE,VALUE..." words, the last name's values changing fastest.
 
     A comma inside brackets or quotes belongs to the value. Raises `SweepError`.
@@ -158,7 +160,7 @@ def _remote(url: str) -> list[Source]:
 def tasks_of(
     what: What,
     sources: Sequence[Source],
-    graphs: Mapping[tuple[tuple[str, str], ...], Graph | None],
+    graphs: Mapping[Choice, Graph | None],
     graph: str | None,
     words: Sequence[str],
     digests: Digests,

@@ -17,7 +17,7 @@ AHEAD = 4
 
 
 def local(tasks: Sequence[Task], jobs: int, timeout: float) -> Generator[tuple[Task, Result]]:
-    """Yields tasks with their results as they end, `jobs` at a time. What runs is ended with the iteration."""
+    """Yields tasks with their results as they end, `jobs` at a time. Those running end with the iteration."""
     pool = ThreadPoolExecutor(jobs, thread_name_prefix="sweep")
     left, running, stop = iter(tasks), dict[Future[Result], Task](), Event()
     try:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dataflow.graph import load_graph
-from dataflow.sweep.plan import Digests, SweepError, Task, What, grid, sources_in, tasks_of
+from dataflow.graph import Graph, load_graph
+from dataflow.sweep.plan import Choice, Digests, SweepError, Task, What, sources_in, tasks_of
 from dataflow.sweep.pools import local, on_ray
 from dataflow.sweep.table import Store, summed_up, write_table
 from dataflow.sweep.work import Result
@@ -22,7 +22,7 @@ class Sweep:
 
     - `recordings`: files, folders, URLs.
     - `graph`: a graph file; None: of each recording the one that made it.
-    - `settings`: "NAME=VALUE,VALUE" words; `words`: further words of the command that each recording is run by.
+    - `choices`: of settings, each as (name, value) pairs; `words`: further words of the command that runs a recording.
     - `folder`: where results are kept. `again`: also run what has one.
     - `jobs`: recordings at a time; 0: one for each core. `timeout`: seconds for one.
     - `ray`: address of a Ray cluster; "local" begins one.
@@ -33,32 +33,32 @@ class Sweep:
     recordings: Sequence[str]
     what: What = "replay"
     graph: Path | None = None
-    settings: Sequence[str] = ()
+    choices: Sequence[Choice] = ((),)
     words: Sequence[str] = ()
     folder: Path = Path("out/sweep")
     jobs: int = 0
     ray: str | None = None
     timeout: float = 3600.0
     again: bool = False
+    graphs: dict[Choice, Graph | None] = field(init=False)
     tasks: list[Task] = field(init=False)
     left: list[Task] = field(init=False)
     store: Store = field(init=False)
 
     def __post_init__(self) -> None:
-        if self.graph is None and self.settings:
+        if self.graph is None and any(self.choices):
             raise SweepError("--set changes a graph file: name one")
         if not self.recordings:
             raise SweepError("no recordings: name files, folders or URLs with --recordings")
-        choices = grid(self.settings)
-        loaded = {
+        self.graphs = {
             choice: None if self.graph is None else load_graph(self.graph, settings=[f"{n}={v}" for n, v in choice])
-            for choice in choices
+            for choice in self.choices
         }
         self.store = Store(self.folder)
         digests = Digests(self.folder / "digests.json")
         sources = sources_in(self.recordings, digests)
         named = None if self.graph is None else str(self.graph.resolve())
-        self.tasks = tasks_of(self.what, sources, loaded, named, self.words, digests)
+        self.tasks = tasks_of(self.what, sources, self.graphs, named, self.words, digests)
         digests.save()
         kept = {} if self.again else {task.key: self.store.of(task.key) for task in self.tasks}
         self.left = [task for task in self.tasks if (result := kept.get(task.key)) is None or not result.final]

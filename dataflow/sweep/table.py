@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dataflow.sweep.plan import Task
+from dataflow.sweep.plan import Choice, Task
 from dataflow.sweep.work import Result
 
 TIMES = ("cpu_ms", "wall_ms", "total_wall_s")
@@ -112,8 +112,8 @@ def summed_up(tasks: Iterable[Task], store: Store) -> list[dict[str, Any]]:
     `recordings`, `outcomes` (outcome → number), `verdicts` (verdict → operators), `culprits` (operator → recordings),
     `dropped` messages, `cpu_s`, and `figures`: "operator: name" → mean, standard deviation, number of recordings.
     """
-    found: dict[tuple[tuple[str, str], ...], dict[str, Any]] = {}
-    figures: dict[tuple[tuple[str, str], ...], dict[str, _Moments]] = {}
+    found: dict[Choice, dict[str, Any]] = {}
+    figures: dict[Choice, dict[str, _Moments]] = {}
     for task in tasks:
         here = found.setdefault(
             task.settings,

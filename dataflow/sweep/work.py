@@ -1,4 +1,4 @@
-"""The work on one task: the command in a process of its own, and what is kept of its report."""
+"""The work on one task: the command in a separate process, and what is kept of its report."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Result:
 
     @property
     def final(self) -> bool:
-        """Whether another try would have the same outcome: nothing from outside ended it."""
+        """Returns whether another try would have the same outcome: nothing from outside ended it."""
         return self.outcome in ("done", "failed")
 
 

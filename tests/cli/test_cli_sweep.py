@@ -210,6 +210,22 @@ def test_what_cannot_be_swept_is_refused_before_anything_runs(
     assert not (tmp_path / "sweep.parquet").exists()
 
 
+def test_two_settings_are_compared_pair_by_pair(dataflow, folder: Path, tmp_path: Path) -> None:
+    given = ("--recordings", folder / "runs", "--path", folder, "--out", tmp_path, "-q", "--json")
+    told = json.loads(dataflow("compare", folder / "graph.yaml", *given, "--set", "b:scaled.by=3").stdout)
+
+    (figure,) = told["figures"]
+    assert (figure["figure"], figure["a"], figure["b"]) == ("scaled: total error", 132.0, 198.0)
+    assert dict(figure["recordings"]) == {"first.mcap": 66.0, "deep/second.mcap": 66.0}
+    assert told["operators"] == [{"operator": "scaled", "recordings": 2, "first": 2}]
+
+    words = ("--set", "b:scaled.by=3", "--set", "a:scaled.fail_at=5")
+    failed = json.loads(dataflow("compare", folder / "graph.yaml", *given, *words, code=1).stdout)
+    assert failed["failed"] == [{"settings": {"scaled.fail_at": "5"}, "outcomes": {"failed": 2}}]
+    for word, what in (("scaled.by", "expected NAME=VALUE"), ("scaled.by=3", "A and B are the same")):
+        assert what in dataflow("compare", folder / "graph.yaml", *given, "--set", word, code=2).stderr
+
+
 @pytest.mark.long
 def test_a_cluster_makes_the_same_table(sweep: Sweep, tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'robot-dataflow[ray]'")

@@ -52,9 +52,7 @@ Values = Annotated[
         help="The values of a graph parameter, or OPERATOR.PARAM. May be repeated: every combination is run.",
     ),
 ]
-Done = Annotated[
-    str, typer.Option("--what", metavar="replay|verify|evaluate", help="What is done with each recording.")
-]
+Done = Annotated[str, typer.Option("--what", metavar="replay|verify|evaluate", help="The work on each recording.")]
 Maps = Annotated[
     list[str] | None,
     typer.Option(
@@ -102,9 +100,9 @@ def sweep(
 ) -> None:
     """Run every recording by every choice of settings, and make one table of it.
 
-    Each runs in a process alone, --jobs of them at a time. What has a result already is not run again, as long as the
+    Each runs in a process alone, --jobs of them at a time. One that has a result is not run again, as long as the
     recording, the graph, its files, the operators' code and the packages are the same: a sweep that was interrupted
-    goes on, and a second one is done at once. What was killed or took too long is tried again.
+    goes on, and a second one is done at once. Those that were killed or took too long are tried again.
 
     The folder holds `sweep.parquet`, with a row for each recording and operator, `results/`, and of what failed
     `logs/`. With --what evaluate the table holds the operators that have figures.
@@ -133,20 +131,22 @@ def sweep(
     words += [word for value in path or () for word in ("--path", str(value.resolve()))]
     with friendly_errors():
         find_modules_in(path)
-        from dataflow.sweep.plan import SweepError
+        from dataflow.sweep.plan import SweepError, grid
         from dataflow.sweep.run import Sweep
 
         try:
             file = None if graph is None else graph_file(graph)
             task = cast("What", what)
-            plan = Sweep(recordings or (), task, file, settings or (), words, folder, jobs or 0, ray, timeout, again)
-            spent = _run(plan, quiet=quiet)
+            plan = Sweep(
+                recordings or (), task, file, grid(settings or ()), words, folder, jobs or 0, ray, timeout, again
+            )
+            spent = work(plan, quiet=quiet)
         except SweepError as error:
             raise fail(str(error)) from None
     _report(plan, spent, json=json, verbose=verbose)
 
 
-def _run(plan: Sweep, *, quiet: bool) -> float:
+def work(plan: Sweep, *, quiet: bool) -> float:
     """Runs what is left; returns the seconds that it took."""
     begun = time.monotonic()
     if not quiet:
