@@ -188,8 +188,8 @@ def _print(summary: Sequence[Mapping[str, Any]], *, verbose: bool) -> None:
     for choice in summary:
         done = (count(choice["recordings"]), Text(_counts(choice["outcomes"])))
         costs = (count(choice["dropped"]), f"{choice['cpu_s']:.1f}")
-        found = (Text(_counts(choice["verdicts"])), Text(_counts(choice["culprits"])))
-        made.add_row(Text(_named(choice) or "as the graph is"), *done, *(found if verified else costs))
+        verdicts = (Text(_counts(choice["verdicts"])), Text(_counts(choice["culprits"])))
+        made.add_row(Text(_named(choice) or "as the graph is"), *done, *(verdicts if verified else costs))
     out.print(made)
     names = dict.fromkeys(name for choice in summary for name in choice["figures"])
     shown = [name for name in names if verbose or any(part in name.replace(":", " ").split() for part in SCORES)]
