@@ -14,9 +14,9 @@ import tempfile
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path += [str(REPOSITORY / "tests" / folder) for folder in ("support", "capture")]
+sys.path.append(str(REPOSITORY / "tests" / "support"))
 
-import seeded  # noqa: E402
+import seeded_bugs  # noqa: E402
 from zoo import bugs  # noqa: E402
 
 
@@ -26,15 +26,15 @@ def main() -> int:
         folder = Path(name)
         for case in bugs.CASES:
             bug = case.use.__name__
-            path = seeded.recorded(case, folder / f"{bug}.mcap")
-            found, nbytes, seconds = seeded.captured(case, path, folder / f"test_{bug}.py")
+            path = seeded_bugs.recorded(case, folder / f"{bug}.mcap")
+            found, nbytes, seconds = seeded_bugs.captured(case, path, folder / f"test_{bug}.py")
             path.unlink()
             rows[f"test_{bug}"] = bug, found, nbytes, seconds
             most = 60 if case.use.stateless else 300
             if found.left > max(1, found.calls // 100) or nbytes > 1_000_000 or seconds > most:
                 wrong.append(bug)
         tests = sorted(folder.glob("test_*.py"))
-        with_bug, without = (seeded.outcomes(tests, fixed=fixed) for fixed in (False, True))
+        with_bug, without = (seeded_bugs.outcomes(tests, fixed=fixed) for fixed in (False, True))
     print("| bug | wrong | calls | kept | begins with | bytes | seconds | with it | without |")
     print("| --- | --- | ---: | ---: | --- | ---: | ---: | --- | --- |")
     for test, (bug, found, nbytes, seconds) in rows.items():

@@ -30,7 +30,7 @@ ROOMS = {
     "docs": ("docs", "scaffold"),
     "network": ("client", "foxglove", "transport"),
     "process": (
-        "analysis", "api", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
+        "analysis", "api", "capture", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
         "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",
     ),
 }  # fmt: skip

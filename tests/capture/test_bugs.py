@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import seeded
+import seeded_bugs
 from zoo import bugs
 
 from dataflow.capture.capture import Found
@@ -17,13 +17,14 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Found, in
     made = {}
     for case in bugs.CASES:
         name = case.use.__name__
-        path = seeded.recorded(case, folder / f"{name}.mcap")
-        one, nbytes, _ = seeded.captured(case, path, folder / f"test_{name}.py")
+        path = seeded_bugs.recorded(case, folder / f"{name}.mcap")
+        one, nbytes, _ = seeded_bugs.captured(case, path, folder / f"test_{name}.py")
         path.unlink()  # the test is alone
         made[name] = one, nbytes, folder / f"test_{name}.py"
     return made
 
 
+@pytest.mark.long
 def test_every_bug_is_captured_small(found: dict[str, tuple[Found, int, Path]]) -> None:
     assert len(found) == 10
     for name, (one, nbytes, _) in found.items():
@@ -33,8 +34,9 @@ def test_every_bug_is_captured_small(found: dict[str, tuple[Found, int, Path]]) 
     assert {name for name, (one, _, _) in found.items() if "may be wrong" in one.begins} == set()
 
 
+@pytest.mark.long
 def test_the_tests_fail_alone_and_pass_on_mended_code(found: dict[str, tuple[Found, int, Path]]) -> None:
     tests = [test for _, _, test in found.values()]
 
-    assert seeded.outcomes(tests, fixed=False) == {test.stem: False for test in tests}
-    assert seeded.outcomes(tests, fixed=True) == {test.stem: True for test in tests}
+    assert seeded_bugs.outcomes(tests, fixed=False) == {test.stem: False for test in tests}
+    assert seeded_bugs.outcomes(tests, fixed=True) == {test.stem: True for test in tests}

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-import seeded
+import seeded_bugs
 import vision_language
 from typer.testing import CliRunner
 from zoo import bugs
@@ -24,7 +24,7 @@ CASES = {case.use.__name__: case for case in bugs.CASES}
 
 @pytest.fixture(scope="module")
 def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return seeded.recorded(CASES["LateBatch"], tmp_path_factory.mktemp("late") / "run.mcap")
+    return seeded_bugs.recorded(CASES["LateBatch"], tmp_path_factory.mktemp("late") / "run.mcap")
 
 
 def captured(path: Path, operator: str = "bug", number: int | None = None, predicate: str = "") -> Captured:

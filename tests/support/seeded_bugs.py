@@ -18,7 +18,7 @@ from dataflow.graph import Graph, load_text
 from dataflow.recording import Recording
 from dataflow.supervision.core.report import RunFailed
 
-SUPPORT = Path(bugs.__file__).resolve().parents[1]
+SUPPORT = Path(__file__).resolve().parent
 
 
 def graph(case: bugs.Case) -> Graph:
