@@ -30,8 +30,8 @@ ROOMS = {
     "docs": ("docs", "scaffold"),
     "network": ("client", "foxglove", "transport"),
     "process": (
-        "analysis", "api", "capture", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
-        "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",
+        "analysis", "api", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
+        "capture", "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",
     ),
 }  # fmt: skip
 """Folders of tests by marker; a test anywhere else is a `unit` test."""
