@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.sweep import Again, Folder, Jobs, Maps, Patience, Ray, Recordings, work
+from dataflow.cli.commands.sweep import Again, Folder, Jobs, Maps, Patience, Ray, Recordings, passed_on, work
 from dataflow.cli.support.arguments import Json, ModuleFolders, find_modules_in, graph_file
 from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
 from dataflow.cli.support.report import SCORES
@@ -50,10 +50,8 @@ def compare(
     """Replay recordings with A's settings and with B's, and compare the figures of the graph pair by pair.
 
     Each figure's mean of B - A has a 95 % interval (bootstrap over recordings) and the p of Wilcoxon's signed-rank
-    test; with several figures, p is adjusted by Holm's method. Pairs show differences that two means hide: how hard a
-    recording is cancels out. Besides: the recordings where B is worst, and the operators whose outputs differ.
-
-    Results are kept as those of `dataflow sweep`, in the same folder if asked for, so that A runs once for several B.
+    test, adjusted by Holm's method where there are several. Besides: the recordings where B is worst, and the operators
+    whose outputs differ. Results are kept as those of `dataflow sweep` are: A runs once for several B.
 
     Exit codes:
 
@@ -68,8 +66,6 @@ def compare(
       dataflow compare graphs/slam.yaml --recordings runs --set a:slam.voxel=0.1 --set b:slam.voxel=0.2 --json
     """
     choices = _choices(settings or ())
-    words = [word for value in maps or () for word in ("--map", value)]
-    words += [word for value in path or () for word in ("--path", str(value.resolve()))]
     with friendly_errors():
         find_modules_in(path)
         from dataflow.sweep.paired import compared, differing, figures_of
@@ -78,7 +74,9 @@ def compare(
 
         try:
             file = graph_file(graph)
-            plan = Sweep(recordings or (), "replay", file, choices, words, folder, jobs or 0, ray, timeout, again)
+            plan = Sweep(
+                recordings or (), "replay", file, choices, passed_on(maps, path), folder, jobs or 0, ray, timeout, again
+            )
             work(plan, quiet=quiet)
         except SweepError as error:
             raise fail(str(error)) from None

@@ -121,14 +121,7 @@ def sweep(
       dataflow sweep perception --recordings runs --what evaluate --out out/scores --json
       dataflow sweep perception --recordings s3://bucket/runs --ray auto
     """
-    if what not in ("replay", "verify", "evaluate"):
-        raise fail(f"--what {what!r}: expected replay, verify or evaluate")
-    if jobs is not None and not 1 <= jobs <= MOST_JOBS:
-        raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}")
-    if maps and what == "verify":
-        raise fail("--map is for bags, and these hold no firing records to verify")
-    words = [word for value in maps or () for word in ("--map", value)]
-    words += [word for value in path or () for word in ("--path", str(value.resolve()))]
+    task = _checked(what, jobs, maps)
     with friendly_errors():
         find_modules_in(path)
         from dataflow.sweep.plan import SweepError, grid
@@ -136,14 +129,28 @@ def sweep(
 
         try:
             file = None if graph is None else graph_file(graph)
-            task = cast("What", what)
-            plan = Sweep(
-                recordings or (), task, file, grid(settings or ()), words, folder, jobs or 0, ray, timeout, again
-            )
+            choices, words = grid(settings or ()), passed_on(maps, path)
+            plan = Sweep(recordings or (), task, file, choices, words, folder, jobs or 0, ray, timeout, again)
             spent = work(plan, quiet=quiet)
         except SweepError as error:
             raise fail(str(error)) from None
     _report(plan, spent, json=json, verbose=verbose)
+
+
+def _checked(what: str, jobs: int | None, maps: Sequence[str] | None) -> What:
+    if what not in ("replay", "verify", "evaluate"):
+        raise fail(f"--what {what!r}: expected replay, verify or evaluate")
+    if jobs is not None and not 1 <= jobs <= MOST_JOBS:
+        raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}")
+    if maps and what == "verify":
+        raise fail("--map is for bags, and these hold no firing records to verify")
+    return cast("What", what)
+
+
+def passed_on(maps: Sequence[str] | None, folders: Sequence[Path] | None) -> list[str]:
+    """Returns the options that the command of each recording gets as well."""
+    words = [word for value in maps or () for word in ("--map", value)]
+    return words + [word for folder in folders or () for word in ("--path", str(folder.resolve()))]
 
 
 def work(plan: Sweep, *, quiet: bool) -> float:
