@@ -157,7 +157,7 @@ def lift(
 def _on(mask: Mask, seen: Seen, rows: Indices) -> Indices:
     """Returns those of some points that are on an object's mask (H, W)."""
     columns, lines = seen.places[:2].take(rows, axis=1).astype(np.intp)
-    return rows[mask[lines, columns]]
+    return np.asarray(rows[mask[lines, columns]])
 
 
 def _of_class(

@@ -116,7 +116,9 @@ class ObjectLifter(Operator):
         )
         boxes, bodies = detections.boxes[rows].astype(np.float64), frozenset(np.flatnonzero(body[rows]).tolist())
         classes = [known.get(names[k], -1) for k in rows]
-        instances = None if detections.masks is None else [m for k in rows if (m := detections.mask(k)) is not None]
+        instances = (
+            None if detections.masks is None else [m for k in rows if (m := detections.mask(int(k))) is not None]
+        )
         found = lift(seen, boxes, classes, background, settings, bodies, instances)
         labels = np.full(cloud.count, -1, np.int32)
         for number, each in enumerate(found):
