@@ -6,11 +6,12 @@ arguments and the operator's state alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from dataflow.execution.completion import complete_outputs, require_complete
 from dataflow.execution.failure import RAISED, OperatorFailure
 from dataflow.execution.generators.loading import LOADS
 from dataflow.execution.generators.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
@@ -62,7 +63,9 @@ class Calls:
             seed = FiringSeed(self._seeded_by, firing.stamp)
             seed_generators(seed, self.version)
             self.operator.seed_rng(seed)
-            return outputs_of(self.operator, _call(self.operator, firing))
+            outputs = outputs_of(self.operator, _call(self.operator, firing))
+            complete_outputs(self.operator.spec, outputs, firing)
+            return outputs
         finally:
             LOADS.seed = None
             AT_WORK.ended += 1
@@ -116,6 +119,7 @@ class Calls:
                 raise OutputError(f"{self.node.name}: static_outputs() gave {name!r}, which is no static output port")
             if not isinstance(message, port.types):
                 raise OutputError(f"{self.node.name}.{name} is a {port.type_text()}, got {type(message).__name__}")
+        require_complete(self.operator.spec, statics, "static_outputs()")
         return statics
 
     def _seed_change(self, what: str, place: Place) -> None:
@@ -136,19 +140,6 @@ def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
         raise OperatorFailure(name, "summary()", error) from error
 
 
-def entries_of(given: InputValue) -> Sequence[Entry]:
-    """All entries an input was given, in the order `process()` sees them."""
-    match given:
-        case None:
-            return ()
-        case Entry():
-            return (given,)
-        case Mapping():
-            return tuple(given.values())
-        case _:
-            return given
-
-
 def _call(operator: Operator, firing: Firing) -> Outputs:
     if firing.kind == "finish":
         return operator.finish()
@@ -167,8 +158,6 @@ def value_of(given: InputValue) -> Any:
     match given:
         case None:
             return None
-        case Entry():
-            return given.value
         case Entry():
             return given.value
         case Mapping():
