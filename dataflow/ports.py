@@ -17,7 +17,9 @@ from dataflow.sync.stamps import parse_duration
 T = TypeVar("T")
 
 InputKind = Literal["in", "sampled", "batch"]
-Outputs = Message | Mapping[str, Message | None] | None
+Outputs = Message | Mapping[str, object] | None
+"""Result of `process()`: a message, a mapping from port to message or None, or None. A `TypedDict` is a mapping, too,
+which type checkers compare with what is returned, port by port."""
 Duration = Annotated[int, BeforeValidator(parse_duration)]
 """A parameter type: nanoseconds, written as `"100ms"`, `"2s"` or an integer."""
 
