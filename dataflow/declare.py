@@ -67,7 +67,7 @@ class Declaration:
         )
         doc = inspect.cleandoc(self.cls.__doc__ or "")
         return OperatorSpec(
-            self.cls.__name__, doc, self.inputs, self.outputs, model, bool(merge), window, period, taken
+            self.cls.__name__, doc, self.inputs, self.outputs, model, bool(merge), window, period, taken, self.state
         )
 
     def _annotations(self, local: Mapping[str, Any]) -> dict[str, Any]:

@@ -192,7 +192,8 @@ class OutputPort:
 class OperatorSpec:
     """All that an operator class declares; everything else (checks, docs, viewer) reads it from here.
 
-    `every` and `tolerance` are nanoseconds; `parameters` is a pydantic model of the parameters.
+    `every` and `tolerance` are nanoseconds; `parameters` is a pydantic model of the parameters; `state` is the
+    dataclass of the state, or None.
     """
 
     name: str
@@ -204,6 +205,7 @@ class OperatorSpec:
     tolerance: int
     every: int | None
     process_takes: tuple[str, ...]
+    state: Any = None
 
     @property
     def triggers(self) -> tuple[InputPort, ...]:
