@@ -84,6 +84,7 @@ __all__ = [
     "is_source",
     "is_tunable",
     "outputs_of",
+    "state_hints",
     "validate_parameters",
 ]
 

@@ -24,8 +24,7 @@ from dataflow.extras import missing_extra
 from dataflow.graph.lookup import NotFound, find_operator, is_concrete, lost_exports, offered
 from dataflow.graph.model import current_path
 from dataflow.graph.problems import did_you_mean
-from dataflow.operator import InputPort, Operator, OutputPort, is_source, is_tunable
-from dataflow.state import state_hints
+from dataflow.operator import InputPort, Operator, OutputPort, is_source, is_tunable, state_hints
 from dataflow.sync.stamps import format_duration, parse_duration
 
 ENTRY_POINTS = "dataflow.operators"
