@@ -7,7 +7,7 @@ import inspect
 import sys
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import pydantic
@@ -67,7 +67,7 @@ class Declaration:
         )
         doc = inspect.cleandoc(self.cls.__doc__ or "")
         return OperatorSpec(
-            self.cls.__name__, doc, self.inputs, self.outputs, model, bool(merge), window, period, taken
+            self.cls.__name__, doc, self.inputs, self.outputs, model, bool(merge), window, period, taken, self.state
         )
 
     def _annotations(self, local: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,27 +148,38 @@ class Declaration:
             )
 
     def _check_returned(self) -> None:
-        """Refuses a `process()` that is annotated to return messages which its outputs do not take."""
-        function = vars(self.cls).get("process")
-        if function is None:  # inherited, and looked at there
-            return
+        """Refuses a `process()` or `finish()` that is annotated to return what its outputs do not take.
+
+        That is another message, or a `TypedDict` with a key that is no port or with another message for a port.
+        """
+        for method in ("process", "finish"):
+            hint = self._hints(vars(self.cls).get(method)).get("return")
+            self._check_message(method, _messages(hint))
+            for table in filter(typing.is_typeddict, _members(hint)):
+                for name, value in self._hints(table).items():
+                    if name not in self.outputs:
+                        known = ", ".join(self.outputs) or "none"
+                        raise self.fault(method, f"returns {name!r}, which is no output; outputs: {known}")
+                    self._check_emits(method, self.outputs[name], _messages(value))
+
+    def _hints(self, annotated: Any) -> dict[str, Any]:
         try:
-            hint = typing.get_type_hints(function, localns=self._local).get("return")
-        except (NameError, TypeError):  # a type that is imported for type checkers alone
-            return
-        members = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
-        returned = [m for m in members if isinstance(m, type) and issubclass(m, Message) and m is not Message]
+            return typing.get_type_hints(annotated, localns=self._local)
+        except (NameError, TypeError):  # inherited, and looked at there; or a type imported for type checkers alone
+            return {}
+
+    def _check_message(self, method: str, returned: Sequence[type[Message]]) -> None:
         ports = [port for port in self.outputs.values() if not port.static]
         if returned and len(ports) != 1:
             names = ", ".join(port.name for port in ports) or "none"
-            raise self.fault(
-                "process", f"returns one message, but has {len(ports)} outputs ({names}): return a mapping"
-            )
+            raise self.fault(method, f"returns one message, but has {len(ports)} outputs ({names}): return a mapping")
+        if returned:
+            self._check_emits(method, ports[0], returned)
+
+    def _check_emits(self, method: str, port: OutputPort, returned: Sequence[type[Message]]) -> None:
         for message in returned:
-            if not issubclass(message, ports[0].types):
-                raise self.fault(
-                    "process", f"returns {message.SCHEMA}, but {ports[0].name} emits {ports[0].type_text()}"
-                )
+            if not issubclass(message, port.types):
+                raise self.fault(method, f"returns {message.SCHEMA}, but {port.name} emits {port.type_text()}")
 
     def _check_source(self) -> None:
         if self.inputs:
@@ -177,17 +188,19 @@ class Declaration:
             raise self.fault("(outputs)", "a source needs at least one Out[...]")
 
 
+def _members(hint: Any) -> tuple[Any, ...]:
+    """The alternatives of a union; any other type alone."""
+    return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+
+
+def _messages(hint: Any) -> list[type[Message]]:
+    """The message types among the alternatives; any message is none."""
+    return [m for m in _members(hint) if isinstance(m, type) and issubclass(m, Message) and m is not Message]
+
+
 def _port_types(hint: Any) -> tuple[type[Message], ...]:
-    found: list[type[Message]] = []
-    for argument in typing.get_args(hint):
-        members = (
-            typing.get_args(argument) if typing.get_origin(argument) in (typing.Union, types.UnionType) else (argument,)
-        )
-        for member in members:
-            if not (isinstance(member, type) and issubclass(member, Message)):
-                return ()
-            found.append(member)
-    return tuple(found)
+    found = [member for argument in typing.get_args(hint) for member in _members(argument)]
+    return tuple(found) if all(isinstance(m, type) and issubclass(m, Message) for m in found) else ()
 
 
 def _input_port(name: str, port: In[Any] | Sampled[Any] | Batch[Any], accepted: tuple[type[Message], ...]) -> InputPort:

@@ -84,6 +84,7 @@ __all__ = [
     "is_source",
     "is_tunable",
     "outputs_of",
+    "state_hints",
     "validate_parameters",
 ]
 
@@ -107,7 +108,6 @@ class Operator:
     """Touches the world (an actuator, a network service): always recorded, never re-executed."""
     state: Any
     """The state, of the dataclass that a class annotates it with (`state: State`). None is annotated: no state."""
-    __state: ClassVar[Any] = None
     __effects: Journaled | None = None
     __generator: np.random.Generator | None = None
     __seed: SupportsInt = 0
@@ -134,7 +134,7 @@ class Operator:
                 )
             declared = Declaration(cls, (Operator, Source), sys._getframe(1).f_locals)
             if declared.state is not None:
-                cls.__state, cls.state = declared.state, StateOf()
+                cls.state = StateOf()
             cls.spec = declared.spec(
                 merge,
                 tolerance,
@@ -210,14 +210,14 @@ class Operator:
 
         Called when `state` is first asked for, and by `on_reset()`. Raises `StateError`.
         """
-        return fresh_state(type(self), self.__state)
+        return fresh_state(type(self), self.spec.state)
 
     def on_reset(self, input: str) -> None:
         """Begins anew with `initial_state()`, the fields declared `KEPT` aside.
 
         The clock behind `input` jumped back: the stamps to come are earlier than those before.
         """
-        if self.__state is not None:
+        if self.spec.state is not None:
             old, self.state = self.state, self.initial_state()
             reset_state(old, self.state)
 
@@ -233,14 +233,14 @@ class Operator:
         Values: numbers, strings, bytes, None, numpy arrays, and lists and mappings (with string keys) of these. Called
         between firings of a recorded run whose graph asks for snapshots. Raises `StateError` for other values.
         """
-        if self.__state is None:
+        if self.spec.state is None:
             return None
         snapshot: Mapping[str, Any] = plain(self.state)
         return snapshot
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Takes over a state that `snapshot` gave. Called once, after `setup()`. Raises `StateError`."""
-        if self.__state is None:
+        if self.spec.state is None:
             raise NotImplementedError(f"{type(self).__name__} gives snapshots but cannot restore them")
         try:
             take_over(self.state, state_hints(self.state), state, self.new_part)
@@ -273,7 +273,7 @@ class Operator:
 
     def summary(self) -> Mapping[str, float | int | str]:
         """Returns figures to show at the end of a run, by default those of a state `Counts`; read after `finish()`."""
-        return dict(self.state.counts) if issubclass(self.__state or object, Counts) else {}
+        return dict(self.state.counts) if issubclass(self.spec.state or object, Counts) else {}
 
     @classmethod
     def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:

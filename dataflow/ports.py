@@ -17,7 +17,9 @@ from dataflow.sync.stamps import parse_duration
 T = TypeVar("T")
 
 InputKind = Literal["in", "sampled", "batch"]
-Outputs = Message | Mapping[str, Message | None] | None
+Outputs = Message | Mapping[str, object] | None
+"""Result of `process()`: a message, a mapping from port to message or None, or None. A `TypedDict` is a mapping, too,
+which type checkers compare with what is returned, port by port."""
 Duration = Annotated[int, BeforeValidator(parse_duration)]
 """A parameter type: nanoseconds, written as `"100ms"`, `"2s"` or an integer."""
 
@@ -190,7 +192,8 @@ class OutputPort:
 class OperatorSpec:
     """All that an operator class declares; everything else (checks, docs, viewer) reads it from here.
 
-    `every` and `tolerance` are nanoseconds; `parameters` is a pydantic model of the parameters.
+    `every` and `tolerance` are nanoseconds; `parameters` is a pydantic model of the parameters; `state` is the
+    dataclass of the state, or None.
     """
 
     name: str
@@ -202,6 +205,7 @@ class OperatorSpec:
     tolerance: int
     every: int | None
     process_takes: tuple[str, ...]
+    state: Any = None
 
     @property
     def triggers(self) -> tuple[InputPort, ...]:

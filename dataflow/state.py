@@ -213,8 +213,8 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def state_hints(state: Any) -> dict[str, Any]:
-    """Returns the fields of a dataclass and their types."""
-    hints = _hints(type(state))
+    """Returns the fields of a dataclass, or of an object of it, and their types."""
+    hints = _hints(state if isinstance(state, type) else type(state))
     return {each.name: hints[each.name] for each in dataclasses.fields(state)}
 
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from types import ModuleType
 
-from dataflow.messages.base import ArrayField, Field, Message, message_types
+from dataflow.messages.base import ArrayField, Field, Message, ScalarField, message_types
 
 INTRODUCTION = """\
 # Messages
@@ -78,6 +78,8 @@ def _row(field: Field) -> str:
             kind += ": " + ", ".join(field.choices)
     if field.optional:
         kind += ", optional"
+    elif isinstance(field, ScalarField) and field.anchored:
+        kind += ", default the anchor's"
     elif not field.required and not isinstance(field, ArrayField):
         kind += ", default " + (repr(field.default) if field.default != () else "empty")
     return f"| `{field.name}` | {kind} |{f' {unit}' if unit else ''} | {field.doc} |"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.execution.completion import complete_outputs, require_complete
 from dataflow.execution.effects.answers import EffectError
 from dataflow.execution.effects.journal import Journal
 from dataflow.execution.failure import RAISED, OperatorFailure
@@ -73,10 +74,11 @@ class Calls:
             seed_generators(seed, self.version)
             self.operator.seed_rng(seed)
             self._firing = firing.stamp
-            made = outputs_of(self.operator, _call(self.operator, firing))
+            outputs = outputs_of(self.operator, _call(self.operator, firing))
             if self.effects.missed is not None:  # the operator has caught it
                 raise self.effects.missed
-            return made
+            complete_outputs(self.operator.spec, outputs, firing)
+            return outputs
         finally:
             LOADS.seed = None
             AT_WORK.ended += 1
@@ -130,6 +132,7 @@ class Calls:
                 raise OutputError(f"{self.node.name}: static_outputs() gave {name!r}, which is no static output port")
             if not isinstance(message, port.types):
                 raise OutputError(f"{self.node.name}.{name} is a {port.type_text()}, got {type(message).__name__}")
+        require_complete(self.operator.spec, statics, "static_outputs()")
         return statics
 
     def _effect(self, call: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -166,19 +169,6 @@ def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
         raise OperatorFailure(name, "summary()", error) from error
 
 
-def entries_of(given: InputValue) -> Sequence[Entry]:
-    """All entries an input was given, in the order `process()` sees them."""
-    match given:
-        case None:
-            return ()
-        case Entry():
-            return (given,)
-        case Mapping():
-            return tuple(given.values())
-        case _:
-            return given
-
-
 def _call(operator: Operator, firing: Firing) -> Outputs:
     if firing.kind == "finish":
         return operator.finish()
@@ -197,8 +187,6 @@ def value_of(given: InputValue) -> Any:
     match given:
         case None:
             return None
-        case Entry():
-            return given.value
         case Entry():
             return given.value
         case Mapping():

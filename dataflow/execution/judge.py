@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
 
-from dataflow.execution.calls import entries_of
 from dataflow.execution.failure import readable
 from dataflow.execution.snapshots import differing_fields
 from dataflow.messages.base import Message
@@ -14,6 +13,7 @@ from dataflow.records.comparison import Difference, Verification
 from dataflow.records.firing import WITHHELD, Emission, FiringRecord
 from dataflow.records.reading import Digests
 from dataflow.sync import Entry, Firing
+from dataflow.sync.entries import entries_of
 
 _ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
 

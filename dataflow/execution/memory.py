@@ -5,9 +5,9 @@ Its arrays are read-only, but libraries need not look at that (LAPACK with `over
 
 from __future__ import annotations
 
-from dataflow.execution.calls import entries_of
 from dataflow.messages.base import Message
 from dataflow.sync import Firing
+from dataflow.sync.entries import entries_of
 
 WATCHED = 3
 """The first firings of each operator, in which it is always watched: most that write into an input do so each time."""

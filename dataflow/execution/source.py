@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from dataflow.execution.calls import Calls
+from dataflow.execution.completion import require_complete
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.generators.loading import LOADS
 from dataflow.execution.generators.seeding import change_seed, seed_generators
@@ -112,6 +113,7 @@ class SourceRunner:
             for step in self._steps:
                 messages = outputs_of(self.operator, step)
                 if messages:
+                    require_complete(self.operator.spec, messages, "stream()")
                     self._read = step_stamp(messages)
                     if len(messages) > 1:
                         self._check_stamps(messages)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import inspect
 import json
 import pkgutil
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
@@ -21,7 +24,7 @@ from dataflow.extras import missing_extra
 from dataflow.graph.lookup import NotFound, find_operator, is_concrete, lost_exports, offered
 from dataflow.graph.model import current_path
 from dataflow.graph.problems import did_you_mean
-from dataflow.operator import InputPort, Operator, OutputPort, is_source, is_tunable
+from dataflow.operator import InputPort, Operator, OutputPort, is_source, is_tunable, state_hints
 from dataflow.sync.stamps import format_duration, parse_duration
 
 ENTRY_POINTS = "dataflow.operators"
@@ -149,6 +152,7 @@ class Described:
             "inputs": [_input(port) for port in spec.inputs.values()],
             "outputs": [_output(port) for port in spec.outputs.values()],
             "params": [dict(row) for row in parameters(cls)],
+            "state": state_fields(cls),
         }
 
 
@@ -248,6 +252,16 @@ def parameters(cls: type[Operator]) -> list[Mapping[str, Any]]:
     return rows
 
 
+def state_fields(cls: type[Operator]) -> list[dict[str, Any]]:
+    """One row per field of the state that the class declares: name, type, and whether a reset of the clock keeps it."""
+    state = cls.spec.state
+    if state is None:
+        return []
+    kept = {field.name for field in dataclasses.fields(state) if field.metadata.get("kept")}
+    types = {name: re.sub(r"(\w+\.)+", "", inspect.formatannotation(hint)) for name, hint in state_hints(state).items()}
+    return [{"name": name, "type": text, "kept": name in kept} for name, text in types.items()]
+
+
 def _type_text(info: FieldInfo) -> str:
     if _is_duration(info):
         return "duration"
@@ -295,7 +309,7 @@ def table(catalogue: Catalogue) -> RenderableType:
 
 
 def page(described: Described) -> RenderableType:
-    """One operator in full: doc, when it fires, ports and parameters."""
+    """One operator in full: doc, when it fires, ports, parameters and state."""
     cls, spec = described.operator, described.operator.spec
     parts: list[RenderableType] = [Text.assemble((spec.name, "bold"), "  ", (described.use, "cyan")), Text(spec.doc)]
     parts.append(Text(f"fires {fires(cls)}", "dim"))
@@ -317,6 +331,11 @@ def page(described: Described) -> RenderableType:
                 Text(default),
                 _notes(parameter_notes(row), row["doc"]),
             )
+        parts += [Text(), table]
+    if fields := state_fields(cls):
+        table = _table("state", "type", "")
+        for row in fields:
+            table.add_row(row["name"], Text(row["type"]), "kept by a reset of the clock" if row["kept"] else "")
         parts += [Text(), table]
     return Group(*parts)
 

@@ -1,6 +1,6 @@
 """Message types and their conventions, one module per family."""
 
-from dataflow.messages.base import Message, MessageError, array, message_type, message_types, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, message_type, message_types, scalar
 from dataflow.messages.camera import CameraInfo
 from dataflow.messages.clouds import Clusters, PointCloud
 from dataflow.messages.detection import Boxes3D, Detections2D, Keypoints2D, pack_masks
@@ -25,6 +25,7 @@ from dataflow.messages.values import Alarm, Measurement, Number, Switch, Text
 from dataflow.messages.wheels import JointState, WheelTicks
 
 __all__ = [
+    "ANCHOR",
     "Activity",
     "Alarm",
     "Boxes3D",

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from dataflow.messages.fields.compiled import Compiled, compile_class
 from dataflow.messages.fields.declared import (
+    ANCHOR,
     MISSING,
     SYMBOL,
     TAKEN,
@@ -35,6 +36,7 @@ from dataflow.messages.fields.declared import (
 )
 
 __all__ = [
+    "ANCHOR",
     "SYMBOL",
     "ArrayField",
     "Field",
@@ -44,8 +46,10 @@ __all__ = [
     "ScalarField",
     "ScalarKind",
     "array",
+    "complete",
     "import_type",
     "is_built_in",
+    "lacking",
     "message_type",
     "message_types",
     "registered_type",
@@ -107,6 +111,24 @@ def import_type(path: str, schema: str) -> type[Message]:
     return found
 
 
+class _NotGiven:
+    """Stands on the class for a field that a message was constructed without: reading it is an error."""
+
+    def __init__(self, name: str, filled: str) -> None:
+        self._name, self._filled = name, filled
+
+    def __get__(self, message: Message | None, owner: type[Message]) -> Any:
+        if message is None:
+            return self
+        raise MessageError(
+            f"{owner.SCHEMA} has no {self._name}: it is filled in with {self._filled} when process() returns the "
+            f"message; before that, and anywhere else, give {self._name}=..."
+        )
+
+
+_NO_STAMP: Any = _NotGiven("stamp", "the firing's stamp")
+
+
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(scalar, array))
 class _Declared:
     """Tells type checkers that the fields of a class below are the keywords of its constructor."""
@@ -117,6 +139,10 @@ class Message(_Declared):
 
     Every message has `stamp`: event time, integer nanoseconds since the epoch. Subclasses declare further fields with
     `scalar` and `array`; the schema name is the class name unless `schema="..."` is given as a class argument.
+
+    A message that `process()` returns may be constructed without its stamp and without a field declared
+    `default=ANCHOR`: they are filled in with the stamp of the firing and with the `frame` of the message that triggered
+    it. Until then, reading them, comparing, encoding and the digest raise `MessageError`.
     """
 
     SCHEMA: ClassVar[str] = ""
@@ -124,10 +150,12 @@ class Message(_Declared):
     SCALARS: ClassVar[tuple[ScalarField, ...]] = ()
     ARRAYS: ClassVar[tuple[ArrayField, ...]] = ()
     _names: ClassVar[frozenset[str]] = frozenset()
+    _filled: ClassVar[tuple[str, ...]] = ("stamp",)
+    """Names of what may be left out at construction."""
     _made: ClassVar[Compiled | None] = None
     """The functions made for this class, as soon as they are needed."""
 
-    stamp: int
+    stamp: int = _NO_STAMP
 
     def __init_subclass__(cls, schema: str | None = None, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -139,11 +167,15 @@ class Message(_Declared):
                 if name.startswith("_"):
                     raise MessageError(f"{cls.__name__}.{name}: the name of a field begins with a letter")
                 own.append(type(value)(name, *(getattr(value, s) for s in value.__slots__[1:])))
-                delattr(cls, name)
+                if getattr(value, "anchored", False):
+                    setattr(cls, name, _NotGiven(name, "the anchor's frame"))
+                else:
+                    delattr(cls, name)
         cls.FIELDS = (*cls.FIELDS, *own)
         cls.SCALARS = tuple(f for f in cls.FIELDS if isinstance(f, ScalarField))
         cls.ARRAYS = tuple(f for f in cls.FIELDS if isinstance(f, ArrayField))
         cls._names = frozenset(f.name for f in cls.FIELDS)
+        cls._filled = ("stamp", *(f.name for f in cls.SCALARS if f.anchored))
         cls.SCHEMA = schema or cls.__name__
         cls._made = None
         cls._register()
@@ -158,7 +190,7 @@ class Message(_Declared):
             )
         _registry[cls.SCHEMA] = cls
 
-    def __init__(self, *, stamp: int, **values: Any) -> None:
+    def __init__(self, *, stamp: int = MISSING, **values: Any) -> None:
         """Constructs a message from values of any accepted form. Raises `MessageError`.
 
         A class whose messages are constructed gets a compiled constructor, which falls back on this one.
@@ -167,7 +199,8 @@ class Message(_Declared):
         if cls._made is None:
             cls._compile()
         state = self.__dict__
-        state["stamp"] = canonical_stamp(cls.SCHEMA, stamp)
+        if stamp is not MISSING:
+            state["stamp"] = canonical_stamp(cls.SCHEMA, stamp)
         unknown = values.keys() - cls._names
         if unknown:
             raise MessageError(
@@ -175,7 +208,9 @@ class Message(_Declared):
                 f"its fields: stamp, {', '.join(f.name for f in cls.FIELDS)}"
             )
         for spec in cls.SCALARS:
-            state[spec.name] = scalar_value(cls.SCHEMA, spec, values.get(spec.name, MISSING))
+            value = values.get(spec.name, MISSING)
+            if value is not MISSING or not spec.anchored:
+                state[spec.name] = scalar_value(cls.SCHEMA, spec, value)
         extents: dict[str, tuple[int, str]] = {}
         for aspec in cls.ARRAYS:
             state[aspec.name] = array_value(cls.SCHEMA, aspec, values.get(aspec.name), extents)
@@ -264,14 +299,19 @@ class Message(_Declared):
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
-        values = {f.name: self.__dict__[f.name] for f in self.FIELDS}
-        return type(self)(**({"stamp": self.stamp} | values | changes))
+        return type(self)(**(self._given() | changes))
+
+    def _given(self) -> dict[str, Any]:
+        """The fields by name, the stamp first, without those that are not filled in yet."""
+        return {
+            name: self.__dict__[name] for name in ("stamp", *(f.name for f in self.FIELDS)) if name in self.__dict__
+        }
 
     def items(self) -> Iterator[tuple[str, Scalar | npt.NDArray[Any] | None]]:
         """(field name, value) of every field, the stamp first."""
         yield "stamp", self.stamp
         for f in self.FIELDS:
-            yield f.name, self.__dict__[f.name]
+            yield f.name, getattr(self, f.name)
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"{type(self).__name__} is immutable; use replace({name}=...)")
@@ -296,7 +336,7 @@ class Message(_Declared):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled by value and remade by the constructor, so that the arrays come back frozen."""
-        return _remake, (type(self), dict(self.items()))
+        return _remake, (type(self), self._given())
 
     def _picture(self) -> tuple[str, bytes] | None:
         """The message as a picture, (format, file), for people; None for types that have none."""
@@ -306,7 +346,7 @@ class Message(_Declared):
         """HTML for notebooks."""
         from dataflow.messages.display.text import message_html
 
-        return message_html(self.SCHEMA, self.items(), self._picture())
+        return message_html(self.SCHEMA, self._given().items(), self._picture())
 
     def _repr_png_(self) -> bytes | None:
         """A PNG file for notebooks, of messages that can be drawn."""
@@ -314,14 +354,25 @@ class Message(_Declared):
         return found[1] if found is not None and found[0] == "png" else None
 
     def __repr__(self) -> str:
-        words = [f"stamp={self.stamp}"]
-        for f in self.FIELDS:
-            value = self.__dict__[f.name]
+        words = []
+        for name, value in self._given().items():
             if isinstance(value, np.ndarray):
-                words.append(f"{f.name}={value.dtype}{list(value.shape)}")
+                words.append(f"{name}={value.dtype}{list(value.shape)}")
             elif value is not None:
-                words.append(f"{f.name}={value!r}")
+                words.append(f"{name}={value!r}")
         return f"{type(self).__name__}({', '.join(words)})"
+
+
+def lacking(message: Message) -> list[str]:
+    """Returns the names of what a message was constructed without and that is not filled in yet."""
+    state = message.__dict__
+    return [name for name in message._filled if name not in state]
+
+
+def complete(message: Message, stamp: int, frame: str) -> None:
+    """Fills in what a message was constructed without; once, before anything reads it."""
+    for name in lacking(message):
+        message.__dict__[name] = stamp if name == "stamp" else frame
 
 
 def _remake(cls: type[Message], values: dict[str, Any]) -> Message:

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from dataflow.messages.arrays import F64
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import finite, positive
 
 COEFFICIENTS: dict[str, tuple[int, ...]] = {
@@ -27,7 +27,7 @@ class CameraInfo(Message):
     k3, k4, k5, k6[, ...]), `equidistant` (fisheye, k1..k4), and `none`.
     """
 
-    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
     width: int = scalar("int", "columns of the image that `K` belongs to, pixels")
     height: int = scalar("int", "rows of the image that `K` belongs to, pixels")
     distortion_model: str = scalar("str", "name of the lens model, `none` for an ideal pinhole", default="none")

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.arrays import F32, F64, I32, I64, U8, U16
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import within_length
 from dataflow.messages.display import pictures
 from dataflow.messages.display.pictures import Picture
@@ -15,7 +15,7 @@ from dataflow.messages.display.pictures import Picture
 class PointCloud(Message):
     """Points from a lidar, a depth camera or a map."""
 
-    frame: str = scalar("str", "frame of the points")
+    frame: str = scalar("str", "frame of the points", default=ANCHOR)
     points: F32 = array("float32", "N 3", "x, y, z of each point; NaN where there was no return", unit="m")
     colors: U8 | None = array("uint8", "N 3", "RGB of each point", default=None)
     intensities: F32 | None = array("float32", "N", "strength of the return, in the sensor's own scale", default=None)
@@ -52,7 +52,7 @@ class PointCloud(Message):
 class Clusters(Message):
     """A partition of a point cloud into clusters: the cloud of the same stamp, or the one the operator documents."""
 
-    frame: str = scalar("str", "frame of the centroids and bounds")
+    frame: str = scalar("str", "frame of the centroids and bounds", default=ANCHOR)
     labels: I32 = array("int32", "P", "cluster of each point of the cloud, -1 for none")
     centroids: F64 = array("float64", "N 3", "mean of each cluster's points", unit="m")
     lower: F64 | None = array("float64", "N 3", "smallest x, y, z of each cluster", unit="m", default=None)

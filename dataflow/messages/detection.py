@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.arrays import F32, F64, I32, I64, U8
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import (
     ordered_boxes,
     parallel,
@@ -21,7 +21,7 @@ from dataflow.messages.checks import (
 class Detections2D(Message):
     """Objects found in one image."""
 
-    frame: str = scalar("str", "optical frame of the camera")
+    frame: str = scalar("str", "optical frame of the camera", default=ANCHOR)
     width: int = scalar("int", "columns of the image, pixels")
     height: int = scalar("int", "rows of the image, pixels")
     class_names: tuple[str, ...] = scalar(
@@ -71,7 +71,7 @@ class Detections2D(Message):
 class Keypoints2D(Message):
     """Named points of objects in one image, such as the joints of people."""
 
-    frame: str = scalar("str", "optical frame of the camera")
+    frame: str = scalar("str", "optical frame of the camera", default=ANCHOR)
     width: int = scalar("int", "columns of the image, pixels")
     height: int = scalar("int", "rows of the image, pixels")
     names: tuple[str, ...] = scalar("strs", "name of each point of an object, or empty", default=())
@@ -103,7 +103,7 @@ class Keypoints2D(Message):
 class Boxes3D(Message):
     """Objects found in space, as oriented boxes."""
 
-    frame: str = scalar("str", "frame of the boxes")
+    frame: str = scalar("str", "frame of the boxes", default=ANCHOR)
     class_names: tuple[str, ...] = scalar(
         "strs", "name of each class, indexed by class id; empty where they have no names", default=()
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dataflow.messages.arrays import F32, U8, U16
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import finite, not_empty, positive
 from dataflow.messages.display import pictures
 from dataflow.messages.display.pictures import Picture
@@ -19,7 +19,7 @@ START_CODES = (b"\0\0\1", b"\0\0\0\1")
 class Image(Message):
     """A colour or grey image, as the camera's optical frame sees it; stamped at the middle of its exposure."""
 
-    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
     data: U8 = array("uint8", "H W 3|H W", "RGB pixels, or one grey channel; row 0 is the top; at least one pixel")
 
     def validate(self) -> None:
@@ -48,7 +48,7 @@ class Image16(Message):
     """A colour or grey image of 16 bits a channel, of thermal and scientific cameras; values in the camera's own
     scale."""
 
-    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
     data: U16 = array("uint16", "H W 3|H W", "RGB pixels, or one grey channel; row 0 is the top; at least one pixel")
 
     def validate(self) -> None:
@@ -71,7 +71,7 @@ class Image16(Message):
 class CompressedImage(Message):
     """A colour or grey image as an encoded file."""
 
-    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
     format: str = scalar("str", "how the bytes are encoded", choices=FORMATS)
     data: U8 = array("uint8", "N", "the bytes of the encoded file")
 
@@ -95,7 +95,7 @@ class CompressedVideo(Message):
     key frame comes with its parameter sets (SPS, PPS; VPS), so that decoding can begin with it.
     """
 
-    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
     format: str = scalar("str", "how the stream is encoded", choices=VIDEO_FORMATS)
     data: U8 = array("uint8", "N", "NAL units of one picture, each after a start code")
 
@@ -111,7 +111,7 @@ class CompressedVideo(Message):
 class DepthImage(Message):
     """Distance along the optical axis (z, not range) per pixel."""
 
-    frame: str = scalar("str", "optical frame of the depth camera (z forward, x right, y down)")
+    frame: str = scalar("str", "optical frame of the depth camera (z forward, x right, y down)", default=ANCHOR)
     data: F32 = array("float32", "H W", "depth; 0 or NaN where there was no return; at least one pixel", unit="m")
 
     def validate(self) -> None:
@@ -134,7 +134,7 @@ class DepthImage(Message):
 class RelativeDepth(Message):
     """Nearness per pixel: inverse depth up to an unknown factor and constant, as estimated from one image."""
 
-    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
     data: F32 = array(
         "float32",
         "H W",
@@ -167,7 +167,7 @@ class CompressedDepth(Message):
     depth, as ROS's `compressedDepth` has them: scale is its quantisation parameter A, offset its B).
     """
 
-    frame: str = scalar("str", "optical frame of the depth camera (z forward, x right, y down)")
+    frame: str = scalar("str", "optical frame of the depth camera (z forward, x right, y down)", default=ANCHOR)
     quantizer: str = scalar("str", "how pixel values relate to depth", default="linear", choices=("linear", "inverse"))
     scale: float = scalar("float", "metres per unit (linear), or metres times units (inverse); above 0")
     offset: float = scalar("float", "metres (linear), or units (inverse)", default=0.0)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataflow.messages.arrays import F64
-from dataflow.messages.base import Message, array, scalar
+from dataflow.messages.base import ANCHOR, Message, array, scalar
 from dataflow.messages.checks import unit_quaternions
 
 
 class Imu(Message):
     """One sample of an inertial measurement unit; REP 145's conventions."""
 
-    frame: str = scalar("str", "frame of the sensor, in which the vectors are expressed")
+    frame: str = scalar("str", "frame of the sensor, in which the vectors are expressed", default=ANCHOR)
     temperature: float | None = scalar("float", "of the sensor, degrees Celsius", default=None)
     angular_velocity: F64 = array("float64", "3", "gyroscope reading", unit="rad/s")
     linear_acceleration: F64 = array(
@@ -37,6 +37,6 @@ class Imu(Message):
 class MagneticField(Message):
     """One sample of a magnetometer."""
 
-    frame: str = scalar("str", "frame of the sensor, in which the vector is expressed")
+    frame: str = scalar("str", "frame of the sensor, in which the vector is expressed", default=ANCHOR)
     field: F64 = array("float64", "3", "magnetic flux density; NaN on an axis that is not measured", unit="T")
     covariance: F64 | None = array("float64", "3 3", "of the field", unit="T²", default=None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataflow.messages.arrays import F32, F64, I8, I32, I64, U8, U32
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import (
     positive,
     together,
@@ -62,7 +62,7 @@ class Mesh(Message):
 class Planes(Message):
     """Planes found in a cloud: walls, floors, table tops. A point p lies on plane i where n·p + d = 0."""
 
-    frame: str = scalar("str", "frame of the planes")
+    frame: str = scalar("str", "frame of the planes", default=ANCHOR)
     coefficients: F64 = array("float64", "N 4", "(nx, ny, nz, d), n of unit length", unit="m (d)")
     centers: F64 | None = array(
         "float64", "N 3", "middle of the part of each plane that was seen", unit="m", default=None

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.arrays import F64, I64
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import finite, parallel, unit_quaternions, within
+from dataflow.messages.fields.declared import MISSING
 from dataflow.messages.geometry import split_matrix, transform_matrix
 
 COVARIANCE_TYPES = ("unknown", "approximated", "diagonal_known", "known")
@@ -35,7 +36,7 @@ class Pose(Message):
         cls,
         matrix: npt.ArrayLike,
         *,
-        stamp: int,
+        stamp: int = MISSING,
         frame: str,
         child_frame: str = "",
         covariance: npt.ArrayLike | None = None,
@@ -59,7 +60,7 @@ class Pose(Message):
 class Point(Message):
     """One place: an obstacle, a clicked point, a corner that was found."""
 
-    frame: str = scalar("str", "frame in which the position is expressed")
+    frame: str = scalar("str", "frame in which the position is expressed", default=ANCHOR)
     position: F64 = array("float64", "3", "the place in `frame`", unit="m")
     covariance: F64 | None = array("float64", "3 3", "of the position, in `frame`", unit="m²", default=None)
 
@@ -89,7 +90,7 @@ class Transforms(Message):
                 raise MessageError(f"Transforms.child_frames: {child!r} must differ from its parent frame")
 
     @classmethod
-    def from_matrix(cls, matrix: npt.ArrayLike, *, stamp: int, frame: str, child_frame: str) -> Self:
+    def from_matrix(cls, matrix: npt.ArrayLike, *, stamp: int = MISSING, frame: str, child_frame: str) -> Self:
         """One transform, from a rigid transform `T_frame_child` (4, 4)."""
         translation, rotation = split_matrix(matrix)
         return cls(
@@ -143,7 +144,7 @@ class Odometry(Message):
         cls,
         matrix: npt.ArrayLike,
         *,
-        stamp: int,
+        stamp: int = MISSING,
         frame: str,
         child_frame: str,
         linear: npt.ArrayLike | None = None,
@@ -211,7 +212,7 @@ class NavSatFix(Message):
     """A position from a satellite receiver, WGS 84. Latitude and longitude are in degrees, as receivers give them: the
     one exception to radians."""
 
-    frame: str = scalar("str", "frame of the antenna")
+    frame: str = scalar("str", "frame of the antenna", default=ANCHOR)
     status: str = scalar("str", "kind of fix", default="fix", choices=FIX_STATUSES)
     latitude: float = scalar("float", "degrees north, [-90, 90]; NaN without a fix")
     longitude: float = scalar("float", "degrees east, [-180, 180]; NaN without a fix")

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.arrays import F32, I64
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import finite
 
 
@@ -17,7 +17,7 @@ class LaserScan(Message):
     `angle_max < angle_min`.
     """
 
-    frame: str = scalar("str", "frame of the scanner")
+    frame: str = scalar("str", "frame of the scanner", default=ANCHOR)
     angle_min: float = scalar("float", "direction of the first beam, radians")
     angle_max: float = scalar("float", "direction of the last beam, radians")
     range_min: float = scalar("float", "nearest range that counts, metres", default=0.0)
@@ -54,7 +54,7 @@ class LaserScan(Message):
 class RangeReading(Message):
     """One distance along the x axis of an ultrasonic or infrared sensor, of what is nearest in its cone."""
 
-    frame: str = scalar("str", "frame of the sensor (x along its axis)")
+    frame: str = scalar("str", "frame of the sensor (x along its axis)", default=ANCHOR)
     range: float = scalar("float", "distance, metres; -inf: nearer than it can measure, inf: nothing in reach")
     range_min: float = scalar("float", "nearest range that counts, metres", default=0.0)
     range_max: float = scalar("float", "farthest range that counts, metres; may be infinite", default=float("inf"))
@@ -66,7 +66,7 @@ class RangeReading(Message):
 class RadarScan(Message):
     """Detections of one radar cycle, in polar coordinates about the sensor."""
 
-    frame: str = scalar("str", "frame of the radar (x forward, y left, z up)")
+    frame: str = scalar("str", "frame of the radar (x forward, y left, z up)", default=ANCHOR)
     ranges: F32 = array("float32", "N", "distance", unit="m")
     azimuths: F32 = array("float32", "N", "angle from x towards y", unit="rad")
     elevations: F32 | None = array(

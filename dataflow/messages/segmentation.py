@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataflow.messages.arrays import F32, I32, U8, U16
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import not_empty, within
 from dataflow.messages.display import pictures
 from dataflow.messages.display.pictures import Picture
@@ -12,7 +12,7 @@ from dataflow.messages.display.pictures import Picture
 class SegmentationMap(Message):
     """Class of every pixel of an image (semantic), and its instance where known (panoptic)."""
 
-    frame: str = scalar("str", "optical frame of the camera")
+    frame: str = scalar("str", "optical frame of the camera", default=ANCHOR)
     class_names: tuple[str, ...] = scalar(
         "strs", "name of each class, indexed by class id; empty where they have no names", default=()
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from dataflow.messages.arrays import F32, F64, I32, I64, U8
-from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import (
     ordered_boxes,
     positive,
@@ -35,7 +35,9 @@ class Tracks(Message):
     """Objects followed over time, in the image (`boxes`), in space (`positions`), or both."""
 
     frame: str = scalar(
-        "str", "frame of positions and velocities; the camera's optical frame where there are only boxes"
+        "str",
+        "frame of positions and velocities; the camera's optical frame where there are only boxes",
+        default=ANCHOR,
     )
     width: int | None = scalar("int", "columns of the image that `boxes` lie in, pixels", default=None)
     height: int | None = scalar("int", "rows of the image that `boxes` lie in, pixels", default=None)
@@ -99,7 +101,7 @@ class LandmarkSightings(Message):
     Either polar (`ranges`, `bearings`, or both; `elevations` with bearings) or Cartesian (`positions`).
     """
 
-    frame: str = scalar("str", "frame of the sensor")
+    frame: str = scalar("str", "frame of the sensor", default=ANCHOR)
     family: str = scalar("str", "kind of landmark, such as a tag family; empty where there is only one", default="")
     ids: I64 = array("int64", "N", "identity of each landmark, -1 where unknown")
     ranges: F64 | None = array("float64", "N", "distance", unit="m", default=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from dataflow.messages.base import Message, scalar
+from dataflow.messages.base import ANCHOR, Message, scalar
 
 ALARM_LEVELS: Final = ("debug", "info", "warning", "error", "fatal")
 
@@ -19,7 +19,7 @@ class Number(Message):
 class Measurement(Message):
     """One number that a sensor at a place has measured: a temperature, a pressure, an illuminance."""
 
-    frame: str = scalar("str", "frame of the sensor")
+    frame: str = scalar("str", "frame of the sensor", default=ANCHOR)
     value: float = scalar("float", "the number, in `unit`; NaN where it could not be measured")
     unit: str = scalar("str", "its unit, such as `°C`, `Pa` or `lx`; empty for a ratio", default="")
     variance: float | None = scalar(

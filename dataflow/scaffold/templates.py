@@ -32,12 +32,13 @@ class $Class(Operator):
     state: State
 
     def process(self, image: Image) -> Number:
-        """Called for each image, in the order of their timestamps. Returns a message, or None for nothing."""
+        """Called for each image, in the order of their timestamps. Returns a message, which gets the image's timestamp,
+        or None for nothing."""
         value = self.scale * float(image.data.mean()) / 255
         if value < self.state.darkest:
             self.state.darkest = value
             self.log.info("darkest so far: %.3f", value)
-        return Number(stamp=image.stamp, value=value)
+        return Number(value=value)
 
     def summary(self) -> dict[str, float]:
         """Figures that `dataflow run` prints at the end."""
@@ -85,7 +86,7 @@ TIMER = Template('''\
 from __future__ import annotations
 
 from dataflow.messages import Image, Number
-from dataflow.operator import Batch, Context, Operator, Out
+from dataflow.operator import Batch, Operator, Out
 
 
 class $Class(Operator, every="500ms"):
@@ -96,9 +97,9 @@ class $Class(Operator, every="500ms"):
     image: Batch[Image] = Batch(doc="all images since the last tick")
     rate: Out[Number] = Out(doc="images a second")
 
-    def process(self, image: tuple[Image, ...], context: Context) -> Number:
-        """Called at each tick, also when no image came."""
-        return Number(stamp=context.stamp, value=len(image) / 0.5, unit="Hz")
+    def process(self, image: tuple[Image, ...]) -> Number:
+        """Called at each tick, also when no image came. The result gets the tick's timestamp."""
+        return Number(value=len(image) / 0.5, unit="Hz")
 ''')
 
 TIMER_TEST = Template('''\

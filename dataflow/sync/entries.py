@@ -6,7 +6,7 @@ times as much.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -46,6 +46,19 @@ class Entry:
 
 InputValue = Entry | None | tuple[Entry, ...] | Mapping[str, Entry]
 """An entry or None; of a Batch a tuple; of a `many` trigger or Sampled a map from stream to entry."""
+
+
+def entries_of(given: InputValue) -> Sequence[Entry]:
+    """All entries an input was given, in the order `process()` sees them."""
+    match given:
+        case None:
+            return ()
+        case Entry():
+            return (given,)
+        case Mapping():
+            return tuple(given.values())
+        case _:
+            return given
 
 
 @dataclass(slots=True)

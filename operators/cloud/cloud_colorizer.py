@@ -65,7 +65,7 @@ class CloudColorizer(Operator):
         colors = np.repeat(colors, 3, axis=1) if colors.shape[1] == 1 else colors
         colors[~seen.seen] = 0
         kept = seen.seen if self.seen_only else np.ones(cloud.count, np.bool_)
-        colored = cloud.replace(colors=colors, stamp=cloud.stamp)
+        colored = cloud.replace(colors=colors)
         if self.seen_only:
             fields = ("points", "colors", "intensities", "rings", "time_offsets", "normals")
             colored = colored.replace(
@@ -91,8 +91,6 @@ def _labels(colored: PointCloud, classes: SegmentationMap, seen: Sight, kept: ND
     empty = np.zeros((0, 3))
     members = [points[labels == k] for k in range(len(ids))]
     return Clusters(
-        stamp=colored.stamp,
-        frame=colored.frame,
         labels=labels,
         centroids=np.array([m.mean(axis=0) for m in members]) if members else empty,
         lower=np.array([m.min(axis=0) for m in members]) if members else empty,

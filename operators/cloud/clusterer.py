@@ -99,8 +99,8 @@ class Clusterer(Operator):
             counts | {"clouds": 1, "clouds without clusters": not shapes, "poses not finite": lost}
         )
         return {
-            "clusters": _clusters(cloud, labels, shapes),
-            "boxes": _boxes(cloud, sizes, shapes),
+            "clusters": _clusters(labels, shapes),
+            "boxes": _boxes(sizes, shapes),
             "features": _features(cloud, shapes),
             "status": _status(cloud.stamp, counts, lost),
         }
@@ -121,10 +121,8 @@ class Clusterer(Operator):
         return kept(labels, sizes, self.min_points, self.max_points)
 
 
-def _clusters(cloud: PointCloud, labels: NDArray[np.int32], shapes: list[Shape]) -> Clusters:
+def _clusters(labels: NDArray[np.int32], shapes: list[Shape]) -> Clusters:
     return Clusters(
-        stamp=cloud.stamp,
-        frame=cloud.frame,
         labels=labels,
         centroids=_rows([s.centroid for s in shapes], 3),
         lower=_rows([s.lower for s in shapes], 3),
@@ -132,10 +130,8 @@ def _clusters(cloud: PointCloud, labels: NDArray[np.int32], shapes: list[Shape])
     )
 
 
-def _boxes(cloud: PointCloud, sizes: NDArray[np.int64], shapes: list[Shape]) -> Boxes3D:
+def _boxes(sizes: NDArray[np.int64], shapes: list[Shape]) -> Boxes3D:
     return Boxes3D(
-        stamp=cloud.stamp,
-        frame=cloud.frame,
         class_names=("cluster",),
         centers=_rows([s.T[:3, 3] for s in shapes], 3),
         sizes=_rows([s.size for s in shapes], 3),

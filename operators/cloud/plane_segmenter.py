@@ -140,10 +140,9 @@ class PlaneSegmenter(Operator):
             {name: found[name] for name in SURFACES} | {"clouds": 1, "clouds without": not surfaces}
         )
         self.state.counts["poses not finite"] += lost
-        boxes = _boxes(cloud, surfaces, labels)
         return {
-            "planes": _planes(cloud, surfaces, labels),
-            "surfaces": boxes,
+            "planes": _planes(surfaces, labels),
+            "surfaces": _boxes(cloud, surfaces, labels),
             "rest": _without(cloud, named[labels]),
             "status": _status(cloud, found, self.state.floor is not None, lost),
         }
@@ -185,10 +184,8 @@ def _turned(up: Array) -> Array:
     return np.stack([x, y, up])
 
 
-def _planes(cloud: PointCloud, surfaces: list[Surface], labels: Labels) -> Planes:
+def _planes(surfaces: list[Surface], labels: Labels) -> Planes:
     return Planes(
-        stamp=cloud.stamp,
-        frame=cloud.frame,
         coefficients=_rows([[*s.plane.normal, s.plane.d] for s in surfaces], 4),
         centers=_rows([s.seen.T[:3, 3] for s in surfaces], 3),
         orientations=_orientations(surfaces),

@@ -52,7 +52,7 @@ class VideoDecoder(Operator):
                 self.log.warning("pictures are lost until the next key frame: %s", decoder.lost)
             return {"status": self._status(video.stamp, decoder.lost)}
         self._counts["decoded"] += 1
-        made: dict[str, Message] = {"image": Image(stamp=video.stamp, frame=video.frame, data=pixels)}
+        made: dict[str, Message] = {"image": Image(data=pixels)}
         if was_lost:
             made["status"] = self._status(video.stamp, "")
         return made

@@ -117,9 +117,8 @@ class MonoDepth(Operator):
             self.state.counts.update({"images": 1, "images with a scale": 1})
             near = np.where(np.isfinite(nearness) & (nearness > 0) & (nearness <= self.max_range), nearness, 0)
             status = counted_status("mono_depth", image.stamp, "the model gives metres", Level.OK, counts)
-            metres = DepthImage(stamp=image.stamp, frame=image.frame, data=near.astype(np.float32))
-            return {"depth": metres, "status": status}
-        messages: dict[str, Any] = {"relative": RelativeDepth(stamp=image.stamp, frame=image.frame, data=nearness)}
+            return {"depth": DepthImage(data=near.astype(np.float32)), "status": status}
+        messages: dict[str, Any] = {"relative": RelativeDepth(data=nearness)}
         scaling, text, level = None, "no metric depth is given: relative only", Level.OK
         if sparse is not None:
             scaling, counts = self._scaling(nearness, sparse)
@@ -128,7 +127,7 @@ class MonoDepth(Operator):
             else:
                 text = f"1/depth is {scaling.scale:.3g} of nearness and {scaling.shift:+.3g} 1/m"
                 depth = scaling.depth(nearness, self.max_range)
-                messages["depth"] = DepthImage(stamp=image.stamp, frame=image.frame, data=depth)
+                messages["depth"] = DepthImage(data=depth)
         self.state.counts.update(
             {"images": 1, "images with a scale": int(scaling is not None), "images without": int(level is Level.WARN)}
         )

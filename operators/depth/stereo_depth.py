@@ -103,7 +103,7 @@ class StereoDepth(Operator):
         self.state.counts.update(counts | {"pairs": 1, "blind pairs": int(blind)})
         data = np.where(kept, z, 0).astype(np.float32)
         return {
-            "depth": DepthImage(stamp=left.stamp, frame=left.frame, data=data),
+            "depth": DepthImage(data=data),
             "status": _status(left, right, counts, blind),
         }
 

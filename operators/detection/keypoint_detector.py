@@ -75,8 +75,6 @@ class KeypointDetector(Operator):
         points, scores = self._points(image, cuts)
         known = points.shape[1] == len(COCO_KEYPOINTS)
         return Keypoints2D(
-            stamp=image.stamp,
-            frame=image.frame,
             width=image.width,
             height=image.height,
             names=COCO_KEYPOINTS if known else (),

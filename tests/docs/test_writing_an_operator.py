@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dataflow.graph import GraphError, load_text
-from dataflow.messages import Pose
+from dataflow.messages import Number, Odometry, Point
 from dataflow.testing import play
 from operators.cloud import CloudBuilder
 from operators.sources import SyntheticRgbd
@@ -61,6 +61,28 @@ def test_its_operator_works_in_that_chain(my_robot: Any) -> None:
     cloud = play(CloudBuilder(stride=4), {port: camera[port] for port in ("depth", "image", *infos)}, static=infos)
     nearest = play(my_robot.NearestObstacle(min_range=0.3), {"cloud": cloud["cloud"]})["nearest"]
     assert len(nearest) == 3
-    for pose in nearest:
-        assert isinstance(pose, Pose)
-        assert 0.3 < float((pose.position**2).sum() ** 0.5) < 2.5  # the table stands within reach of the whole path
+    for point in nearest:
+        assert isinstance(point, Point)
+        assert point.frame == cloud["cloud"][0].frame  # type: ignore[attr-defined]
+        assert 0.3 < float((point.position**2).sum() ** 0.5) < 2.5  # the table stands within reach of the whole path
+
+
+def test_its_first_step_needs_neither_stamp_nor_state(blocks: Blocks) -> None:
+    first, *later = (code for code in blocks["python"] if code.startswith("# file:"))
+    for word in ("stamp", "frame", "state", "context", "Sampled", "Batch", "every"):
+        assert word not in first, word
+    assert [step for step, word in enumerate(("state", "Sampled", "context"), 2) if word not in later[step - 2]] == []
+
+
+def test_its_later_steps_work(my_robot: Any) -> None:
+    second = 1_000_000_000
+    points = [Point(stamp=k * second // 2, frame="lidar", position=[0, 3, 0]) for k in range(1, 6)]
+    averaged = play(my_robot.MovingAverage(), {"value": [Number(stamp=k, value=k) for k in (1, 2, 3)]})["mean"]
+    assert [(n.stamp, n.value) for n in averaged] == [(1, 1.0), (2, 1.5), (3, 2.0)]
+    still = {"frame": "odom", "child_frame": "base", "position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
+    odometry = [Odometry(stamp=second - 1, linear=[1.5, 0, 0], **still), Odometry(stamp=2 * second, **still)]
+    contact = play(my_robot.TimeToContact(), {"nearest": points, "odometry": odometry})
+    assert [(n.stamp, n.value) for n in contact["contact"]] == [(second, 2.0)]
+    assert set(contact.drops) == {("nearest", "no_sample"), ("nearest", "stale")}
+    ages = play(my_robot.ObstacleAge(), {"nearest": points})["age"]
+    assert [(n.stamp, n.value) for n in ages] == [(second, 0.0), (2 * second, 0.0)]

@@ -7,7 +7,10 @@ import importlib
 import io
 import json
 import pkgutil
+import re
 import sys
+from collections import Counter
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import graph_operators
@@ -16,7 +19,8 @@ from rich.console import Console, RenderableType
 
 from dataflow.graph.catalogue import BUILT_IN, Described, discover, find, look_up, page, parameters, table
 from dataflow.graph.lookup import is_concrete
-from dataflow.operator import Operator
+from dataflow.messages import Number
+from dataflow.operator import KEPT, In, Operator
 
 
 def shown(renderable: RenderableType) -> str:
@@ -118,6 +122,37 @@ def test_details_show_everything_declared() -> None:
     text = shown(page(Described("graph_operators:Detector", graph_operators.Detector)))
     assert "must be given" in text
     assert "list[str]" in text
+
+
+@dataclass
+class Seen:
+    last: Number | None = None
+    ages: dict[int, list[float]] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter, metadata=KEPT)
+
+
+class Watching(Operator):
+    number: In[Number]
+    state: Seen
+
+    def process(self, number: Number) -> None: ...
+
+
+class WatchingMore(Watching):
+    """Inherits its state."""
+
+
+def test_the_fields_of_a_declared_state_are_shown_with_their_types() -> None:
+    for cls in (Watching, WatchingMore):
+        assert Described("x:Watching", cls).to_json()["state"] == [
+            {"name": "last", "type": "Number | None", "kept": False},
+            {"name": "ages", "type": "dict[int, list[float]]", "kept": False},
+            {"name": "counts", "type": "Counter[str]", "kept": True},
+        ]
+        text = shown(page(Described("x:Watching", cls)))
+        assert re.search(r"ages +dict\[int, list\[float\]\]", text)
+        assert re.search(r"counts +Counter\[str\] +kept by a reset of the clock", text)
+    assert Described("x:Mapper", graph_operators.Mapper).to_json()["state"] == []
 
 
 def test_one_operator_is_looked_up_by_name_or_path_with_the_errors_of_the_whole_catalogue() -> None:

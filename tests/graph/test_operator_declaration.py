@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
+from pathlib import Path
+from typing import TypedDict
+
 import pytest
 
 from dataflow.messages import Image, PointCloud, Pose
 from dataflow.operator import Batch, In, Operator, OperatorDefinitionError, Out, Param, Sampled, Source
 
+
+class Found(TypedDict, total=False):
+    pose: Pose | None
+
+
 NAMES = {
     **{cls.__name__: cls for cls in (Batch, In, Operator, Out, Sampled, Source, Image, PointCloud, Pose)},
+    "Found": Found,
     "Param": Param,
     "__name__": __name__,
 }
@@ -113,6 +124,21 @@ P = "\n    def process(self, image):\n        return None\n"
             "    image: In[Image]\n    def process(self, image) -> Image:\n        pass\n",
             "X.process: returns one message, but has 0 outputs (none): return a mapping",
         ),
+        (
+            "Operator",
+            "    image: In[Image]\n    out: Out[Pose]\n    def process(self, image) -> Found | None:\n        pass\n",
+            "X.process: returns 'pose', which is no output; outputs: out",
+        ),
+        (
+            "Operator",
+            "    image: In[Image]\n    pose: Out[Image]\n    def process(self, image) -> Found:\n        pass\n",
+            "X.process: returns Pose, but pose emits Image",
+        ),
+        (
+            "Operator",
+            "    image: In[Image]\n    out: Out[Pose]" + P + "    def finish(self) -> Image:\n        pass\n",
+            "X.finish: returns Image, but out emits Pose",
+        ),
         ("Source", "    image: In[Image]\n    out: Out[Image]\n", "X.image: a source has no inputs"),
         ("Source", "    gain: int = Param(1, doc='g')\n", "X.(outputs): a source needs at least one Out[...]"),
     ],
@@ -123,6 +149,15 @@ def test_a_faulty_declaration_names_the_attribute(head: str, body: str, said: st
         exec(code, dict(NAMES))
 
     assert said in str(caught.value)
+
+
+def test_wrong_returns_are_left_to_the_type_checker_of_the_project(repository: Path) -> None:
+    """It reports each ignored mistake of the file that it does not find."""
+    settings = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]
+    assert settings["strict"]
+    assert "tests/support/typed_returns.py" in settings["files"]
+    text = (repository / "tests/support/typed_returns.py").read_text(encoding="utf-8")
+    assert len(re.findall(r"# type: ignore\[[\w-]+\]$", text, re.MULTILINE)) == 5
 
 
 def test_a_subclass_inherits_ports_and_timing_and_adds_its_own() -> None:

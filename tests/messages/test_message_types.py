@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import operator
 import re
 
 import numpy as np
@@ -13,6 +14,7 @@ from messages_page import families
 import dataflow.messages
 from dataflow.messages import Message, MessageError
 from dataflow.messages.base import ArrayField, ScalarField
+from dataflow.recording.streams.codecs import codec_for
 
 TYPES = [cls for classes in families().values() for cls in classes]
 EXAMPLES = [(cls, seed) for cls in TYPES for seed in range(8)]
@@ -93,11 +95,19 @@ def test_a_missing_or_unknown_field_is_named() -> None:
         values = dict(example(cls, 0).items())
         with pytest.raises(MessageError, match=rf"{cls.SCHEMA} has no field 'nonsense'; its fields: stamp, "):
             cls(**values, nonsense=1)
-        required = [f.name for f in cls.FIELDS if f.required]
+        anchored = [f.name for f in cls.SCALARS if f.anchored]
+        required = [f.name for f in cls.FIELDS if f.required and f.name not in anchored]
         assert required, "a message without a required field says nothing"
         for name in required:
             with pytest.raises(MessageError, match=rf"{cls.SCHEMA}\.{name} is required"):
                 cls(**{k: v for k, v in values.items() if k != name})
+        for name in ("stamp", *anchored):
+            incomplete = cls(**{k: v for k, v in values.items() if k != name})
+            assert re.search(rf"\b{name}=", repr(incomplete)) is None
+            uses = (operator.attrgetter(name), Message.digest, codec_for(cls).encode, cls.compiled().content)
+            for use in uses[: 3 if name == "stamp" else 4]:  # the content is without the stamp
+                with pytest.raises(MessageError, match=rf"{cls.SCHEMA} has no {name}: .* give {name}="):
+                    use(incomplete)
 
 
 def test_an_array_of_the_wrong_rank_is_named() -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dataflow.messages import FeatureVector, Message
+from dataflow.messages import FeatureVector, Image, Message, Point
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 
 
@@ -72,6 +72,21 @@ class Counter(Source):
 
     def length(self) -> int:
         return self.count
+
+
+class Corner(Operator):
+    """Emits a pixel as a point, with and without stamp and frame."""
+
+    image: In[Image]
+    told: Out[Point]
+    left_out: Out[Point]
+
+    def process(self, image: Image) -> Mapping[str, Message]:
+        position = [float(image.data[0, 0].sum()), 0, 0]
+        return {
+            "told": Point(stamp=image.stamp, frame=image.frame, position=position),
+            "left_out": Point(position=position),
+        }
 
 
 class Mix(Operator, tolerance="3ms"):

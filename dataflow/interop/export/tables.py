@@ -50,7 +50,7 @@ def row_of(message: Message, columns: Mapping[str, Sequence[str]]) -> dict[str, 
     """The values of a message by column; None for fields without a value."""
     row: dict[str, Any] = {"stamp": message.stamp}
     for name, names in columns.items():
-        value = message.__dict__[name]
+        value = getattr(message, name)
         if len(names) == 1 and not isinstance(value, np.ndarray):
             row[names[0]] = "; ".join(value) if isinstance(value, tuple) else value
         else:

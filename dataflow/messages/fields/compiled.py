@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dataflow.messages.fields.compiled_digest import content_text, digest_text
+from dataflow.messages.fields.compiled_digest import content_text, digest_text, value_text
 from dataflow.messages.fields.declared import (
     INT64_MAX,
     INT64_MIN,
@@ -90,7 +90,7 @@ def compile_class(
         *digest_text(names, schema, scalars, arrays),
         "def _header(_self):",
         "    _state = _self.__dict__",
-        f"    return ({''.join(f'_state[{f.name!r}], ' for f in scalars)})",
+        f"    return ({''.join(f'{value_text(f)}, ' for f in scalars)})",
         "def _arrays(_self):",
         "    _state = _self.__dict__",
         f"    return ({''.join(f'_state[{f.name!r}], ' for f in arrays)})",
@@ -113,22 +113,27 @@ def _construct(
         taken.append(f"{spec.name}=_default{k}, ")
     taken += [f"{f.name}=None, " for f in arrays]
     fields: tuple[Field, ...] = (*scalars, *arrays)
-    given = "".join(f", {f.name}={f.name}" for f in fields)
+    passed = "".join(f", {f.name}={f.name}" for f in fields)
     text = [
-        f"def _construct(_self, *, stamp, {''.join(taken)}**_unknown):",
+        f"def _construct(_self, *, stamp=_missing, {''.join(taken)}**_unknown):",
         "    if _self.__class__ is not _cls or _unknown:",
-        f"        return _general(_self, stamp=stamp{given}, **_unknown)",
+        f"        return _general(_self, stamp=stamp{passed}, **_unknown)",
     ]
     if arrays:
         text += [
             f"    if not ({_fit(names, arrays, [f.name for f in arrays])}):",
-            f"        return _general(_self, stamp=stamp{given})",
+            f"        return _general(_self, stamp=stamp{passed})",
         ]
     text += [
         "    _state = _self.__dict__",
-        "    _state['stamp'] = stamp if stamp.__class__ is _int and _min < stamp < _max else _stamp(_schema, stamp)",
-        *(f"    _state[{f.name!r}] = {_canonical(names, k, f, f.name)}" for k, f in enumerate(scalars)),
+        "    if stamp.__class__ is _int and _min < stamp < _max:",
+        "        _state['stamp'] = stamp",
+        "    elif stamp is not _missing:",
+        "        _state['stamp'] = _stamp(_schema, stamp)",
     ]
+    for k, spec in enumerate(scalars):
+        given = f"    if {spec.name} is not _missing: " if spec.anchored else "    "
+        text.append(f"{given}_state[{spec.name!r}] = {_canonical(names, k, spec, spec.name)}")
     for held in arrays:
         name = held.name
         taken = [f"{name} = {name}.copy() if {name}.nbytes < _large else _copied({name})", f"{name}.setflags(False)"]

@@ -27,10 +27,10 @@ def digest_text(
     names["_prefix"] = struct.pack("<I", len(encoded)) + encoded
     names["_stamp_bytes"] = struct.Struct("<q").pack
     names["_int_bytes"], names["_float_bytes"] = struct.Struct("<cq").pack, struct.Struct("<cd").pack
-    head = ["_prefix", "_stamp_bytes(_state['stamp'])"]
+    head = ["_prefix", "_stamp_bytes(_self.stamp)"]
     later = []
     for spec in scalars:
-        value = f"_state[{spec.name!r}]"
+        value = value_text(spec)
         canonical = {
             "bool": f"(b'T' if {value} else b'F')",
             "int": f"_int_bytes(b'i', {value})",
@@ -72,6 +72,11 @@ def digest_text(
     return text
 
 
+def value_text(spec: ScalarField) -> str:
+    """An expression for the value of a field; one that was not given raises the `MessageError` that names it."""
+    return f"_self.{spec.name}" if spec.anchored else f"_state[{spec.name!r}]"
+
+
 def content_text(names: dict[str, Any], scalars: tuple[ScalarField, ...], arrays: tuple[ArrayField, ...]) -> list[str]:
     """The fields in order: (schema, scalars, (dtype, shape) of each array), and the arrays."""
     described = []
@@ -82,7 +87,7 @@ def content_text(names: dict[str, Any], scalars: tuple[ScalarField, ...], arrays
         "def _content(_self):",
         "    _state = _self.__dict__",
         *(f"    _a{k} = _state[{spec.name!r}]" for k, spec in enumerate(arrays)),
-        f"    _scalars = ({''.join(f'_state[{f.name!r}], ' for f in scalars)})",
+        f"    _scalars = ({''.join(f'{value_text(f)}, ' for f in scalars)})",
         f"    return (_schema, _scalars, ({''.join(described)})), ({''.join(f'_a{k}, ' for k in range(len(arrays)))})",
     ]
 

@@ -16,6 +16,8 @@ ScalarKind = Literal["bool", "int", "float", "str", "strs"]
 Scalar = bool | int | float | str | tuple[str, ...]
 
 MISSING: Any = object()
+ANCHOR: Any = object()
+"""Default of a field `frame` that is the sensor's or the data's: the frame of the anchor, as `Message` describes."""
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 _PYTHON_NAME = {"bool": "bool", "int": "int", "float": "float", "str": "str", "strs": "sequence of str"}
 TAKEN = ("stamp", "timestamp")
@@ -39,6 +41,8 @@ class ScalarField:
     choices: tuple[str, ...]
     added: bool = False
     """The type got it after recordings of it were made: None counts in no digest, so theirs stay."""
+    anchored: bool = False
+    """A message may be constructed without it; the runner fills it in."""
 
     @property
     def required(self) -> bool:
@@ -93,14 +97,20 @@ def scalar(
 ) -> Any:
     """Declares a header field of a message. `default=None` makes it optional: it may be None.
 
-    `added`: a built-in type got the field after recordings of it were made; its default is None.
+    `default=ANCHOR`: the frame of the anchor, where a message is made in `process()`. `added`: a built-in type got the
+    field after recordings of it were made; its default is None. Raises `MessageError`.
     """
+    anchored = default is ANCHOR
+    if anchored:
+        default = MISSING
+        if kind != "str":
+            raise MessageError(f"default=ANCHOR is the name of a frame: the kind is str, got {kind}")
     optional = optional or default is None
     if default is not MISSING and default is not None:
         given, default = default, canonical_scalar(kind, default)
         if default is None or (choices and default not in choices):
             raise MessageError(f"default {given!r} is not a {_PYTHON_NAME[kind]}{f' of {choices}' if choices else ''}")
-    return ScalarField("", kind, doc, optional, default, tuple(choices), added)
+    return ScalarField("", kind, doc, optional, default, tuple(choices), added, anchored)
 
 
 def array(

@@ -45,7 +45,7 @@ def encode_fields(message: Message, fields: Iterable[Field]) -> dict[str, Any]:
     plain: dict[str, Any] = {}
     exact: dict[str, Any] = {}
     for spec in fields:
-        value = message.__dict__[spec.name]
+        value = getattr(message, spec.name)
         if value is None:
             continue
         if isinstance(spec, ArrayField):

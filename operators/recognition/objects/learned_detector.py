@@ -86,8 +86,6 @@ class LearnedDetector(Operator):
         self._counts["images"] += 1
         self._counts["learned objects"] += len(learned.scores)
         return Detections2D(
-            stamp=image.stamp,
-            frame=image.frame,
             width=image.width,
             height=image.height,
             class_names=self._names,
