@@ -74,16 +74,17 @@ def adjoint(T: Matrix) -> Matrix:
 
 
 def orthonormalised(T: Matrix) -> Matrix:
-    """Returns the nearest rigid motion to a nearly rigid matrix: products of many motions drift off SO(3)."""
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = nearest_rotation(T[:3, :3]), T[:3, 3]
+    """Returns the nearest rigid motions to nearly rigid matrices (..., 4, 4): products of many drift off SO(3)."""
+    out = np.zeros_like(T)
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = nearest_rotation(T[..., :3, :3]), T[..., :3, 3], 1.0
     return out
 
 
 def nearest_rotation(M: Matrix) -> Matrix:
-    """Returns the rotation (3, 3) nearest to M (3, 3) in the Frobenius norm."""
+    """Returns the rotations nearest to M (..., 3, 3) in the Frobenius norm."""
     u, _, vt = np.linalg.svd(M)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return np.asarray(u @ vt)
 
 
 def about_fixed_axes(covariance: Matrix, T_world_body: Matrix) -> Matrix:

@@ -10,7 +10,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
+from dataflow.messages.geometry import invert
 from operators.estimation.kernels import geman_mcclure
+from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.slam import motions
 
@@ -68,7 +70,7 @@ def optimised(poses: Sequence[Matrix], edges: Sequence[Edge], fixed: int = 1, wi
             break
         kernel = max(width, kernel * _NARROWS)
     weights = np.where(graph.loop, geman_mcclure(square / width**2), 1.0)
-    T[fixed:] = motions.orthonormalised(T[fixed:])
+    T[fixed:] = se3.orthonormalised(T[fixed:])
     return Optimum(list(T), weights)
 
 
@@ -79,7 +81,7 @@ class _Graph:
         self.first = np.array([e.first for e in edges])
         self.last = np.array([e.last for e in edges])
         self.loop = np.array([e.loop for e in edges])
-        self.inverse = motions.inverses(np.array([e.T for e in edges]))
+        self.inverse = invert(np.array([e.T for e in edges]))
         self.information = np.array([e.information for e in edges])
         self.size = 6 * (nodes - fixed)
         self.ends = (self.first - fixed, self.last - fixed)  # below 0: held fixed
@@ -95,7 +97,7 @@ class _Graph:
 
     def errors(self, T: Array) -> Array:
         """Returns log(measured^-1 first^-1 last), (E, 6)."""
-        return motions.logs(self.inverse @ (motions.inverses(T[self.first]) @ T[self.last]))
+        return motions.logs(self.inverse @ (invert(T[self.first]) @ T[self.last]))
 
     def squares(self, errors: Array) -> Array:
         """Returns the squared errors in units of their standard deviations, (E,)."""
@@ -110,7 +112,7 @@ class _Graph:
     def normal(self, T: Array, errors: Array, weights: Array) -> tuple[scipy.sparse.csc_matrix, Array]:
         """Returns the normal equations' matrix and gradient."""
         J_last = motions.right_jacobians_inverse(errors)
-        J_first = -J_last @ motions.adjoints(motions.inverses(T[self.last]) @ T[self.first])
+        J_first = -J_last @ motions.adjoints(invert(T[self.last]) @ T[self.first])
         J = (J_first, J_last)
         weighted = weights[:, None, None] * self.information
         WJ = (weighted @ J_first, weighted @ J_last)

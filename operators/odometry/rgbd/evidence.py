@@ -22,6 +22,11 @@ NEAR, NEAR_PER_SQUARE = 0.03, 0.01  # metres by which depths may differ, and so 
 FEWEST = 300  # points that a view must have in common with the map
 OVERLAP, AGREEMENT, LIKENESS = 0.3, 0.5, 0.45  # the least of a view that is recognised (see the benchmark)
 TOGETHER = 1.25  # the least of agreement and likeness in sum
+ALIKE = 0.8  # cosine between the normals of one surface
+FACET, BESIDE = 0.05, 0.3  # share of what agrees that makes a surface count, and the least likeness on a second such
+PLAIN = 0.15  # contrast below which a surface has no pattern
+FEW = 50  # points by which no surface is judged
+SUPPORTERS = 200  # points by which the surface that holds the most is found
 USUAL_NOISE = DepthNoise()
 
 
@@ -30,13 +35,15 @@ class Evidence:
     """Likeness of a view and the map where a pose lays the one on the other.
 
     `overlap` is the share of the view that the map saw, of which `agreement` lies on the map's surfaces, at so many
-    `points`; `likeness` is the correlation of brightness there.
+    `points`; `likeness` is the correlation of brightness there, `beside` that on the surface that is second in it: a
+    door or a poster that hangs elsewhere, too, is like itself on one.
     """
 
     points: int
     overlap: float
     agreement: float
     likeness: float
+    beside: float
 
     @property
     def certain(self) -> bool:
@@ -47,6 +54,7 @@ class Evidence:
             and self.agreement >= AGREEMENT
             and self.likeness >= LIKENESS
             and self.agreement + self.likeness >= TOGETHER
+            and self.beside >= BESIDE
         )
 
 
@@ -71,18 +79,18 @@ def gathered(
 ) -> Evidence:
     """Compares a frame at a pose with keyframes, by the colour camera of whose images K_color is."""
     points = frame.surface.points(STRIDE)
-    here = sampled(levelled(frame.gray), points, camera)
-    met, same, pairs = 0, 0, [np.zeros((0, 2))]
+    here, facing = sampled(levelled(frame.gray), points, camera), frame.surface.planes_at(points)[:, :3]
+    met, same, found = 0, 0, [np.zeros((0, 5))]
     for keyframe in keyframes:
         moved, on, known = compared(points, T_world_camera, keyframe, slack_of(noise))
         met += int(np.count_nonzero(known))
         same += int(np.count_nonzero(on))
         there = sampled(levelled(keyframe.gray), moved[on], camera)
-        pairs.append(np.column_stack([here[on], there]))
-    both = np.concatenate(pairs)
+        found.append(np.column_stack([here[on], there, facing[on]]))
+    both = np.concatenate(found)
     both = both[np.isfinite(both).all(axis=1)]
-    overlap = met / max(len(points) * len(keyframes), 1)
-    return Evidence(len(both), overlap, same / max(met, 1), _correlation(both))
+    overlap, pairs = met / max(len(points) * len(keyframes), 1), both[:, :2]
+    return Evidence(len(both), overlap, same / max(met, 1), _correlation(pairs), _second(pairs, both[:, 2:]))
 
 
 def _correlation(pairs: NDArray[np.float64]) -> float:
@@ -90,6 +98,20 @@ def _correlation(pairs: NDArray[np.float64]) -> float:
     if len(pairs) < 3 or not (pairs.std(axis=0) > 1e-6).all():
         return 0.0
     return float(np.asarray(np.corrcoef(pairs.T))[0, 1])
+
+
+def _second(pairs: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
+    """Returns the second largest correlation of pairs (N, 2) on surfaces that face alike, by normals (N, 3) or zeros;
+    1 where fewer than two surfaces have a pattern."""
+    found, left, least = [], np.flatnonzero(normals.any(axis=1)), max(FACET * len(pairs), FEW)
+    while len(left) > least:
+        some = normals[left[np.linspace(0, len(left) - 1, min(len(left), SUPPORTERS)).astype(np.int64)]]
+        facing = some[np.argmax(np.count_nonzero(some @ some.T > ALIKE, axis=0))]
+        on = normals[left] @ facing > ALIKE
+        if np.count_nonzero(on) > least and (pairs[left[on]].std(axis=0) > PLAIN).all():
+            found.append(_correlation(pairs[left[on]]))
+        left = left[~on]
+    return sorted(found)[-2] if len(found) > 1 else 1.0
 
 
 def compared(

@@ -46,9 +46,9 @@ class VisualOdometry(Operator):
     relocalised, predicted or lost, and why. A lost camera looks for its view among the keyframes; where it sees
     something that is not among them for longer than `patience`, it begins a new map at the predicted pose, and joins
     it to the old one when that is seen again. A place is believed where shape fixes it in every direction, or a
-    pattern that fits nowhere beside it, and taken back when what follows contradicts it. An image that is black or
-    repeats the last one is not used. The images need not be registered, but must be free of lens distortion. Without
-    `extrinsics` the two cameras are taken to coincide.
+    pattern that fits nowhere beside it, and more than one surface looks as it did; it is taken back when what follows
+    contradicts it. An image that is black or repeats the last one is not used. The images need not be registered, but
+    must be free of lens distortion. Without `extrinsics` the two cameras are taken to coincide.
 
     Methods: corners, Shi and Tomasi, "Good features to track", 1994; RANSAC PnP; point-to-plane alignment to the
     surfaces of keyframes, Newcombe et al., "KinectFusion", 2011; views found again by SIFT, Lowe, 2004.

@@ -20,7 +20,7 @@ from operators.geometry.facing import free_directions
 from operators.geometry.pinhole import Points, project
 from operators.geometry.se3 import Matrix
 from operators.odometry.rgbd.camera import RgbdCamera
-from operators.odometry.rgbd.evidence import NEAR, STRIDE, compared, levelled, sampled, slack_of
+from operators.odometry.rgbd.evidence import ALIKE, NEAR, STRIDE, SUPPORTERS, compared, levelled, sampled, slack_of
 from operators.odometry.rgbd.frame import Frame
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.surface import DepthNoise, Surface
@@ -28,7 +28,6 @@ from operators.odometry.rgbd.surface import DepthNoise, Surface
 Array = NDArray[np.float64]
 
 TELLING = 0.015  # share of what agrees that must face along a direction (see the benchmark)
-ALIKE = 0.8  # cosine between the normals of one surface
 CELL = 0.025  # metres, of the grid on which a pattern is laid out
 HALF = 2.0  # metres, half the side of that grid at most
 SHIFTS = (0.3, 2.0)  # metres: the least and the largest period that is looked for; what repeats at others passes
@@ -37,7 +36,6 @@ SHARED = 0.1  # of the pattern that must still lie on the map for a shift to be 
 JUDGED = 1 / 3  # share of the shifts that must be
 REPEATS = 0.6  # of the likeness where the pose is: a shift that reaches it fits as well
 THICK = 0.05  # metres by which points of a plane may be off it
-SUPPORTERS = 200  # points by which the plane that holds the most is found
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.geometry import invert
 from operators.estimation.bundle import PosesAndPoints, pose_jacobian
 from operators.estimation.kernels import cauchy
 from operators.estimation.least_squares import gauss_newton_step
+from operators.geometry import se3
 from operators.geometry.pinhole import Points
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.slam import motions
@@ -67,7 +69,7 @@ def adjusted(
         poses[fixed:], points, step = solver.step(poses, points, graph)
         if step < _STILL:
             break
-    poses[fixed:] = motions.orthonormalised(poses[fixed:])
+    poses[fixed:] = se3.orthonormalised(poses[fixed:])
     return Bundle(poses, points, solver.residuals(poses, points)[2])
 
 
@@ -85,7 +87,7 @@ class _Solver:
     def residuals(self, poses: Array, points: Points) -> tuple[Array, Array, Array, Array]:
         """Returns points in the depth cameras (S, 3), residuals (S, 3) in sigmas, their squares (S, 2), R (S, 3, 3)."""
         seen, K, T_color = self.seen, self.camera.K_color, self.camera.T_color_depth
-        inverse = motions.inverses(poses)
+        inverse = invert(poses)
         R = inverse[seen.views, :3, :3]
         p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.views, :3, 3]
         c = p @ T_color[:3, :3].T + T_color[:3, 3]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from operators.geometry import se3
 from operators.monitoring.image_flaws import Watch
 from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.rgbd.evidence import gathered
 from operators.odometry.rgbd.frame import Frame, observe
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.relocalizer import believed
@@ -52,6 +53,11 @@ def groove(X: Array, Y: Array) -> Array:
 def roof(X: Array, Y: Array) -> Array:
     """A wall, and a pyramid on it."""
     return 2.0 - 0.5 * np.maximum(0.6 - np.maximum(np.abs(X - 0.3), np.abs(Y)), 0.0)
+
+
+def corner(X: Array, Y: Array) -> Array:
+    """Two walls that meet in a line along x, and a pyramid on that."""
+    return groove(X, Y) - 0.5 * np.maximum(0.6 - np.maximum(np.abs(X - 0.3), np.abs(Y)), 0.0)
 
 
 Shape = Callable[[Array, Array], Array]
@@ -113,3 +119,18 @@ def test_a_plane_of_which_too_little_is_seen_for_its_pattern_to_repeat_is_no_evi
         return np.where(np.abs(Y) < 0.2, 2.0, 1e3)  # which is no return
 
     assert not taken_for(strip, 6.0, 0.1, 0.1)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_wall_that_looks_like_another_elsewhere_is_no_evidence_where_the_one_beside_it_does_not(same: bool) -> None:
+    there = spots(6.0)
+    here = there.copy()
+    if not same:
+        half = len(here) // 2  # y < 0 wraps round to there
+        here[half:] = np.roll(here[half:], round(1.7 / TEXEL), axis=1)
+    known = [keyframe(corner, there, k) for k in (-0.3, 0.4)]
+    frame = view(corner, here, 0.1)
+    found = gathered(frame, at(0.1), known, CAMERA)
+    assert found.agreement > 0.9
+    assert found.likeness > 0.45
+    assert (believed(frame, at(0.1), known, CAMERA, DepthNoise()) is not None) == same
