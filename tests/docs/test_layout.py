@@ -28,7 +28,6 @@ LONG = {
     "dataflow.verification.verify:verify": 72,
     "operators.scene.commands:show": 64,
     "operators.scene.map.cuboid:fit_cuboid": 81,
-    "operators.scene.lifting.frustums:lift": 61,
     "operators.training.learning:learn_object": 71,
 }
 """Functions of more than `MOST_LINES` lines, with their lines. The list only gets shorter, and its numbers smaller."""
