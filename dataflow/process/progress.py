@@ -149,7 +149,9 @@ def final_report(driver: Driver, transport: Mapping[str, int]) -> dict[str, Any]
         "counts": counts_of(driver, runners),
         "drops": _drops_of(driver, runners),
         "waits": _waits_of(runners),
-        "summaries": {r.node.name: found for r in runners if (found := summary_of(r.operator, r.node.name))},
+        "summaries": {
+            r.node.name: found for r in (*driver.sources, *runners) if (found := summary_of(r.operator, r.node.name))
+        },
         "transport": dict(transport),
     }
 
