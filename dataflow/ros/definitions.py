@@ -97,7 +97,8 @@ def _as(made: Any, kind: str, store: Typestore, message: Message) -> Any:
     if found is not None and all(hasattr(found, name) for name in names):
         return found
     if found is not None:  # a newer definition, whose further fields the message may have
-        return store.types[kind](**{n: getattr(found, n, None) or getattr(message, n, None) or 0.0 for n in names})
+        further = {n: getattr(message, n, None) or 0.0 for n in names if not hasattr(found, n)}
+        return store.types[kind](**further, **{n: getattr(found, n) for n in names if n not in further})
     package, _, name = kind.rpartition("/")
     if package == "std_msgs/msg" and names == ["data"] and isinstance(getattr(made, "data", None), float):
         whole = made.data.is_integer()

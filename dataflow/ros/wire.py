@@ -48,7 +48,7 @@ class Qos:
     def decoded(cls, text: str) -> Self:
         """Reads the last part of a token; its deadline, lifespan and liveliness are passed over. Raises `WireError`."""
         try:
-            reliability, durability, history, *_ = text.split(":")
+            reliability, durability, history, _, _, _ = text.split(":")
             kept, depth = history.split(",")
             return cls(
                 (reliability or _RELIABLE) != _BEST_EFFORT,
@@ -136,11 +136,11 @@ class End:
 
     @classmethod
     def decoded(cls, token: str) -> Self:
-        """Reads a token. Raises `WireError` for one that is not of an end of a topic."""
+        """Reads a token; what later versions add to it is passed over. Raises `WireError` for any other key."""
         parts = token.split("/")
-        if len(parts) != 13 or parts[0] != _SPACE or not parts[1].isdecimal():
+        if len(parts) < 13 or parts[0] != _SPACE or not parts[1].isdecimal():
             raise WireError(f"liveliness token {token!r}: expected {_SPACE}/DOMAIN/… with 13 parts")
-        _, domain, session, number, id_, kind, enclave, namespace, name, topic, type_, hash_, qos = parts
+        _, domain, session, number, id_, kind, enclave, namespace, name, topic, type_, hash_, qos, *_ = parts
         node = Node(int(domain), session, _plain(namespace), _plain(name), number, _plain(enclave))
         return cls(node, id_, kind, _plain(topic), _type_of_wire(type_), hash_, Qos.decoded(qos))
 
@@ -152,7 +152,7 @@ def gid_of(token: str) -> bytes:
 
 def tokens_of(domain: int, topic: str = "", kind: str = "MP") -> str:
     """Returns the key expression of the tokens of a topic's ends; of all topics where none is named."""
-    return f"{_SPACE}/{domain}/*/*/*/{kind}/*/*/*/{_mangled(topic) or '*'}/*/*/*"
+    return f"{_SPACE}/{domain}/*/*/*/{kind}/*/*/*/{_mangled(topic) or '*'}/*/*/**"
 
 
 def absolute(topic: str, namespace: str) -> str:

@@ -44,7 +44,7 @@ class Peer:
 
     def __init__(self, endpoint: str, node: str = "talker") -> None:
         self.session = zenoh.open(_config("client", "connect", endpoint))
-        self.node, self.kept = node, []
+        self.endpoint, self.node, self.kept = endpoint, node, []
 
     def publisher(
         self, topic: str, kind: str, hash_: str, *, latched: int = 0, qos: str = "::,:,:,:,,"
