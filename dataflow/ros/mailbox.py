@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
+import queue
 import time
-from collections import deque
 from typing import Final, NamedTuple
 
 MOST: Final = 4096
@@ -27,51 +26,38 @@ class TokenChange(NamedTuple):
 
 
 class Mailbox:
-    """A queue in the order of arrival. Bounded: the oldest messages go first, and are counted as `overflow`."""
+    """A queue in the order of arrival. Bounded: a message for which there is no room is counted as `overflow`."""
 
     def __init__(self) -> None:
         self.overflow = 0
-        self._waiting: deque[Arrival | TokenChange] = deque()
-        self._bytes = 0
-        self._changed = threading.Condition()
-        self._closed = False
+        self.closed = False
+        self._waiting: queue.SimpleQueue[Arrival | TokenChange | None] = queue.SimpleQueue()
+        self._put = self._taken = 0
+        """Bytes, each counted by one thread."""
 
     def sample(self, data: bytes, attachment: bytes) -> None:
         """Takes a message."""
-        with self._changed:
-            self._waiting.append(Arrival(data, attachment, time.time_ns()))
-            self._bytes += len(data)
-            while len(self._waiting) > MOST or self._bytes > MOST_BYTES:
-                oldest = self._waiting.popleft()
-                if isinstance(oldest, Arrival):
-                    self._bytes -= len(oldest.data)
-                    self.overflow += 1
-            self._changed.notify()
+        if self._waiting.qsize() >= MOST or self._put - self._taken + len(data) > MOST_BYTES:
+            self.overflow += 1
+            return
+        self._put += len(data)
+        self._waiting.put(Arrival(data, attachment, time.time_ns()))
 
     def token(self, token: str, alive: bool) -> None:
         """Takes a change of the graph."""
-        with self._changed:
-            self._waiting.append(TokenChange(token, alive))
-            self._changed.notify()
+        self._waiting.put(TokenChange(token, alive))
 
     def get(self, timeout: float | None) -> Arrival | TokenChange | None:
         """Returns the next of what came; None after `timeout` seconds, and when it is closed."""
-        with self._changed:
-            self._changed.wait_for(lambda: bool(self._waiting) or self._closed, timeout)
-            if self._closed or not self._waiting:
-                return None
-            found = self._waiting.popleft()
-            if isinstance(found, Arrival):
-                self._bytes -= len(found.data)
-            return found
-
-    @property
-    def closed(self) -> bool:
-        """True when nothing more is to be read."""
-        return self._closed
+        try:
+            found = None if self.closed else self._waiting.get(timeout=timeout)
+        except queue.Empty:
+            return None
+        if isinstance(found, Arrival):
+            self._taken += len(found.data)
+        return found
 
     def close(self) -> None:
-        """Lets whoever waits return."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+        """Lets the reader return."""
+        self.closed = True
+        self._waiting.put(None)
