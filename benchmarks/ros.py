@@ -171,6 +171,17 @@ def measure(name: str, seconds: float, endpoint: str, folder: Path, *, apart: bo
     }
 
 
+def latecomer(hash_: str, endpoint: str) -> bool:
+    """Subscribes to what is latched; returns whether it comes."""
+    node = Ros2Node("late", "/", 0, endpoint, {})
+    came = threading.Event()
+    end = node.end("MS", "/tf_static", "tf2_msgs/msg/TFMessage", hash_, Qos(transient_local=True, depth=1))
+    node.subscribe(end, lambda data, attachment: came.set())
+    found = came.wait(10)
+    node.close()
+    return found
+
+
 def late_joiners(times: int, endpoint: str) -> tuple[int, int]:
     """Returns how many of so many late subscribers got what was latched: sources here, and subscribers of a sink."""
     transforms = Transforms(
@@ -190,12 +201,7 @@ def late_joiners(times: int, endpoint: str) -> tuple[int, int]:
         source.setup()
         here += source.static_outputs()["message"].child_frames == ("lidar",)
         source.close()
-        node = Ros2Node("late", "/", 0, endpoint, {})
-        came = threading.Event()
-        end = node.end("MS", "/tf_static", "tf2_msgs/msg/TFMessage", hash_, Qos(transient_local=True, depth=1))
-        node.subscribe(end, lambda data, attachment, came=came: came.set())
-        there += came.wait(10)
-        node.close()
+        there += latecomer(hash_, endpoint)
     sink.close()
     return here, there
 

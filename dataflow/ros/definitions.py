@@ -50,7 +50,7 @@ def type_hash(type_: str, distro: Distro) -> str | None:
 
 
 def distros_of(type_: str, hash_: str) -> tuple[Distro, ...]:
-    """Returns the distributions that define a type as its hash says, newest first."""
+    """Returns the distributions whose definition of a type has a hash, newest first."""
     return tuple(distro for distro in reversed(_STORES) if type_hash(type_, distro) == hash_)
 
 

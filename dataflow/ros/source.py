@@ -47,7 +47,7 @@ class Subscriber(Place, Source, abstract=True):
         self._counts: Counter[str] = Counter()
         self._first_fault = ""
         self._ends: dict[bytes, End] = {}
-        self._told: set[str] = set()
+        self._warned: set[str] = set()
         self._clock = self._lost = 0
         self._wanted = self.spec.outputs["message"].types[0]
         transforms = self._wanted is Transforms
@@ -119,8 +119,8 @@ class Subscriber(Place, Source, abstract=True):
             gid = self._number(came)
             for message in self._read(came, gid):
                 self._order.put(message, gid, time.monotonic())
-        while (message := self._order.take(time.monotonic())) is not None:
-            yield message
+        while (ready := self._order.take(time.monotonic())) is not None:
+            yield ready
 
     def _number(self, came: Arrival) -> bytes:
         """Takes note of a message's number; returns its publisher's gid."""
@@ -132,7 +132,7 @@ class Subscriber(Place, Source, abstract=True):
             return b""
         if missing := self._losses.take(seen):
             who = self._publisher(seen.gid)
-            self._tell(f"{self._name}: {missing} messages of {who} were lost before number {seen.number}", who)
+            self._warn(f"{self._name}: {missing} messages of {who} were lost before number {seen.number}", who)
         return seen.gid
 
     def _read(self, came: Arrival, gid: bytes) -> list[Message]:
@@ -151,7 +151,7 @@ class Subscriber(Place, Source, abstract=True):
         except (RecordingError, MessageError) as error:
             self._counts["unreadable"] += 1
             self._first_fault = self._first_fault or str(error)
-            self._tell(f"{self._name}: a message of {self._publisher(gid)} cannot be read: {error}", "unreadable")
+            self._warn(f"{self._name}: a message of {self._publisher(gid)} cannot be read: {error}", "unreadable")
             return []
 
     @staticmethod
@@ -172,7 +172,7 @@ class Subscriber(Place, Source, abstract=True):
         try:
             end = End.decoded(change.token)
         except WireError as error:
-            self._tell(f"{self._name}: {error}", change.token)
+            self._warn(f"{self._name}: {error}", change.token)
             return
         self._ends[gid_of(change.token)] = end
         who = f"{self._name}: {end.node.full_name}"
@@ -185,16 +185,16 @@ class Subscriber(Place, Source, abstract=True):
                 "messages do not come; `distro` chooses"
             )
         elif self._end.qos.transient_local and not end.qos.transient_local:
-            self._tell(f"{who} is volatile: messages that it sent before this start do not come", who)
+            self._warn(f"{who} is volatile: messages that it sent before this start do not come", who)
 
     def _mismatch(self, text: str) -> None:
-        self._counts["mismatched"] += text not in self._told
+        self._counts["mismatched"] += text not in self._warned
         self._first_fault = self._first_fault or text
-        self._tell(text, text)
+        self._warn(text, text)
 
-    def _tell(self, text: str, once: str) -> None:
-        if once not in self._told:
-            self._told.add(once)
+    def _warn(self, text: str, once: str) -> None:
+        if once not in self._warned:
+            self._warned.add(once)
             self.log.warning("%s", text)
 
     def summary(self) -> Mapping[str, float | int | str]:
@@ -264,7 +264,7 @@ class Latched(Subscriber, abstract=True):
     def _with(self, message: Message) -> Message:
         if isinstance(message, Transforms) and isinstance(self._held, Transforms):
             for other in other_parents(self._held, message):
-                self._tell(f"{self._name}: {other}", other)
+                self._warn(f"{self._name}: {other}", other)
             return joined(self._held, message)
         return message
 
@@ -274,7 +274,7 @@ class Latched(Subscriber, abstract=True):
             self._take_in(self._mail.get(None))
             if before is not None and self._held is not None:
                 if self._held.replace(stamp=before.stamp).digest() != before.digest():
-                    self._tell(f"{self._name} has changed since the start; the run keeps what it began with", "changed")
+                    self._warn(f"{self._name} has changed since the start; the run keeps what it began with", "changed")
                 self._held = before
         yield from ()
 

@@ -89,18 +89,15 @@ class Node:
     session: str
     namespace: str
     name: str
-    number: str = "0"
-    enclave: str = "/"
 
     @property
     def full_name(self) -> str:
         """The name as `ros2 node list` prints it."""
         return f"{self.namespace.rstrip('/')}/{self.name}"
 
-    def token(self, id_: str = "", kind: str = "NN") -> str:
-        """The key of its liveliness token, or how that of one of its ends begins."""
-        names = (_mangled(self.enclave), _mangled(self.namespace), _mangled(self.name))
-        return "/".join((_SPACE, str(self.domain), self.session, self.number, id_ or self.number, kind, *names))
+    def token(self, id_: str = "0", kind: str = "NN") -> str:
+        """The key of its liveliness token, or how that of one of its ends begins. It is the session's only node."""
+        return f"{_SPACE}/{self.domain}/{self.session}/0/{id_}/{kind}/%/{_mangled(self.namespace)}/{self.name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +123,8 @@ class End:
     @property
     def token(self) -> str:
         """The key of its liveliness token."""
-        parts = (_mangled(self.topic), _type_on_wire(self.type), self.hash, self.qos.encoded())
-        return "/".join((self.node.token(self.id, self.kind), *parts))
+        begin = self.node.token(self.id, self.kind)
+        return f"{begin}/{_mangled(self.topic)}/{_type_on_wire(self.type)}/{self.hash}/{self.qos.encoded()}"
 
     @property
     def gid(self) -> bytes:
@@ -140,8 +137,8 @@ class End:
         parts = token.split("/")
         if len(parts) < 13 or parts[0] != _SPACE or not parts[1].isdecimal():
             raise WireError(f"liveliness token {token!r}: expected {_SPACE}/DOMAIN/… with 13 parts")
-        _, domain, session, number, id_, kind, enclave, namespace, name, topic, type_, hash_, qos, *_ = parts
-        node = Node(int(domain), session, _plain(namespace), _plain(name), number, _plain(enclave))
+        _, domain, session, _, id_, kind, _, namespace, name, topic, type_, hash_, qos, *_ = parts
+        node = Node(int(domain), session, _plain(namespace), name)
         return cls(node, id_, kind, _plain(topic), _type_of_wire(type_), hash_, Qos.decoded(qos))
 
 
