@@ -9,18 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import zenoh.ext
 from ros_peer import HUMBLE, JAZZY, STRING, Peer, ros, router, string, until
 
 import dataflow.ros as topics
 from dataflow.graph import GraphError, load_text
-from dataflow.messages import Image, Message, Text, Twist
+from dataflow.messages import CameraInfo, Image, Message, Text, Twist
 from dataflow.operator import FINDING, SourceError
 from dataflow.recording import Recording
 from dataflow.ros.sink import Ros2Sink
 from dataflow.supervision.core.report import RunReport
-from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.plan import LogPlan, RunPlan, process_plans
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.verification.verify import verify
 
@@ -186,12 +187,12 @@ def test_what_a_sink_latches_comes_to_late_subscribers_of_ros(endpoint: str, pee
     sink.setup()
     for text in ("old", "new"):
         sink.process(Text(stamp=1, text=text), None)
+    kind = "std_msgs/msg/String"
     key = f"0/robot/notice/std_msgs::msg::dds_::String_/{STRING}"
     for _ in range(5):
         late = peer.heard(key, history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1))
-        until(lambda late=late: late)
-        assert JAZZY.deserialize_cdr(late[0].payload.to_bytes(), "std_msgs/msg/String").data == "new"
-        attachment = late[0].attachment.to_bytes()
+        until(lambda late=late: late and JAZZY.deserialize_cdr(late[-1].payload.to_bytes(), kind).data == "new")
+        attachment = late[-1].attachment.to_bytes()
         assert (len(attachment), attachment[:8], attachment[16]) == (33, bytes([2, 0, 0, 0, 0, 0, 0, 0]), 16)
     (token,) = peer.tokens("@ros2_lv/0/*/*/*/MP/*/*/*/%robot%notice/**")
     assert token.endswith(f"/MP/%/%robot/dash/%robot%notice/std_msgs::msg::dds_::String_/{STRING}/:1:,1:,:,:,,")
@@ -317,3 +318,40 @@ def test_a_live_graph_of_ros_topics_is_recorded_and_verified(endpoint: str, peer
     assert images[-1].data[0, 0, 0] == 200
     assert verified.identical, verified.as_json()
     assert [v.operator for v in verified.operators] == ["half"]
+
+
+def test_a_replay_does_not_publish_again() -> None:
+    graph = load_text(GRAPH % (("tcp/127.0.0.1:7447",) * 3))
+    log = LogPlan(Path("run.mcap"), ("robot/camera/message", "robot/fixed/message"), finals={}, first=0)
+    nodes = [node for plan in process_plans(RunPlan(graph, log=log)).values() for node in plan.nodes]
+    assert nodes == ["half"]
+
+
+def test_a_node_listens_nowhere(endpoint: str) -> None:
+    def listening() -> set[Any]:
+        return {
+            c.laddr for c in psutil.Process().net_connections("inet") if c.status == psutil.CONN_LISTEN or not c.raddr
+        }
+
+    before = listening()
+    sink = Ros2Sink(topic="/quiet", type="std_msgs/msg/String", router=endpoint)
+    sink.setup()
+    assert listening() == before
+    sink.close()
+
+
+def test_a_calibration_beside_images_goes_with_each_of_them_at_its_stamp(endpoint: str, peer: Peer) -> None:
+    kind = "sensor_msgs/msg/CameraInfo"
+    came = peer.heard(f"0/camera_info/sensor_msgs::msg::dds_::CameraInfo_/{JAZZY.hash_rihs01(kind)}")
+    sink = Ros2Sink(topic="/image", fixed_topic="/camera_info", router=endpoint, depth=5)
+    sink.setup()
+    info = CameraInfo.from_intrinsics(stamp=0, frame="c", width=4, height=2, fx=3, fy=3, cx=2, cy=1)
+    pixels = np.zeros((2, 4), np.uint8)
+    sink.process(Image(stamp=7, frame="c", data=pixels), info)
+    until(lambda: peer.tokens("@ros2_lv/0/*/*/*/MP/*/*/*/%camera_info/**"))
+    for stamp in (8, 9):
+        sink.process(Image(stamp=stamp, frame="c", data=pixels), info)
+    until(lambda: len(came) >= 2)
+    stamps = [JAZZY.deserialize_cdr(each.payload.to_bytes(), kind).header.stamp.nanosec for each in came]
+    assert stamps[-2:] == [8, 9]
+    sink.close()
