@@ -83,6 +83,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("replay:replay", MAKE),
     Command("verification:verify", MAKE),
     Command("debug:debug", MAKE),
+    Command("debug:capture", MAKE),
     Command("sweep:sweep", MAKE),
     Command("compare:compare", MAKE),
     Command("inspection:check", LOOK),

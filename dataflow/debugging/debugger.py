@@ -35,20 +35,23 @@ class DebugError(ReplayError):
 
 class Debugger:
     """One operator of a recorded run. `calls` are its recorded calls, in order; `at` is the one that was made last.
+    `live_effects`: a call outside that is not recorded is made.
 
     Runs the operator in this process, which should have the environment of operators (`threads.environment`): what
     depends on the hashes of strings else repeats only by chance. Raises `DebugError`, `ReplayError`, `RecordingError`,
     `GraphError`.
     """
 
-    def __init__(self, recording: Recording, operator: str, graph: Graph | None = None) -> None:
-        self._recording = recording
-        self._graph = graph_that_is_here(recording)[0] if graph is None else graph
+    def __init__(
+        self, recording: Recording, operator: str, graph: Graph | None = None, *, live_effects: bool = False
+    ) -> None:
+        self._recording, self._live_effects = recording, live_effects
+        self.graph = graph_that_is_here(recording)[0] if graph is None else graph
         log = _ResumedLog(recording)
-        self.node = node = self._graph.nodes[_named(operator, self._graph, log)]
+        self.node = node = self.graph.nodes[_named(operator, self.graph, log)]
         self._log = log
         self.calls: Sequence[Call] = [call_of(record) for record in log.ordered(node) if record.kind in CALLS]
-        self._feeding = plan_feeding(recording, self._graph, [node.name])
+        self._feeding = plan_feeding(recording, self.graph, [node.name])
         self._kept: dict[int, FiringRecord] = {}
         """States before calls, by the call's number, as `cut` records."""
         self._sources = Sources(node.operator)
@@ -181,7 +184,13 @@ class Debugger:
     def _start(self, begin: int | None, cut: FiringRecord | None) -> None:
         self._log.cut = cut
         work = Recomputation(
-            self._recording, self._graph, self._feeding, self._log, made=lambda stream, entry: None, begin=begin
+            self._recording,
+            self.graph,
+            self._feeding,
+            self._log,
+            made=lambda stream, entry: None,
+            begin=begin,
+            live_effects=self._live_effects,
         )
         runner = work.runners[self.node.name]
         self._probe = runner.calls = Probe(runner)
@@ -250,6 +259,10 @@ class Debugger:
             error=error,
             recorded_error=recorded,
             injected=injected,
+            record=record,
+            firing=None if injected else probe.firing,
+            raised=None if injected else probe.raised,
+            parameters=dict(self._work.runners[self.node.name].changed),
             same=self._same,
         )
 
