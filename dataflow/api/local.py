@@ -25,7 +25,7 @@ from dataflow.records.firing import FiringRecord, encode_batch
 from dataflow.sinks.recorder import RecorderSink
 from dataflow.supervision.configs import replay_of, warm_start_of
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, RunReport, Status
-from dataflow.supervision.plan import LogPlan
+from dataflow.supervision.plan import LogPlan, replaced_in
 from dataflow.sync import FOREVER, NEVER, Entry
 
 BATCH_RECORDS = 64
@@ -192,7 +192,7 @@ def config_of(graph: Graph, log: LogPlan | None, *, paranoid: bool = False, sour
     and without `sources` all of them."""
     replaced = set() if sources else {node.name for node in graph.sources()}
     if log is not None:
-        replaced = {graph.streams[stream].node for stream in log.streams}
+        replaced = replaced_in(graph, log)
     return ProcessConfig(
         label="here",
         graph={},

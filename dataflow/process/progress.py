@@ -143,13 +143,14 @@ def final_report(driver: Driver, transport: Mapping[str, int]) -> dict[str, Any]
     for log in driver.feeding.logs:
         streams |= {name: [count, digest] for name, count, digest in log.counts()}
     runners = driver.operators
+    everything: list[SourceRunner | Runner] = [*driver.sources, *runners]
     return {
         "streams": streams,
         "first": _first(driver),
         "counts": counts_of(driver, runners),
         "drops": _drops_of(driver, runners),
         "waits": _waits_of(runners),
-        "summaries": {r.node.name: found for r in runners if (found := summary_of(r.operator, r.node.name))},
+        "summaries": {r.node.name: found for r in everything if (found := summary_of(r.operator, r.node.name))},
         "transport": dict(transport),
     }
 

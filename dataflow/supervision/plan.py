@@ -105,10 +105,18 @@ class ProcessPlan:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
+def replaced_in(graph: Graph, log: LogPlan | None) -> set[str]:
+    """Returns the operators that do not run where a log is played: those whose streams it has, and external ones that
+    give nothing, which would act on the world again."""
+    if log is None:
+        return set()
+    return {graph.streams[s].node for s in log.streams} | {node.name for node in graph.sinks() if node.external}
+
+
 def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
     """Returns the processes of a run by label: those of operators in graph order, the recorder, the viewer file."""
     graph = plan.graph
-    replaced = {graph.streams[s].node for s in plan.log.streams} if plan.log is not None else set()
+    replaced = replaced_in(graph, plan.log)
     labels = {node: label for label, nodes in graph.processes(plan.placement).items() for node in nodes}
     if plan.log is not None:
         log_process = "all" if plan.placement == "one_process" else LOG_PROCESS

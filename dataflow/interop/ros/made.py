@@ -33,15 +33,26 @@ _VISION = {
 
 _VIDEO = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
 """foxglove_msgs/CompressedVideo, neither."""
+_PACKET = """std_msgs/Header header
+int32 width
+int32 height
+string encoding
+uint64 pts
+uint8 flags
+bool is_bigendian
+uint8[] data
+"""
+"""ffmpeg_image_transport_msgs/FFMPEGPacket, neither."""
 
 
 @cache
-def typestore() -> Typestore:
-    """The ROS 2 types that messages become."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
+def typestore(distribution: Stores = Stores.ROS2_HUMBLE) -> Typestore:
+    """The ROS 2 types that messages become, as a distribution defines them."""
+    store = get_typestore(distribution)
     for name, text in _VISION.items():
         store.register(get_types_from_msg(text, name))
     store.register(get_types_from_msg(_VIDEO, "foxglove_msgs/msg/CompressedVideo"))
+    store.register(get_types_from_msg(_PACKET, "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"))
     return store
 
 

@@ -1,0 +1,357 @@
+"""Topics of a hand-made ROS peer in and out of graphs, through a Zenoh router on loopback."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import zenoh.ext
+from ros_peer import HUMBLE, JAZZY, STRING, Peer, ros, router, string, until
+
+import dataflow.ros as topics
+from dataflow.graph import GraphError, load_text
+from dataflow.messages import CameraInfo, Image, Message, Text, Twist
+from dataflow.operator import FINDING, SourceError
+from dataflow.recording import Recording
+from dataflow.ros.sink import Ros2Sink
+from dataflow.supervision.core.report import RunReport
+from dataflow.supervision.plan import LogPlan, RunPlan, process_plans
+from dataflow.supervision.supervisor import Supervisor
+from dataflow.verification.verify import verify
+
+pytestmark = pytest.mark.network
+
+TF, IMAGE = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/Image"
+OF_STRINGS = "0/chatter/std_msgs::msg::dds_::String_"
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    with router() as found:
+        yield found
+
+
+@pytest.fixture
+def peer(endpoint: str) -> Iterator[Peer]:
+    with Peer(endpoint) as found:
+        yield found
+
+
+class Read:
+    """A source that is read on a thread, as in a live run."""
+
+    def __init__(self, name: str, peer: Peer, **params: Any) -> None:
+        self.source = getattr(topics, name)(router=peer.endpoint, **params)
+        self.source.setup()
+        node = self.source._node.node
+        until(lambda: peer.tokens(f"@ros2_lv/0/{node.session}/*/*/MS/**"))  # what is sent now comes
+        self.steps: list[dict[str, Message]] = []
+        self.thread = threading.Thread(target=self._read)
+        self.thread.start()
+
+    def _read(self) -> None:
+        for step in self.source.stream():
+            self.steps.append(step)
+
+    @property
+    def texts(self) -> list[str]:
+        return [step["message"].text for step in self.steps]
+
+    def __enter__(self) -> Read:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.source.stop_reading()
+        self.thread.join(10)
+        self.source.close()
+
+
+def header(nanoseconds: int, frame: str = "camera") -> Any:
+    seconds, rest = divmod(nanoseconds, 10**9)
+    stamp = ros("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+    return ros("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def transform(child: str, stamp: int = 5 * 10**9) -> Any:
+    vector, turn = (
+        ros("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0),
+        ros("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    place = ros("geometry_msgs/msg/Transform", translation=vector, rotation=turn)
+    row = ros("geometry_msgs/msg/TransformStamped", header=header(stamp, "base"), child_frame_id=child, transform=place)
+    return ros(TF, transforms=[row])
+
+
+def image(stamp: int, value: int) -> Any:
+    return ros(
+        IMAGE,
+        header=header(stamp),
+        height=48,
+        width=64,
+        encoding="rgb8",
+        is_bigendian=0,
+        step=192,
+        data=np.full(48 * 192, value, np.uint8),
+    )
+
+
+def test_messages_come_in_order_and_every_loss_is_counted(endpoint: str, peer: Peer) -> None:
+    talker = peer.publisher("/chatter", "std_msgs/msg/String", STRING)
+    with Read("Text", peer, topic="chatter") as read:
+        for text in "ab":
+            talker.send(string(text))
+        talker.number += 3
+        talker.send(string("f"))
+        until(lambda: len(read.steps) == 3)
+        other = peer.publisher("/chatter", "std_msgs/msg/String", STRING)  # it was started anew
+        other.send(string("g"))
+        until(lambda: len(read.steps) == 4)
+    assert read.texts == ["a", "b", "f", "g"]
+    assert [(step["lost"].value, step["message"].text) for step in read.steps if "lost" in step] == [(3, "f")]
+    summary = read.source.summary()
+    assert (summary["lost"], summary["received"], summary["overflow"]) == (3, 4, 0)
+    assert summary[FINDING] == "/chatter: lost are 3 of 6 messages of /talker"
+
+
+def test_a_publisher_of_another_distribution_is_named(
+    endpoint: str, peer: Peer, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Read("Text", peer, topic="/chatter", type="std_msgs/msg/String", distro="kilted") as read:
+        old = peer.publisher("/chatter", "std_msgs/msg/String", HUMBLE)
+        numbers = peer.publisher("/chatter", "std_msgs/msg/Float64", JAZZY.hash_rihs01("std_msgs/msg/Float64"))
+        old.send(string("unheard"))
+        until(lambda: read.source.summary().get("mismatched") == 2)
+    said = caplog.text
+    assert "/talker publishes std_msgs/msg/String as defined by humble (TypeHashNotSupported)" in said
+    assert "/talker publishes std_msgs/msg/Float64, and std_msgs/msg/String is taken" in said
+    assert "as defined by humble" in str(read.source.summary()[FINDING])
+    assert not read.steps
+    assert numbers.number == 0
+
+
+@pytest.mark.parametrize("hash_", [HUMBLE, STRING])
+def test_type_and_distribution_are_those_of_the_publisher_unless_given(endpoint: str, peer: Peer, hash_: str) -> None:
+    talker = peer.publisher("/found", "std_msgs/msg/String", hash_)
+    with Read("Text", peer, topic="/found") as read:
+        talker.send(string("heard"))
+        until(lambda: read.texts == ["heard"])
+
+
+def test_types_without_a_counterpart_are_passed_on_as_they_are(endpoint: str, peer: Peer) -> None:
+    own = "RIHS01_" + "7" * 64
+    talker = peer.publisher("/gripper", "my_robot/msg/Gripper", own)
+    key = f"0/again/my_robot::msg::dds_::Gripper_/{own}"
+    came = peer.heard(key)
+    sink = Ros2Sink(topic="/again", router=endpoint)
+    sink.setup()
+    with Read("Ros2Source", peer, topic="/gripper") as read:
+        talker.send(b"\0\1\0\0abc")
+        until(lambda: len(read.steps) == 1)
+    got = read.steps[0]["message"]
+    assert (got.type, got.hash, got.data.tobytes()) == ("my_robot/msg/Gripper", own, b"\0\1\0\0abc")
+    sink.process(got, None)
+    until(lambda: peer.tokens("@ros2_lv/0/*/*/*/MP/*/*/*/%again/**"))
+    sink.process(got, None)
+    until(lambda: came)
+    assert came[-1].payload.to_bytes() == b"\0\1\0\0abc"
+    sink.close()
+    with pytest.raises(SourceError, match="defines my_robot/msg/Gripper as no distribution"):
+        topics.Imu(topic="/gripper", router=endpoint).setup()
+
+
+def test_a_late_subscriber_gets_what_was_latched_and_both_publishers_count(endpoint: str, peer: Peer) -> None:
+    with Peer(endpoint, "second") as second:
+        hash_ = JAZZY.hash_rihs01(TF)
+        one, two = (each.publisher("/tf_static", TF, hash_, latched=1) for each in (peer, second))
+        one.send(transform("lidar"))
+        two.send(transform("camera"))
+        for _ in range(5):
+            source = topics.StaticTransforms(topic="/tf_static", router=endpoint)
+            source.setup()
+            held = source.static_outputs()["message"]
+            source.close()
+            assert sorted(held.child_frames) == ["camera", "lidar"]
+            assert source.summary()["lost"] == 0
+
+
+def test_what_a_sink_latches_comes_to_late_subscribers_of_ros(endpoint: str, peer: Peer) -> None:
+    sink = Ros2Sink(
+        topic="notice", namespace="/robot", router=endpoint, durability="transient_local", depth=1, node="dash"
+    )
+    sink.setup()
+    for text in ("old", "new"):
+        sink.process(Text(stamp=1, text=text), None)
+    kind = "std_msgs/msg/String"
+    key = f"0/robot/notice/std_msgs::msg::dds_::String_/{STRING}"
+    for _ in range(5):
+        late = peer.heard(key, history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1))
+        until(lambda late=late: late and JAZZY.deserialize_cdr(late[-1].payload.to_bytes(), kind).data == "new")
+        attachment = late[-1].attachment.to_bytes()
+        assert (len(attachment), attachment[:8], attachment[16]) == (33, bytes([2, 0, 0, 0, 0, 0, 0, 0]), 16)
+    (token,) = peer.tokens("@ros2_lv/0/*/*/*/MP/*/*/*/%robot%notice/**")
+    assert token.endswith(f"/MP/%/%robot/dash/%robot%notice/std_msgs::msg::dds_::String_/{STRING}/:1:,1:,:,:,,")
+    sink.close()
+
+
+def test_a_command_goes_out_as_the_type_that_the_robot_takes(endpoint: str, peer: Peer) -> None:
+    kind = "geometry_msgs/msg/Twist"
+    came = peer.heard(f"0/cmd_vel/geometry_msgs::msg::dds_::Twist_/{JAZZY.hash_rihs01(kind)}")
+    sink = Ros2Sink(topic="/cmd_vel", type=kind, router=endpoint)
+    sink.setup()
+    until(lambda: peer.tokens("@ros2_lv/0/*/*/*/MP/*/*/*/%cmd_vel/**"))
+    sink.process(Twist(stamp=5, frame="base", linear=(0.5, 0, 0), angular=(0, 0, 1)), None)
+    until(lambda: came)
+    assert JAZZY.deserialize_cdr(came[0].payload.to_bytes(), kind).linear.x == 0.5
+    sink.close()
+
+
+def test_messages_without_a_header_are_stamped_by_the_clock_of_ros(endpoint: str, peer: Peer) -> None:
+    talker = peer.publisher("/simulated", "std_msgs/msg/String", STRING)
+    clock = peer.publisher("/clock", "rosgraph_msgs/msg/Clock", JAZZY.hash_rihs01("rosgraph_msgs/msg/Clock"))
+    with Read("Text", peer, topic="/simulated", sim_time=True) as read:
+        talker.send(string("before"))
+        until(lambda: read.source.summary().get("before_clock") == 1)
+        for second in (7, 8):
+            clock.send(ros("rosgraph_msgs/msg/Clock", clock=ros("builtin_interfaces/msg/Time", sec=second, nanosec=1)))
+            until(lambda second=second: read.source._clock == second * 10**9 + 1)
+            talker.send(string("after"))
+        until(lambda: len(read.steps) == 2)
+    assert [step["message"].stamp for step in read.steps] == [7 * 10**9 + 1, 8 * 10**9 + 1]
+
+
+def test_a_message_that_cannot_be_read_is_counted_with_its_reason(endpoint: str, peer: Peer) -> None:
+    talker = peer.publisher("/broken", "sensor_msgs/msg/Imu", JAZZY.hash_rihs01("sensor_msgs/msg/Imu"))
+    with Read("Imu", peer, topic="/broken") as read:
+        talker.send(b"\0\1\0\0\1")
+        until(lambda: read.source.summary().get("unreadable") == 1)
+    assert "sensor_msgs/msg/Imu" in str(read.source.summary()[FINDING])
+
+
+def test_errors_name_what_is_missing(endpoint: str, peer: Peer) -> None:
+    talker = peer.publisher("/chatter", "std_msgs/msg/String", STRING)
+    with pytest.raises(SourceError, match=r"no publisher of /scan in domain 0 within 0.2 s; topics there: .*/chatter"):
+        topics.LaserScan(topic="/scan", router=endpoint, within="200ms").setup()
+    with pytest.raises(SourceError, match="no type 'my_robot/msg/Gripper' that is known here"):
+        topics.Imu(topic="/gripper", type="my_robot/msg/Gripper", router=endpoint).setup()
+    source = topics.StaticText(topic="/chatter", router=endpoint, within="200ms")
+    source.setup()
+    with pytest.raises(SourceError, match=r"std_msgs/msg/String.* came within 0\.2 s; its publishers: /talker"):
+        source.static_outputs()
+    source.close()
+    with pytest.raises(GraphError, match="has no operator 'Imag'"):
+        load_text("graph: g\noperators:\n  a: {use: 'dataflow.ros:Imag', params: {topic: /a}}\n")
+    assert talker.number == 0
+
+
+GRAPH = """
+graph: robot
+operators:
+  camera: {use: "dataflow.ros:Image", params: {topic: /camera/image, router: "%s"}}
+  fixed: {use: "dataflow.ros:StaticTransforms", params: {topic: /tf_static, router: "%s"}}
+  half: {use: "ros_operators:Half", inputs: {image: camera/message}, live: {queue: block}}
+  out:
+    use: "dataflow.ros:Ros2Sink"
+    inputs: {message: half/half, fixed: fixed/message}
+    params: {topic: /half, fixed_topic: /kept, router: "%s"}
+    live: {queue: block}
+"""
+
+
+class Live:
+    """A live run on a thread, until it is to end."""
+
+    def __init__(self, text: str, record: Path) -> None:
+        self.graph = load_text(text)
+        self.supervisor = Supervisor(RunPlan(self.graph, live=True, record=record, metadata={}))
+        self.reports: list[RunReport] = []
+        self.thread = threading.Thread(target=lambda: self.reports.append(self.supervisor.run()))
+        self.thread.start()
+
+    def end(self) -> RunReport:
+        self.supervisor.stop()
+        self.thread.join(60)
+        return self.reports[0]
+
+
+@pytest.mark.process
+def test_a_live_graph_of_ros_topics_is_recorded_and_verified(endpoint: str, peer: Peer, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    fixed = peer.publisher("/tf_static", TF, JAZZY.hash_rihs01(TF), latched=1)
+    fixed.send(transform("lidar"))
+    hash_ = JAZZY.hash_rihs01(IMAGE)
+    camera = peer.publisher("/camera/image", IMAGE, hash_)
+    came = peer.heard(f"0/half/sensor_msgs::msg::dds_::Image_/{hash_}")
+    live = Live(GRAPH % (endpoint, endpoint, endpoint), path)
+    until(lambda: peer.tokens("@ros2_lv/0/*/*/*/MS/*/*/*/%camera%image/**"), 60)
+    begin = time.time_ns()
+    sent = 0
+    while len(came) < 5:  # a run that has begun publishes
+        camera.send(image(time.time_ns(), sent % 256))
+        sent += 1
+        time.sleep(0.05)
+        assert time.time_ns() - begin < 60 * 10**9
+    camera.number += 2
+    camera.send(image(time.time_ns(), 200))
+    until(lambda: came[-1].payload.to_bytes()[-1] == 200)
+    late = peer.heard(
+        f"0/kept/tf2_msgs::msg::dds_::TFMessage_/{JAZZY.hash_rihs01(TF)}",
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+    )
+    until(lambda: late)
+    report = live.end()
+    verified = verify(path, graph=live.graph)
+
+    assert report.summaries["camera"]["lost"] == 2
+    assert "lost are 2 of" in report.summaries["camera"][FINDING]
+    assert JAZZY.deserialize_cdr(late[0].payload.to_bytes(), TF).transforms[0].child_frame_id == "lidar"
+    with Recording(path) as recording:
+        images = [r.message for r in recording.messages(["robot/camera/message"])]
+        lost = [r.message.value for r in recording.messages(["robot/camera/lost"])]
+    assert lost == [2]
+    assert isinstance(images[-1], Image)
+    assert images[-1].data[0, 0, 0] == 200
+    assert verified.identical, verified.as_json()
+    assert [v.operator for v in verified.operators] == ["half"]
+
+
+def test_a_replay_does_not_publish_again() -> None:
+    graph = load_text(GRAPH % (("tcp/127.0.0.1:7447",) * 3))
+    log = LogPlan(Path("run.mcap"), ("robot/camera/message", "robot/fixed/message"), finals={}, first=0)
+    nodes = [node for plan in process_plans(RunPlan(graph, log=log)).values() for node in plan.nodes]
+    assert nodes == ["half"]
+
+
+def test_a_node_listens_nowhere(endpoint: str) -> None:
+    def listening() -> set[Any]:
+        return {
+            c.laddr for c in psutil.Process().net_connections("inet") if c.status == psutil.CONN_LISTEN or not c.raddr
+        }
+
+    before = listening()
+    sink = Ros2Sink(topic="/quiet", type="std_msgs/msg/String", router=endpoint)
+    sink.setup()
+    assert listening() == before
+    sink.close()
+
+
+def test_a_calibration_beside_images_goes_with_each_of_them_at_its_stamp(endpoint: str, peer: Peer) -> None:
+    kind = "sensor_msgs/msg/CameraInfo"
+    came = peer.heard(f"0/camera_info/sensor_msgs::msg::dds_::CameraInfo_/{JAZZY.hash_rihs01(kind)}")
+    sink = Ros2Sink(topic="/image", fixed_topic="/camera_info", router=endpoint, depth=5)
+    sink.setup()
+    info = CameraInfo.from_intrinsics(stamp=0, frame="c", width=4, height=2, fx=3, fy=3, cx=2, cy=1)
+    pixels = np.zeros((2, 4), np.uint8)
+    sink.process(Image(stamp=7, frame="c", data=pixels), info)
+    until(lambda: peer.tokens("@ros2_lv/0/*/*/*/MP/*/*/*/%camera_info/**"))
+    for stamp in (8, 9):
+        sink.process(Image(stamp=stamp, frame="c", data=pixels), info)
+    until(lambda: len(came) >= 2)
+    stamps = [JAZZY.deserialize_cdr(each.payload.to_bytes(), kind).header.stamp.nanosec for each in came]
+    assert stamps[-2:] == [8, 9]
+    sink.close()
