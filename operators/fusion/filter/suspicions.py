@@ -52,8 +52,8 @@ class Suspicions:
         """Returns these and one of a sensor, without evidence if it is new."""
         if sensor in self.sensors:
             return self
-        sums = (np.append(one, 0.0) for one in (self.score, self.information, self.variance))
-        return Suspicions((*self.sensors, sensor), (*self.kinds, kind), *sums, self.time)
+        score, information, variance = (np.append(one, 0.0) for one in (self.score, self.information, self.variance))
+        return Suspicions((*self.sensors, sensor), (*self.kinds, kind), score, information, variance, self.time)
 
     def after(self, time: int, state: State, residual: Array, H: Array, noise: Array, signature: Array) -> Suspicions:
         """Returns these after the residual (M,) of a measurement, with what an error adds to it (M, S)."""
