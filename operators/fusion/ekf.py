@@ -32,7 +32,7 @@ from operators.fusion.filter.history import Measurement
 from operators.fusion.filter.imu_dropout import ImuDropout
 from operators.fusion.filter.initialisation import Prior, coasting_node, prior_of
 from operators.fusion.filter.late_filter import FilterConfig, LateFilter
-from operators.fusion.output import diagnostics, figures, odometry_of, unmeasured, well_known
+from operators.fusion.output import diagnostics, figures, odometry_of, suspicion_of, unmeasured, well_known
 from operators.fusion.sensors.constraints import Constraints
 from operators.fusion.sensors.covariances import Unusable
 from operators.fusion.sensors.inertial import InertialConfig, InertialSensor
@@ -79,7 +79,8 @@ class EkfFusion(Operator):
 
     A sensor's time offset is a setting, `offset`; with `offset_sigma` it is a state of the filter and estimated, as far
     as the motion makes it observable. So are a position's error that changes slowly, as satellites have (`drift`), and
-    the scale of wheels (`scale_sigma`): taken for white noise, these would make the covariance too small.
+    the scale of wheels (`scale_sigma`): taken for white noise, these would make the covariance too small. Late stamps
+    of places and speeds of a wrong scale that were not told are looked for in the innovations, and warned of.
 
     `standstill` and `slip` say what is known of the motion without a sensor of it (wheels say both by themselves).
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
@@ -332,6 +333,8 @@ class EkfFusion(Operator):
             others["filter"] = f"{count} headings in question"
         if self.state.filter.refuted_heading:
             others["heading"] = "the first heading that was told is wrong: measurements contradict it"
+        if (found := self.state.filter.suspicion) is not None:
+            others |= suspicion_of(*found)
         if self.state.dropout.lasts(stamp):
             others["inertial sensor"] = "silent: the motion is bridged by what others see"
         if (warnings := self.state.alarms.due(stamp, health, self.state.filter.ignored, self._gates, others)) is None:

@@ -12,6 +12,7 @@ from dataflow.messages.diagnostics import Level
 from operators.fusion.filter.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, cross
 from operators.fusion.filter.far import UNMEASURED
 from operators.fusion.filter.gate import Health
+from operators.fusion.filter.suspicions import LATE
 from operators.geometry.se3 import skew
 from operators.status import Row, status_of_rows
 
@@ -33,6 +34,16 @@ def unmeasured(covariance: Array) -> dict[str, str]:
     if z < UNMEASURED or max(x, y) >= UNMEASURED:
         return {}
     return {"height": "nothing measures it (fixes without altitude): z of the odometry has no meaning"}
+
+
+def suspicion_of(sensor: str, kind: str, size: float, sigma: float) -> dict[str, str]:
+    """Returns a warning of a sensor's error that was not told: of its stamps (s), or of the scale of its speeds."""
+    if kind == LATE:
+        side = "late" if size > 0 else "early"
+        text = f"its stamps are {abs(size):.2f} ± {sigma:.2f} s {side} (offset), or its place on the robot is wrong"
+        return {sensor: text}
+    side = "fast" if size > 0 else "slow"
+    return {sensor: f"its speeds are {abs(size):.1%} ± {sigma:.1%} too {side} (scale_sigma)"}
 
 
 def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame: str, child_frame: str) -> Odometry:

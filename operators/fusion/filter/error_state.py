@@ -27,8 +27,9 @@ _I3, _I15 = np.eye(3), np.eye(SIZE)
 class State:
     """An estimate: position (3,) and velocity (3,) in the world, R_world_body (3, 3), biases (3,), covariance.
 
-    `errors` (K,): lasting errors of sensors, such as time offsets; `covariance` is (15 + K, 15 + K). A body
-    without inertial sensor has the angular velocity -gyro_bias: it is an inertial body whose sensor reads 0.
+    `errors` (K,): lasting errors of sensors, such as time offsets; `covariance` is (15 + K, 15 + K). `effects`
+    (15 + K, S): by how much the estimate is wrong for each unit of S suspected errors, which it does not contain. A
+    body without inertial sensor has the angular velocity -gyro_bias: it is an inertial body whose sensor reads 0.
     """
 
     position: Array
@@ -38,6 +39,7 @@ class State:
     accel_bias: Array
     covariance: Array
     errors: Array = field(default_factory=lambda: np.zeros(0))
+    effects: Array = field(default_factory=lambda: np.zeros((SIZE, 0)))
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,8 @@ def propagated(
     F[ROTATION, ROTATION] = step.T
     F[ROTATION, GYRO_BIAS] = middle.T * -dt
     left = 1.0 - wander.decay * dt
-    P = _carried(F, left, state.covariance)
+    G = _with_errors(F, left)
+    P = np.asarray(G @ state.covariance @ G.T)
     own, shared = _spread(noise, dt)
     diagonal = _diagonal(P, 0)
     diagonal[:SIZE] += own
@@ -132,6 +135,7 @@ def propagated(
         accel_bias=state.accel_bias,
         covariance=P,
         errors=left * state.errors,
+        effects=G @ state.effects if state.effects.size else state.effects,
     )
 
 
@@ -152,13 +156,13 @@ def _diagonal(square: Array, beside: int) -> Array:
     return square.reshape(-1)[beside if beside >= 0 else -beside * side :: side + 1]
 
 
-def _carried(F: Array, left: Array, covariance: Array) -> Array:
-    """The covariance after a motion F (15, 15) that leaves a share (K,) of the sensors' errors."""
-    if len(covariance) == SIZE:
-        return np.asarray(F @ covariance @ F.T)
+def _with_errors(F: Array, left: Array) -> Array:
+    """The transition (15 + K, 15 + K) by F (15, 15) of a state of whose sensors' errors a share (K,) is left."""
+    if not len(left):
+        return F
     G = np.diag(np.concatenate([np.ones(SIZE), left]))
     G[:SIZE, :SIZE] = F
-    return np.asarray(G @ covariance @ G.T)
+    return np.asarray(G)
 
 
 def shifted(state: State, rate: Array, acceleration: Array, seconds: float) -> State:
@@ -181,6 +185,7 @@ def moved(state: State, error: Array, covariance: Array | None = None) -> State:
         accel_bias=state.accel_bias + error[ACCEL_BIAS],
         covariance=state.covariance if covariance is None else covariance,
         errors=state.errors + error[SIZE:],
+        effects=state.effects,
     )
 
 
@@ -198,8 +203,11 @@ def difference(state: State, other: State) -> Array:
     )
 
 
-def updated(state: State, residual: Array, H: Array, R: Array) -> State:
-    """Corrects the state by a residual (M,) with Jacobian (M, 15 + K) and covariance (M, M); Joseph's form."""
+def updated(state: State, residual: Array, H: Array, R: Array, suspected: Array | None = None) -> State:
+    """Corrects the state by a residual (M,) with Jacobian (M, 15 + K) and covariance (M, M); Joseph's form.
+
+    `suspected` (M, S): the part of the residual that each unit of a suspected error makes; None for no part.
+    """
     P = state.covariance
     PH = P @ H.T
     K = np.linalg.solve(H @ PH + R, PH.T).T
@@ -210,6 +218,9 @@ def updated(state: State, residual: Array, H: Array, R: Array) -> State:
     reset = unit.copy()  # the error is from now on one of the corrected rotation
     reset[ROTATION, ROTATION] -= 0.5 * skew(error[ROTATION])
     P = reset @ P @ reset.T
+    if state.effects.size:
+        effects = A @ state.effects + (0.0 if suspected is None else K @ suspected)
+        state = replace(state, effects=reset @ effects)
     return moved(state, error, 0.5 * (P + P.T))
 
 

@@ -12,6 +12,7 @@ from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import Noise, State
 from operators.fusion.filter.gate import Health
 from operators.fusion.filter.measurements import Model
+from operators.fusion.filter.suspicions import Suspicions
 
 Array = NDArray[np.float64]
 
@@ -48,12 +49,14 @@ Entry = Sample | Measurement | Command
 class Hypothesis:
     """One of several estimates, with the logarithm of its weight.
 
-    `against`: what was told of the first heading, which it is followed against for a time in motion.
+    `against`: what was told of the first heading, which it is followed against for a time in motion; `suspicions`: of
+    errors that its sensors were not told to have.
     """
 
     weight: float
     state: State
     against: bool = False
+    suspicions: Suspicions = field(default_factory=Suspicions)
 
 
 @dataclass(frozen=True, eq=False)

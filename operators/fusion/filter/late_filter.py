@@ -36,7 +36,9 @@ from operators.fusion.filter.history import (
     Sample,
 )
 from operators.fusion.filter.hypotheses import combined, likely, moves, reduced, refuted, with_errors
+from operators.fusion.filter.measurements import Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
+from operators.fusion.filter.suspicions import LATE, suspected
 
 Array = NDArray[np.float64]
 TOO_LATE = ": too late"
@@ -117,6 +119,12 @@ class LateFilter(Remembered):
         """Returns whether what was measured contradicts what was told of the first heading, of late."""
         node = self._newest()
         return node.refuted and node.moving < _STANDS
+
+    @property
+    def suspicion(self) -> tuple[str, str, float, float] | None:
+        """The error that a sensor was not told to have, as `Suspicions.found`; None while several estimates stand."""
+        hypotheses = likely(self._newest().hypotheses)
+        return hypotheses[0].suspicions.found if len(hypotheses) == 1 else None
 
     def feel(self, sample: Sample) -> None:
         """Takes an inertial sample, later than the last one."""
@@ -278,13 +286,37 @@ class LateFilter(Remembered):
         else:
             hypotheses = reduced(
                 [
-                    replace(h, weight=h.weight - 0.5 * (nis + spread), state=updated(h.state, r, J, entry.noise))
+                    self._updated(
+                        replace(h, weight=h.weight - 0.5 * (nis + spread)), entry, r, J, node, verdict == "used"
+                    )
                     for h, (r, J), (nis, spread) in zip(hypotheses, found, scores, strict=True)
                 ],
                 node.moving,
             )
         told_wrongly = refuted(hypotheses, node.refuted)
         return replace(node, hypotheses=hypotheses, health={**node.health, entry.sensor: after}, refuted=told_wrongly)
+
+    def _updated(
+        self, h: Hypothesis, entry: Measurement, residual: Array, H: Array, node: Node, counts: bool
+    ) -> Hypothesis:
+        """Returns a hypothesis after a measurement, which `counts` as evidence of errors that were not told."""
+        state, suspicions, model = h.state, h.suspicions, entry.model
+        kind = suspected(model)
+        if entry.clock >= 0 if kind == LATE else entry.sensor in dict(self._config.errors.scales):
+            kind = None  # it is estimated
+        if kind is not None:
+            suspicions = suspicions.of(entry.sensor, kind)
+            new = len(suspicions.sensors) - state.effects.shape[1]
+            state = replace(state, effects=np.pad(state.effects, ((0, 0), (0, new)))) if new else state
+        if not suspicions.sensors:
+            return replace(h, state=updated(state, residual, H, entry.noise))
+        signature = np.zeros((len(residual), len(suspicions.sensors)))
+        if kind is not None:
+            own = model.value if isinstance(model, Velocity) else -self._change(entry, state, node)
+            signature[:, suspicions.sensors.index(entry.sensor)] = own
+        if counts:
+            suspicions = suspicions.after(entry.time, state, residual, H, entry.noise, signature)
+        return replace(h, state=updated(state, residual, H, entry.noise, signature), suspicions=suspicions)
 
     def _found(
         self, entry: Measurement, hypotheses: Sequence[Hypothesis], node: Node

@@ -58,8 +58,10 @@ class Drive:
         jump: tuple[float, float] = (0, 0),
         out: tuple[float, float] = (0, 0),
         late: float = 0.0,
+        stamped: float = 0.0,
     ) -> list[Event]:
-        """Positions, all of them `off` (m), 5 m more within `jump` (s), none within `out`; they come `late` (s)."""
+        """Positions, all of them `off` (m), 5 m more within `jump` (s), none within `out`; they come `late` (s), and
+        their stamps are late by `stamped` (s)."""
         made: list[Event] = []
         for k in range(0, len(self.t), RATE // 5):
             x, sigma = self.t[k], np.array([0.05, 0.05, 0.1])
@@ -67,7 +69,7 @@ class Drive:
             if jump[0] <= x < jump[1]:
                 place = place + np.array([5.0, 0, 0])
             fix = Pose(
-                stamp=stamp_of(x),
+                stamp=stamp_of(x + stamped),
                 frame="world",
                 child_frame="base_link",
                 position=place,
@@ -75,7 +77,7 @@ class Drive:
                 covariance=np.diag([*sigma**2, 1, 1, 1]),
             )
             if not out[0] <= x < out[1]:
-                made.append((stamp_of(x + late), "fix", fix))
+                made.append((stamp_of(x + max(late, stamped)), "fix", fix))
         return made
 
     def wheels(self, factor: float, begin: float = 5.0, end: float = 8.0) -> list[Event]:
@@ -232,6 +234,36 @@ def test_wheels_that_spin_by_less_than_the_inertial_sensor_can_exclude_are_named
     assert 5.0 <= run.alarms["robot/wheels"][0][0] <= 6.0
 
 
+@pytest.mark.parametrize("late", [0.2, 0.5])
+def test_late_stamps_of_positions_beside_wheels_are_named_with_their_offset(late: float) -> None:
+    drive = Drive(15.0)
+    run = Run(drive, drive.fixes(stamped=late), drive.wheels(1.0))
+    found = [(at, text) for at, text in run.alarms["robot/fix"] if text.startswith("its stamps are")]
+    assert found[0][0] < 10.0
+    assert abs(float(found[-1][1].split()[3]) - late) < 0.15
+    assert "s late" in found[-1][1]
+    assert "robot/wheels" not in run.alarms
+
+
+def test_wheels_of_a_wrong_scale_are_named_with_it() -> None:
+    drive = Drive(12.0)
+    run = Run(drive, drive.fixes(), drive.wheels(1.05, 0.0, 12.0))
+    text = run.alarms["robot/wheels"][-1][1]
+    assert abs(float(text.split()[3].rstrip("%")) - 5.0) < 2.0
+    assert "too fast" in text
+    assert run.alarms["robot/wheels"][0][0] < run.alarms.get("robot/fix", [(12.0, "")])[0][0]
+
+
+def test_an_offset_or_a_scale_that_is_estimated_is_not_warned_of() -> None:
+    drive = Drive(12.0)
+    settings = {
+        "robot/fix": {"use": "position", "offset_sigma": 0.2},
+        "robot/wheels": {"use": "wheels", "sigma": 0.03, "scale_sigma": 0.05},
+    }
+    run = Run(drive, drive.fixes(stamped=0.1), drive.wheels(1.05, 0.0, 12.0), sensors=settings)
+    assert not run.alarms
+
+
 def test_a_drive_without_faults_raises_no_alarm() -> None:
     drive = Drive(15.0)
     assert not Run(drive, drive.fixes(out=(6.0, 9.0)), drive.wheels(1.0)).alarms
@@ -259,17 +291,19 @@ def test_a_snapshot_from_before_there_were_alarms_is_refused() -> None:
         operator.restore(old)
 
 
-def heading_of(drive: Drive, wrong: float) -> Array:
+def heading_of(drive: Drive, wrong: float, *sensors: list[Event]) -> Array:
     """Returns of each pose its time (s), error and claimed deviation of the heading (rad), and if a warning stood."""
-    operator = EkfFusion(patience=0.5, heading=drive.heading + wrong, heading_sigma=0.05)
+    settings = {"robot/wheels": {"use": "wheels", "sigma": 0.03}}
+    operator = EkfFusion(patience=0.5, heading=drive.heading + wrong, heading_sigma=0.05, sensors=settings)
     operator.setup()
     rows, warned = [], False
-    for now, name, message in sorted(drive.imu + drive.fixes(), key=lambda e: e[:2]):
+    events = sorted((e for s in (drive.imu, drive.fixes(), *sensors) for e in s), key=lambda e: e[:2])
+    for now, name, message in events:
         made = operator.process({f"ns/robot/{name}": message}, Context(now)) or {}
         if (status := made.get("status")) is not None:
             levels = dict(zip(status.names, status.levels, strict=True))
             warned = Level.WARN in (levels["filter"], levels.get("heading"))
-        if (pose := made.get("odometry")) is not None:
+        if name == "imu" and (pose := made.get("odometry")) is not None:
             time = (now - 10**9) * 1e-9
             turned = (float(yaw_of(pose.orientation)) - 0.9 * np.sin(0.7 * time) + np.pi) % (2 * np.pi) - np.pi
             rows.append((time, abs(turned), np.sqrt(pose.pose_covariance[5, 5]), warned))
@@ -293,6 +327,15 @@ def test_a_first_heading_told_wrongly_is_warned_of_within_a_second_and_while_it_
         assert warned[~late].any()
         assert errors[-600:].mean() < 0.3
     assert np.concatenate(told).mean() >= 0.95
+
+
+@pytest.mark.parametrize("wrong", [0.5, -0.5])
+def test_a_first_heading_told_wrongly_is_found_out_by_wheels(wrong: float) -> None:
+    drive = Drive(5.0)
+    time, errors, claimed, warned = heading_of(drive, wrong, drive.wheels(1.0)).T
+    late = time >= time[0] + 1.0
+    assert (errors <= 3 * claimed)[late].mean() >= 0.95
+    assert warned[~late].any()
 
 
 def test_a_first_heading_told_rightly_raises_no_doubt_and_costs_no_confidence() -> None:
