@@ -14,7 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from dataflow.execution.calls import Calls, entries_of, value_of
+from dataflow.execution.calls import Calls, value_of
 from dataflow.execution.effects.journal import RecordedJournal
 from dataflow.execution.failure import RAISED, readable
 from dataflow.execution.snapshots import pack_state, unpack_state
@@ -24,6 +24,7 @@ from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import differences
 from dataflow.state import plain, typed
 from dataflow.sync import NEVER, Entry, Firing, InputValue
+from dataflow.sync.entries import entries_of
 
 FORMAT = 1
 BEFORE = 2

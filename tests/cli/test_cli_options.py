@@ -81,6 +81,8 @@ UNANSWERED: tuple[str, ...] = (
 
 ELSEWHERE: dict[str, tuple[str, str]] = {
     "convert": ("*", "tests/cli/test_cli_convert.py has a table"),
+    "sweep": ("*", "each recording is a process: test_cli_sweep.py"),
+    "compare": ("*", "the same: test_cli_sweep.py"),
     "doctor": ("--json", "it measures the machine for seconds: tests/doctor"),
     "completion": ("--install", "it writes into the home folder: test_cli_completion.py"),
     "run": ("--step", "it needs a terminal's keys: tests of playback"),

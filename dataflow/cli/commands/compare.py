@@ -62,8 +62,8 @@ def compare(
 
     Examples:
 
-      dataflow compare perception --recordings runs --set b:detector.weights=new.onnx
-      dataflow compare graphs/slam.yaml --recordings runs --set a:slam.voxel=0.1 --set b:slam.voxel=0.2 --json
+      dataflow compare perception --recordings runs --set b:cloud.stride=8
+      dataflow compare graphs/cloud.yaml --recordings runs --set b:cloud.rate=5 --json
     """
     choices = _choices(settings or ())
     with friendly_errors():

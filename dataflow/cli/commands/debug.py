@@ -132,7 +132,7 @@ def capture(
 
       dataflow capture run.mcap --op tracker
       dataflow capture run.mcap --op tracker --firing 412 --to test_lost_track.py
-      dataflow capture run.mcap --op detector --predicate "len(out.detections.boxes) > 100"
+      dataflow capture run.mcap --op detector --predicate "out.detections is None"
     """
     with friendly_errors():
         recording = existing_recording(recording)

@@ -116,9 +116,9 @@ def sweep(
 
     Examples:
 
-      dataflow sweep graphs/cloud.yaml --recordings recordings --set cloud.stride=4,8
+      dataflow sweep graphs/cloud.yaml --recordings runs --set cloud.stride=4,8
       dataflow sweep --recordings runs --what verify --jobs 2
-      dataflow sweep perception --recordings runs --what evaluate --out out/scores --json
+      dataflow sweep perception --recordings runs --what evaluate --json
       dataflow sweep perception --recordings s3://bucket/runs --ray auto
     """
     task = _checked(what, jobs, maps)
