@@ -199,9 +199,10 @@ def drifts(steps: list[Any], rig: StereoRig) -> None:
         print(f"| {name} | {np.sqrt(np.mean(off[0] ** 2)):.2f} | {np.sqrt(np.mean(off[1] ** 2)):.2f} |")
 
 
-def offsets(name: str, drive: Drive) -> None:
-    """Prints drift forwards and backwards with right images shifted by whole pixels, and how far errors leave sigma."""
-    for way, chosen in (("forwards", slice(None)), ("backwards", slice(None, None, -1))):
+def offsets(name: str, drive: Drive, first: int) -> None:
+    """Prints drift and squared errors in sigmas with right images shifted by whole pixels, forwards from a pair on and
+    backwards."""
+    for way, chosen in (("forwards", slice(first, None)), ("backwards", slice(None, None, -1))):
         truth = drive.truth[chosen]
         for pixels in (0, 1, -1, 2):
             odometry, results = StereoOdometry(drive.rig), list[TrackResult]()
@@ -251,9 +252,9 @@ def main() -> None:
     if arguments.what == "gaps":
         gaps("street", drive, STREET, ("went on", "came back"))
         return
-    offsets("KITTI 06 from 5", Drive(drive.left[5:], drive.right[5:], drive.truth[5:], rig))
+    offsets("KITTI 06", drive, 12)
     for seed in (1, 2):
-        offsets(f"motorway {seed}", Drive(*stereo_road.motorway(seed, 51), stereo_road.RIG))
+        offsets(f"motorway {seed}", Drive(*stereo_road.motorway(seed, 51), stereo_road.RIG), 0)
 
 
 if __name__ == "__main__":
