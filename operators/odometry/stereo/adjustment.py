@@ -23,7 +23,7 @@ from operators.geometry.se3 import Matrix
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
 # Information on the disparities' offset, 1/px², as windows have it. They share most of their sightings, and tracks
-# near each other err together, so an offset is far less certain than the sum of all says.
+# near each other err together, so an offset is far less certain than their sum suggests.
 FIRST = 100.0  # of an unknown rig, that it has none: a fifth of what a window shows
 MOST = 2e4  # of the past, some 40 windows: rigs bend
 NEAR = 0.3  # metres; nearer points are behind or in the lens
