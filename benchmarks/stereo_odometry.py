@@ -2,6 +2,7 @@
 
 python benchmarks/stereo_odometry.py           drift and time; decoding is excluded
 python benchmarks/stereo_odometry.py gaps      black images in the drive, and where the car is taken to be after
+python benchmarks/stereo_odometry.py offsets   right images shifted, in the drive and on a made motorway
 """
 
 from __future__ import annotations
@@ -22,14 +23,16 @@ sys.path.insert(0, str(REPOSITORY))
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
+import stereo_road  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
+from operators.geometry import se3  # noqa: E402
 from operators.geometry.extrinsics import transform_between  # noqa: E402
 from operators.odometry.stereo.adjustment import StereoRig  # noqa: E402
 from operators.odometry.stereo.odometry import rig_of  # noqa: E402
 from operators.odometry.stereo.tracker import StereoOdometry  # noqa: E402
-from operators.odometry.tracking import MEASURED  # noqa: E402
+from operators.odometry.tracking import MEASURED, TrackResult  # noqa: E402
 from operators.simulator import SimulatedRobot  # noqa: E402
 from operators.sources import KittiOdometry  # noqa: E402
 
@@ -179,7 +182,7 @@ def drifts(steps: list[Any], rig: StereoRig) -> None:
             estimate.append(result.T_world_camera)
             truth.append(step["ground_truth"].matrix())
         end, segments = drift(estimate, truth)
-        offset = odometry.state.offset
+        offset = odometry.state.offset.pixels
         cells = f"{end:.2f} | {from_the_end(estimate, truth):.2f} | {segments:.2f} | {tracked}/{len(estimate)}"
         print(f"| {name} | {cells} | {offset:.2f} | {np.median(wall):.0f} | {np.median(cpu):.0f} |")
         whole[name] = estimate
@@ -196,9 +199,26 @@ def drifts(steps: list[Any], rig: StereoRig) -> None:
         print(f"| {name} | {np.sqrt(np.mean(off[0] ** 2)):.2f} | {np.sqrt(np.mean(off[1] ** 2)):.2f} |")
 
 
+def offsets(name: str, drive: Drive, first: int) -> None:
+    """Prints drift and squared errors in sigmas with right images shifted by whole pixels, forwards from a pair on and
+    backwards."""
+    for way, chosen in (("forwards", slice(first, None)), ("backwards", slice(None, None, -1))):
+        truth = drive.truth[chosen]
+        for pixels in (0, 1, -1, 2):
+            odometry, results = StereoOdometry(drive.rig), list[TrackResult]()
+            for k, (left, right) in enumerate(zip(drive.left[chosen], drive.right[chosen], strict=True)):
+                results.append(odometry.track(left, np.roll(right, pixels, axis=1), k * PERIOD))
+            estimate = [r.T_world_camera for r in results]
+            end, segments = drift(estimate, truth)
+            errors = [se3.log(invert(invert(truth[0]) @ T) @ found) for T, found in zip(truth, estimate, strict=True)]
+            squared = [e @ np.linalg.solve(r.covariance, e) / 6 for e, r in zip(errors[1:], results[1:], strict=True)]
+            cells = f"{end:.2f} | {segments:.2f} | {odometry.state.offset.pixels:.2f} | {np.median(squared):.2f}"
+            print(f"| {name}, {way} | {pixels} | {cells} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["drift", "gaps"], nargs="?", default="drift")
+    parser.add_argument("what", choices=["drift", "gaps", "offsets"], nargs="?", default="drift")
     parser.add_argument("worlds", nargs="*", default=[], help="KIND:SEED of simulated worlds, for gaps")
     parser.add_argument("--cache", type=Path, default=Path("out") / "stereo_odometry", help="folder of rendered drives")
     data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data") / "kitti_odometry_06"
@@ -212,6 +232,9 @@ def main() -> None:
             "| after the gap | gaps | pairs | said to be known | right | wrong | worst m | first known after, pairs |"
         )
         print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
+    if arguments.what == "offsets":
+        print("| drive | shift px | end point % | 10-40 m segments % | offset px | NEES/6, median |")
+        print("| --- | ---: | ---: | ---: | ---: | ---: |")
     for world in arguments.worlds:
         gaps(world.replace(":", " "), simulated(arguments.cache, world), ROOM, ("went on",))
     if arguments.worlds:
@@ -221,12 +244,17 @@ def main() -> None:
     statics = source.static_outputs()
     rig = rig_of(statics["left_info"], statics["right_info"])  # type: ignore[arg-type]
     steps: list[Any] = list(source.stream())
-    if arguments.what == "gaps":
-        left, right = [step["left"].data for step in steps], [step["right"].data for step in steps]
-        drive = Drive(left, right, [step["ground_truth"].matrix() for step in steps], rig)
-        gaps("street", drive, STREET, ("went on", "came back"))
-    else:
+    if arguments.what == "drift":
         drifts(steps, rig)
+        return
+    left, right = [step["left"].data for step in steps], [step["right"].data for step in steps]
+    drive = Drive(left, right, [step["ground_truth"].matrix() for step in steps], rig)
+    if arguments.what == "gaps":
+        gaps("street", drive, STREET, ("went on", "came back"))
+        return
+    offsets("KITTI 06", drive, 12)
+    for seed in (1, 2):
+        offsets(f"motorway {seed}", Drive(*stereo_road.motorway(seed, 51), stereo_road.RIG), 0)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from operators.odometry.rgbd.surface import Array32, DepthNoise, Surface
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
 SLACK = 0.02  # metres along a ray that a tilted or rough surface makes up within one patch
+UNTOLD = 1e-3  # 1/m² and 1/rad²: information along what measurements do not determine
 NOTHING: Vector = np.zeros(0)
 
 
@@ -33,6 +34,11 @@ class Normal:
     seen: int  # measurements that could be compared
     squared: Vector  # (N,) squared residuals, in units of sigma, of those within the gate
 
+    def __add__(self, other: "Normal") -> "Normal":
+        """Returns both measurements as one."""
+        squared = np.concatenate([self.squared, other.squared])
+        return Normal(self.H + other.H, self.b + other.b, self.seen + other.seen, squared)
+
     @property
     def inliers(self) -> int:
         """Measurements within three sigmas."""
@@ -42,6 +48,14 @@ class Normal:
     def median(self) -> float | None:
         """Squared residual in the median, in units of sigma; None without any."""
         return float(np.median(self.squared)) if len(self.squared) else None
+
+
+def disagreement(one: Normal, other: Normal) -> float:
+    """Returns a sixth of the squared distance between the poses that either would give alone, in units of what both
+    believe to err by: 1 where they are right about that."""
+    a, b = (part.H + UNTOLD * np.eye(6) for part in (one, other))
+    apart = np.linalg.solve(b, other.b) - np.linalg.solve(a, one.b)
+    return float(apart @ np.linalg.solve(np.linalg.inv(a) + np.linalg.inv(b), apart)) / 6
 
 
 class Term(Protocol):

@@ -11,13 +11,13 @@ from operators.geometry.perspective import agreed_pose
 from operators.geometry.pinhole import Pixels, Points, project
 from operators.geometry.se3 import Matrix
 from operators.odometry.motion import Motion
-from operators.odometry.rgbd.alignment import Freedom, PixelTerm, PlaneTerm, PriorTerm, align
+from operators.odometry.rgbd.alignment import Freedom, Normal, PixelTerm, PlaneTerm, PriorTerm, align, disagreement
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.frame import Frame
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.movers import Movers
-from operators.odometry.rgbd.noise import Noise
+from operators.odometry.rgbd.noise import AGREED, Noise
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 
 # Share of the summed information that is believed. Neighbouring residuals err together (depth noise is smooth
@@ -28,7 +28,8 @@ PIXEL_STRENGTH = 0.2
 # believe too little where all is well. Calibration, rolling shutters and unsynchronised images err alike in every
 # residual, so no count averages them out, but tracks then miss by more than they jitter. And what moves by less than a
 # gate is wide pulls a pose along by its share of the view, however many residuals there are; it shows as a share of
-# the depth and of the tracks that disagree.
+# the depth and of the tracks that disagree. What draws tracks and depth apart by more than both believe to err by does
+# so at one keyframe after another, so its errors add up: variances grow with the square of the disagreement.
 SYSTEMATIC = 0.43
 JITTER = 0.38  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
 CONTESTED = 120.0  # of the product of both shares, and of the square of the gate
@@ -39,10 +40,10 @@ RIVAL = 0.33  # of the tracks that agree: as many that agree on another motion c
 STAGES = ((4, 0.15, 2), (2, 0.06, 2))  # stride over patches, gate in metres, iterations
 
 
-def systematic(missed: float) -> float:
+def systematic(missed: float, disagreement: float) -> float:
     """Returns how much larger variances are, for what errs alike in all residuals, where tracks miss by so many working
-    pixels."""
-    return max(1.0, missed / JITTER) ** 4
+    pixels, and tracks and depth disagree by so much."""
+    return max(1.0, missed / JITTER) ** 4 + max(1.0, disagreement / AGREED) ** 2 - 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ class Fit:
     def covariance(self) -> Matrix:
         """(6, 6) of the pose against its references, right perturbation: see SYSTEMATIC."""
         gate = max(1.0, self.noise.pixel / JITTER) ** 2
-        misfit = systematic(self.missed) + CONTESTED * gate * self.contested
+        misfit = systematic(self.missed, self.noise.disagreement) + CONTESTED * gate * self.contested
         return SYSTEMATIC * misfit * np.asarray(np.linalg.inv(self.information + self.prior), np.float64)
 
     @property
@@ -230,11 +231,17 @@ class Fitter:
             offered=len(points) * len(depth),
             compared=sum(part.seen for part in depth),
             agreeing=sum(part.inliers for part in depth),
-            noise=self.noise.after(followed, depth[0].median if depth and followed is not None else None),
+            noise=self.noise if followed is None else self._learnt(corners[0], depth),
             missed=self.noise.missed(followed),
             movers=movers,
             sighting=sighting,
         )
+
+    def _learnt(self, tracks: Normal, depth: Sequence[Normal]) -> Noise:
+        """Returns the noise after a frame's fit."""
+        if not depth:
+            return self.noise.after(tracks.median, None, None)
+        return self.noise.after(tracks.median, depth[0].median, disagreement(tracks, sum(depth[1:], depth[0])))
 
     def _planes(self, points: Points, references: Sequence[Keyframe], freedom: Freedom, gate: float) -> list[PlaneTerm]:
         noise, scale = self.config.depth_noise, self.noise.depth

@@ -9,11 +9,14 @@ PIXEL_BOUNDS = (0.2, 3.0)  # working pixels
 DEPTH_BOUNDS = (0.2, 3.0)  # of the depth noise that was declared
 MEDIAN_OF_TWO = 1.386  # median of the squared length of two unit normals
 MEDIAN_OF_ONE = 0.455  # of one
+AGREED = 0.25  # disagreement of tracks and depth in the median of simulated worlds, whose calibration is right
+OUTLIER = 10.0  # times what was learnt: a frame that disagrees by more counts as that much
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations: of a feature track, working pixels, and of a depth as a share of what was declared.
+    """Standard deviations: of a feature track, working pixels, and of a depth as a share of what was declared; and by
+    how much tracks and depth disagree on poses, see `disagreement`.
 
     A gate of three sigmas separates moving from static points only if sigma is that of this camera: tracks of a
     registered camera err by 0.2 pixels, those of an unregistered one by several.
@@ -21,12 +24,16 @@ class Noise:
 
     pixel: float = 1.0
     depth: float = 1.0
+    disagreement: float = AGREED
 
-    def after(self, pixel_median: float | None, depth_median: float | None) -> "Noise":
-        """Returns the noise after a frame's median squared residuals, each in units of the sigma so far."""
+    def after(self, pixel_median: float | None, depth_median: float | None, disagreement: float | None) -> "Noise":
+        """Returns the noise after a frame's median squared residuals, each in units of the sigma so far, and by how
+        much its tracks and its depth disagree."""
+        seen = self.disagreement if disagreement is None else min(disagreement, OUTLIER * self.disagreement)
         return Noise(
             _blend(self.pixel, pixel_median, MEDIAN_OF_TWO, PIXEL_BOUNDS),
             _blend(self.depth, depth_median, MEDIAN_OF_ONE, DEPTH_BOUNDS),
+            (1.0 - RATE) * self.disagreement + RATE * seen,
         )
 
     def missed(self, pixel_median: float | None) -> float:

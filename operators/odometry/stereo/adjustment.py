@@ -4,7 +4,8 @@ Gauss-Newton over left column, row and right column of every sighting, reweighte
 Triggs et al., "Bundle adjustment, a modern synthesis", 2000.
 
 A pair that is rectified imperfectly has disparities that are off by a constant, which scales all depths and, with
-them, the way. Near and far points then disagree on how far the camera came, so the constant is estimated as well.
+them, the way. Near and far points then disagree on how far the camera came, so the constant is estimated as well:
+each window counts for what it shows with all poses and points free, so the first few settle it.
 """
 
 from dataclasses import dataclass
@@ -21,8 +22,10 @@ from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
-SLOWNESS = 3.0  # windows that the disparity's offset is averaged over
-OFFSET_SIGMA = 0.3  # pixels of offset that an unknown rig may have
+# Information on the disparities' offset, 1/px², as windows have it. They share most of their sightings, and tracks
+# near each other err together, so an offset is far less certain than their sum suggests.
+FIRST = 100.0  # of an unknown rig, that it has none: a fifth of what a window shows
+MOST = 2e4  # of the past, some 40 windows: rigs bend
 NEAR = 0.3  # metres; nearer points are behind or in the lens
 
 
@@ -111,16 +114,28 @@ class Sightings:
         return np.asarray((times > 0) & (total < 12.0 * np.maximum(times, 1)), np.bool_)
 
 
+@dataclass(frozen=True)
+class Offset:
+    """Holds what right columns are off by, in pixels, and the information on it, 1/px², of all windows so far."""
+
+    pixels: float = 0.0
+    information: float = FIRST
+
+    def after(self, pixels: float, information: float) -> "Offset":
+        """Returns what is believed after a window that moved the offset to these pixels with this information."""
+        return Offset(pixels, min(self.information + information, MOST))
+
+
 @dataclass(frozen=True, eq=False)
 class Adjusted:
     """Poses (W, 4, 4), points (M, 3) in the world, squared errors (S,) in sigmas, information (6, 6) of the last
-    pose, and the offset of disparities in pixels."""
+    pose, and the disparities' offset."""
 
     poses: NDArray[np.float64]
     points: Points
     squared: NDArray[np.float64]
     information: Matrix
-    offset: float
+    offset: Offset
 
 
 def adjust(
@@ -128,13 +143,13 @@ def adjust(
     poses: NDArray[np.float64],
     points: Points,
     seen: Sightings,
-    offset: float,
+    believed: Offset,
     sigma: float,
     fixed: int,
     iterations: int,
 ) -> Adjusted:
     """Improves poses T_world_camera (W, 4, 4) after the first `fixed` ones, and points (M, 3) in the world."""
-    poses, points, believed = poses.copy(), points.copy(), offset
+    poses, points, offset, told = poses.copy(), points.copy(), believed.pixels, 0.0
     free = len(poses) - fixed
     by_offset = np.broadcast_to(np.array([[0.0], [0.0], [1.0 / sigma]]), (len(seen.frames), 3, 1))
     for iteration in range(iterations + 1):
@@ -153,10 +168,11 @@ def adjust(
             break
         system.damp_points(0.0, 1e-6)
         S, g = system.reduced()
-        told = SLOWNESS * max(float(S[-1, -1]), 0.0) + 1.0 / OFFSET_SIGMA**2
-        S[-1, -1] += told
-        g[-1] += told * (offset - believed)
-        x = gauss_newton_step(S + 1e-9 * np.eye(len(S)), g)
+        S += 1e-9 * np.eye(len(S))
+        told = max(float(S[-1, -1] - S[-1, :-1] @ np.linalg.solve(S[:-1, :-1], S[:-1, -1])), 0.0)
+        S[-1, -1] += believed.information
+        g[-1] += believed.information * (offset - believed.pixels)
+        x = gauss_newton_step(S, g)
         moves = x[:-1].reshape(free, 6)
         poses[fixed:] = np.array([T @ se3.exp(d) for T, d in zip(poses[fixed:], moves, strict=True)])
         points += system.points_step(x)
@@ -164,4 +180,5 @@ def adjust(
         if np.abs(moves).max() < 1e-5:
             break
     information = system.H[-1]
-    return Adjusted(np.array([se3.orthonormalised(T) for T in poses]), points, squared, information, offset)
+    found = np.array([se3.orthonormalised(T) for T in poses])
+    return Adjusted(found, points, squared, information, believed.after(offset, told))

@@ -18,7 +18,7 @@ from operators.odometry.features import Gray, Mask, Pixels, detect_corners, trac
 from operators.odometry.keyframes import RECALL_NEAR, RECALL_OTHERS, candidates, recall_due
 from operators.odometry.mono.pose import solved
 from operators.odometry.motion import Motion
-from operators.odometry.stereo.adjustment import Sightings, StereoRig, adjust
+from operators.odometry.stereo.adjustment import Offset, Sightings, StereoRig, adjust
 from operators.odometry.stereo.map import StereoMap
 from operators.odometry.stereo.pair import StereoPair, Watches, observe
 from operators.odometry.stereo.relocalizer import TYPICAL, FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
@@ -43,7 +43,7 @@ class StereoState:
     points: Points = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) in the world
     pixels: Pixels = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) where the last image shows them
     seen: Sightings = field(default_factory=Sightings.none)
-    offset: float = 0.0  # pixels that right columns are off by
+    offset: Offset = field(default_factory=Offset)
     map: StereoMap = field(default_factory=StereoMap)
 
 
@@ -189,7 +189,9 @@ class StereoOdometry:
 
     def _view(self, pair: StereoPair, T_world_camera: Matrix, segment: int) -> StereoKeyframe:
         state = self.state
-        return kept_pair(pair.left, pair.right, pair.stamp, T_world_camera, state.covariance, state.offset, segment)
+        return kept_pair(
+            pair.left, pair.right, pair.stamp, T_world_camera, state.covariance, state.offset.pixels, segment
+        )
 
     def _keep(self, pair: StereoPair) -> None:
         """Keeps a pair at its pose; the first since a new map began begins its segment."""
@@ -263,7 +265,7 @@ class StereoOdometry:
         guess = pixels.copy()
         guess[:, 0] -= self.rig.K[0, 0] * self.rig.baseline / np.maximum(points[:, 2], 0.3)
         ends, found = track_both_ways(pair.left, pair.right, pixels, guess, back=0.5)
-        disparity = pixels[:, 0] - ends[:, 0]
+        disparity = pixels[:, 0] - ends[:, 0] + self.state.offset.pixels
         found &= np.abs(ends[:, 1] - pixels[:, 1]) < self.config.row_error
         found &= disparity > self.config.min_disparity
         return np.column_stack([pixels, ends[:, 0]]), found
@@ -278,7 +280,7 @@ class StereoOdometry:
         points = np.column_stack([np.zeros((len(fresh), 2)), _depth_guess(fresh, state.pixels, known)])
         sightings, found = self._across(pair, fresh, points)
         sightings = sightings[found]
-        new = transform_points(state.poses[-1], self.rig.triangulate(sightings - [0.0, 0.0, state.offset]))
+        new = transform_points(state.poses[-1], self.rig.triangulate(sightings - [0.0, 0.0, state.offset.pixels]))
         first = len(state.points)
         self.state = replace(
             state,

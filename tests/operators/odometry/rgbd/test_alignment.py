@@ -1,9 +1,10 @@
 """Terms of the alignment against the same sums written point by point, in double precision."""
 
 import numpy as np
+import pytest
 
 from operators.geometry import se3
-from operators.odometry.rgbd.alignment import CAUCHY, Freedom, PixelTerm, PlaneTerm
+from operators.odometry.rgbd.alignment import CAUCHY, NOTHING, Freedom, Normal, PixelTerm, PlaneTerm, disagreement
 from operators.odometry.rgbd.surface import DepthNoise, Surface
 
 K = np.array([[290.0, 0.0, 160.0], [0.0, 290.0, 120.0], [0.0, 0.0, 1.0]])
@@ -67,3 +68,17 @@ def test_pixel_term_is_the_weighted_normal_equation_of_reprojections() -> None:
     assert np.allclose(found.H, H, rtol=0, atol=1e-6 * np.abs(H).max())
     assert np.allclose(found.b, b, rtol=0, atol=1e-6 * np.abs(b).max())
     assert found.inliers == np.count_nonzero(squared < 9.0)
+
+
+def test_disagreement_is_how_far_apart_two_terms_would_put_the_pose() -> None:
+    """The one errs by 0.2 along each axis, the other by 0.1; along some axes it tells nothing."""
+    rng = np.random.default_rng(1)
+    some = np.diag([100.0, 100, 100, 0, 0, 0])
+    every, none = [], []
+    for _ in range(2000):
+        x, y = rng.normal(0, 0.2, 6), rng.normal(0, 0.1, 6)
+        one = Normal(25 * np.eye(6), -25 * x, 1, NOTHING)
+        every.append(disagreement(one, Normal(100 * np.eye(6), -100 * y, 1, NOTHING)))
+        none.append(disagreement(one, Normal(some, -some @ y, 1, NOTHING)))
+    assert np.mean(every) == pytest.approx(1.0, rel=0.05)
+    assert np.mean(none) == pytest.approx(0.5, rel=0.05)

@@ -11,7 +11,7 @@ from operators.geometry import se3
 from operators.odometry.rgbd.fitting import Fit, Sighting
 from operators.odometry.rgbd.keyframe import SINKING, TURNING, Keyframe, carried
 from operators.odometry.rgbd.movers import Movers
-from operators.odometry.rgbd.noise import Noise
+from operators.odometry.rgbd.noise import AGREED, Noise
 from operators.odometry.rgbd.surface import Surface
 from operators.odometry.tracking import moved_covariance
 
@@ -52,6 +52,22 @@ def test_descriptors_that_pair_wrongly_contradict_nothing() -> None:
 def test_a_pose_is_less_certain_where_tracks_of_its_own_frame_miss() -> None:
     """Not where those of earlier frames did, or where none were seen yet."""
     assert sigma2(1.0, 1.0, noise=0.3, missed=0.8) > 10 * sigma2(1.0, 1.0, noise=0.8, missed=0.3)
+
+
+def test_a_pose_is_less_certain_where_tracks_and_depth_have_disagreed() -> None:
+    """By more than they believe to err by: what draws them apart errs alike at every keyframe."""
+    agreed, torn = (supported(1.0, 1.0, Noise(0.3, 1.0, by)).covariance for by in (AGREED, 4 * AGREED))
+    np.testing.assert_allclose(torn, 16 * agreed)
+    np.testing.assert_array_equal(supported(1.0, 1.0, Noise(0.3, 1.0, 0.1 * AGREED)).covariance, agreed)
+
+
+def test_disagreement_is_learnt_from_frames_and_one_frame_counts_for_little() -> None:
+    noise = Noise()
+    assert noise.after(None, None, None).disagreement == AGREED
+    assert noise.after(None, None, 1e6).disagreement < 2 * AGREED
+    for _ in range(60):
+        noise = noise.after(None, None, 2.0)
+    assert noise.disagreement == pytest.approx(2.0, rel=0.01)
 
 
 def first_keyframe() -> Keyframe:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from dataflow.messages import CameraInfo, Image
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.odometry import StereoVisualOdometry
-from operators.odometry.stereo.adjustment import Sightings, StereoRig, adjust
+from operators.odometry.stereo.adjustment import Offset, Sightings, StereoRig, adjust
 from operators.odometry.stereo.odometry import rig_of
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.stereo.tracker import StereoOdometry
@@ -46,17 +47,27 @@ def test_pose_follows_known_motion() -> None:
     assert rotation < 0.005
 
 
-def test_disparities_that_are_off_by_a_constant_do_not_stretch_the_way() -> None:
-    """The right image is shifted by a third of a pixel, as an imperfect rectification leaves it."""
+@pytest.mark.parametrize("shift", [0.33, 2.0])
+def test_disparities_that_are_off_by_a_constant_do_not_stretch_the_way(shift: float) -> None:
+    """The right image is shifted, as an imperfect rectification leaves it: 2 px are a fifth of what is 15 m away."""
     pairs, poses = sequence(25)
-    shift = np.array([[1.0, 0.0, 0.33], [0.0, 1.0, 0.0]])
-    shifted = [(left, cv2.warpAffine(right, shift, SIZE, borderMode=cv2.BORDER_REPLICATE)) for left, right in pairs]
+    right = np.array([[1.0, 0.0, shift], [0.0, 1.0, 0.0]])
+    shifted = [(a, cv2.warpAffine(b, right, SIZE, borderMode=cv2.BORDER_REPLICATE)) for a, b in pairs]
     odometry = StereoOdometry(RIG)
     results = [odometry.track(left, right, i * 100_000_000) for i, (left, right) in enumerate(shifted)]
-    assert odometry.state.offset == pytest.approx(0.33, abs=0.15)
+    assert odometry.state.offset.pixels == pytest.approx(shift, abs=0.15)
     late = np.linalg.norm(results[-1].T_world_camera[:3, 3] - results[12].T_world_camera[:3, 3])
     truth = np.linalg.norm(poses[-1][:3, 3] - poses[12][:3, 3])
     assert late == pytest.approx(truth, rel=0.01)
+    assert errors(results, poses)[0] < 0.05  # of ten metres: the first windows show the offset
+
+
+def test_points_at_infinity_give_no_corner_whatever_the_offset() -> None:
+    """The images are shifted by what the offset is known to be: nothing in them has a depth."""
+    (left, _), odometry = sequence(25)[0][0], StereoOdometry(RIG, StereoOdometryConfig(min_disparity=0.5))
+    odometry.state = replace(odometry.state, offset=Offset(-1.0))
+    result = odometry.track(left, np.roll(left, -1, axis=1), 0)
+    assert (result.status, result.reason) == (Status.LOST, "0 corners seen by both")
 
 
 def test_no_part_of_the_window_holds_the_length_that_a_wrong_offset_gave_it() -> None:
@@ -67,7 +78,7 @@ def test_no_part_of_the_window_holds_the_length_that_a_wrong_offset_gave_it() ->
     frames, indices = (a.ravel() for a in np.meshgrid(np.arange(8), np.arange(60), indexing="ij"))
     pixels = np.concatenate([RIG.project((points - T[:3, 3]) @ T[:3, :3]) for T in poses])
     pixels[:, 2] += 0.4
-    stretched, offset = poses.copy(), 0.0
+    stretched, offset = poses.copy(), Offset()
     stretched[:, :3, 3] *= 1.02
     found, far = stretched, points * 1.02
     for _ in range(30):  # an offset is believed slowly
@@ -76,9 +87,22 @@ def test_no_part_of_the_window_holds_the_length_that_a_wrong_offset_gave_it() ->
         )
         found, far, offset = adjusted.poses, adjusted.points, adjusted.offset
     lengths = np.diff(found[:, 2, 3]) / np.diff(poses[:, 2, 3])
-    assert offset > 0.2
+    assert offset.pixels > 0.2
     assert lengths.max() < 1.016  # every step has got shorter, none holds what was believed at first
     assert np.ptp(lengths) < 0.003
+
+
+def test_a_window_counts_for_what_it_shows_of_the_offset() -> None:
+    """A camera that stands still cannot tell near points of one offset from farther ones of another."""
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-5, 5, 60), rng.uniform(-2, 2, 60), rng.uniform(8, 40, 60)])
+    frames, indices = (a.ravel() for a in np.meshgrid(np.arange(8), np.arange(60), indexing="ij"))
+    learnt = {}
+    for name, poses in {"standing": np.array([np.eye(4)] * 8), "driving": np.array(driving(8))}.items():
+        pixels = np.concatenate([RIG.project((points - T[:3, 3]) @ T[:3, :3]) for T in poses])
+        found = adjust(RIG, poses, points, Sightings(frames, indices, pixels), Offset(), 0.3, 1, 4)
+        learnt[name] = found.offset.information - Offset().information
+    assert learnt["standing"] < 0.01 * learnt["driving"]
 
 
 def test_adjustment_finds_poses_and_points_again() -> None:
@@ -89,10 +113,10 @@ def test_adjustment_finds_poses_and_points_again() -> None:
     pixels = np.concatenate([RIG.project((points - T[:3, 3]) @ T[:3, :3]) for T in poses])
     off = np.array([T @ se3.exp(rng.normal(0, 0.01, 6)) if i else T for i, T in enumerate(poses)])
     seen = Sightings(frames, indices, pixels)
-    found = adjust(RIG, off, points + rng.normal(0, 0.1, points.shape), seen, 0.0, 0.3, 1, 10)
+    found = adjust(RIG, off, points + rng.normal(0, 0.1, points.shape), seen, Offset(), 0.3, 1, 10)
     np.testing.assert_allclose(found.poses, poses, atol=1e-3)
     np.testing.assert_allclose(found.points, points, atol=2e-2)
-    assert found.offset == pytest.approx(0.0, abs=1e-2)
+    assert found.offset.pixels == pytest.approx(0.0, abs=1e-2)
 
 
 # -- failures ------------------------------------------------------------------------------------------------
