@@ -62,8 +62,8 @@ def compare(
 
     Examples:
 
-      dataflow compare perception --recordings runs --set b:cloud.stride=8
-      dataflow compare graphs/cloud.yaml --recordings runs --set b:cloud.rate=5 --json
+      dataflow compare perception --recordings runs --set b:detector=yolox_nano
+      dataflow compare graphs/cloud.yaml --recordings runs --set b:cloud.stride=8 --json
     """
     choices = _choices(settings or ())
     with friendly_errors():
