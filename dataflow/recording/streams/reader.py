@@ -150,10 +150,10 @@ class Recording:
             del record
 
     def firings(
-        self, operator: str | None = None, start: int | None = None, *, skip: int = 0
+        self, operator: str | None = None, start: int | None = None, end: int | None = None, *, skip: int = 0
     ) -> Iterator[tuple[str, bytes]]:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order: all of them,
-        or those with log times from `start` (ns) on, which are those of a batch's last record, without the first
+        or those with log times from `start` to `end` (ns), which are those of a batch's last record, without the first
         `skip`.
 
         One pass: they lie in separate chunks, without the messages of streams (in older recordings among them).
@@ -163,7 +163,7 @@ class Recording:
             for c in self._channels_of(Kind.FIRINGS)
             if operator is None or c.metadata.get("operator", "") == operator
         }
-        for raw in self._in_file_order(list(channels), start, skip=skip):
+        for raw in self._in_file_order(list(channels), start, end, skip=skip):
             yield channels[raw.channel], bytes(raw.data)
 
     def firing_batches(self) -> Mapping[str, int]:
