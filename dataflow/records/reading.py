@@ -49,9 +49,9 @@ class Heading(NamedTuple):
 class FiringLog:
     """The firing records of many operators, read whenever they are asked for.
 
-    `kept`: batches in memory, by operator. Behind them come those of `recording`, all or those with log times from
-    `start` to `end` (ns). `begins`: by operator the index from which on there are all records, where those before were
-    not read. `outlines`: how the records of operators lie in the file, where that is known; else a pass finds it.
+    `kept`: batches in memory, by operator. Behind them come those of `recording`, all or those from `start` to
+    `end` (ns; see `Recording.firings`). `begins`: by operator the index from which on there are all records, where
+    those before were not read. `outlines`: how the records of operators lie in the file, where that is known; else a pass finds it.
     """
 
     def __init__(
