@@ -13,6 +13,7 @@ from dataflow.execution.recorded import RecordedRunner
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.recording.streams import reader
+from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog, recorded_firings
 from dataflow.reexecution import engine
 from dataflow.reexecution.engine import Recomputation, plan_feeding
