@@ -51,7 +51,8 @@ class FiringLog:
 
     `kept`: batches in memory, by operator. Behind them come those of `recording`, all or those from `start` to
     `end` (ns; see `Recording.firings`). `begins`: by operator the index from which on there are all records, where
-    those before were not read. `outlines`: how the records of operators lie in the file, where that is known; else a pass finds it.
+    those before were not read. `outlines`: how the records of operators lie in the file, where that is known; else a
+    pass finds it.
     """
 
     def __init__(
