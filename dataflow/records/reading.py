@@ -38,10 +38,10 @@ Digests = Mapping[str, Lookup]
 
 
 class Heading(NamedTuple):
-    """Place, kind and stamp (ns) of a record."""
+    """Place, kind and stamp (ns) of a record, which is the one of number `record` in its incarnation."""
 
     incarnation: int
-    index: int
+    record: int
     kind: str
     stamp: int
 

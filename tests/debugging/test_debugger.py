@@ -17,6 +17,7 @@ from dataflow.execution.failure import OperatorFailure
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.records import reading
+from dataflow.records.firing import FiringRecord, Rows
 from dataflow.supervision.run import run
 
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
@@ -174,7 +175,12 @@ def test_the_way_to_a_call_does_not_depend_on_the_length_of_the_recording(
     monkeypatch.setattr("dataflow.records.window.FIRST_REACH", 3 * 10**9)
     monkeypatch.setattr("dataflow.debugging.debugger.AHEAD", 10**9)
     decode, decoded = reading.decode_rows, list[int]()
-    monkeypatch.setattr(reading, "decode_rows", lambda batch: decoded.append(len(batch.rows)) or decode(batch))
+
+    def noting(batch: Rows) -> tuple[FiringRecord, ...]:
+        decoded.append(len(batch.rows))
+        return decode(batch)
+
+    monkeypatch.setattr(reading, "decode_rows", noting)
     costs = []
     for count in (400, 1600):
         (tmp_path / "long.yaml").write_text(LONG.format(count=count))

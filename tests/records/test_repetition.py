@@ -112,7 +112,12 @@ def test_records_of_several_operators_are_read_in_one_pass(tmp_path: Path, monke
             writer.flush()
     decompressed: list[int] = []
     decompress = Chunks._decompress
-    monkeypatch.setattr(Chunks, "_decompress", lambda *chunk: decompressed.append(chunk[1]) or decompress(*chunk))
+
+    def noting(chunks: Chunks, number: int) -> bytes:
+        decompressed.append(number)
+        return decompress(chunks, number)
+
+    monkeypatch.setattr(Chunks, "_decompress", noting)
     monkeypatch.setattr("dataflow.recording.mcap.cache.KEPT_BYTES", 1000)
 
     with Recording(tmp_path / "run.mcap") as recording:
