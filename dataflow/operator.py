@@ -17,7 +17,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, SupportsInt
 
@@ -87,6 +87,9 @@ __all__ = [
     "validate_parameters",
 ]
 
+Journaled = Callable[[Callable[..., Any], Sequence[Any], Mapping[str, Any]], Any]
+"""Makes a call with positional and named arguments through a journal."""
+
 FINDING = "finding"
 """Key of a summary's text that stands among the first lines at a run's end: something is wrong with what was given."""
 
@@ -105,6 +108,7 @@ class Operator:
     state: Any
     """The state, of the dataclass that a class annotates it with (`state: State`). None is annotated: no state."""
     __state: ClassVar[Any] = None
+    __effects: Journaled | None = None
     __generator: np.random.Generator | None = None
     __seed: SupportsInt = 0
 
@@ -164,6 +168,21 @@ class Operator:
     def seed_rng(self, seed: SupportsInt) -> None:
         """Gives `rng` a new seed; the runtime does so before every call."""
         self.__generator, self.__seed = None, seed
+
+    def effect(self, call: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+        """Returns the answer of a call that cannot repeat (a service, a cloud model, a network on a GPU), and records
+        it; re-execution gives the recorded answer, without the call.
+
+        For `process()` and `finish()`. An answer holds numbers, strings, bytes, None, arrays, and lists and mappings of
+        these, at most 16 MiB a firing. The key is the name of `call` and the digest of each argument; `call` gets
+        nothing else that varies, and changes nothing of the operator. Raises what `call` raises, recorded too;
+        `EffectError` for what cannot be recorded; in a re-execution `EffectMiss` where no such call was recorded.
+        """
+        return call(*args, **kwargs) if self.__effects is None else self.__effects(call, args, kwargs)
+
+    def journal_effects(self, journal: Journaled) -> None:
+        """Has effects made through a journal; the runtime does so before `setup()`."""
+        self.__effects = journal
 
     def setup(self) -> None:
         """Loads models and other resources. Runs once, on the thread that later runs `process()`."""

@@ -31,7 +31,7 @@ ROOMS = {
     "network": ("client", "foxglove", "transport"),
     "process": (
         "analysis", "api", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
-        "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",
+        "capture", "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",
     ),
 }  # fmt: skip
 """Folders of tests by marker; a test anywhere else is a `unit` test."""

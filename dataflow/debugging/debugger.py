@@ -41,23 +41,26 @@ class DebugError(ReplayError):
 
 class Debugger:
     """One operator of a recorded run. `calls` are its recorded calls, in order; `at` is the one that was made last.
+    `live_effects`: a call outside that is not recorded is made.
 
     Runs the operator in this process, which should have the environment of operators (`threads.environment`): what
     depends on the hashes of strings else repeats only by chance. Raises `DebugError`, `ReplayError`, `RecordingError`,
     `GraphError`.
     """
 
-    def __init__(self, recording: Recording, operator: str, graph: Graph | None = None) -> None:
-        self._recording = recording
-        self._graph = graph_that_is_here(recording)[0] if graph is None else graph
-        self._log = log = FiringLog.read(recording)
-        self.node = node = self._graph.nodes[_named(operator, self._graph, log)]
+    def __init__(
+        self, recording: Recording, operator: str, graph: Graph | None = None, *, live_effects: bool = False
+    ) -> None:
+        self._recording, self._live_effects = recording, live_effects
+        self.graph = graph_that_is_here(recording)[0] if graph is None else graph
+        log = FiringLog.read(recording)
+        self.node = node = self.graph.nodes[_named(operator, self.graph, log)]
         headings = log.headings(node)
         self.calls: Sequence[Call] = [Call(*heading) for heading in headings if heading.kind in CALLS]
         made = accumulate(heading.kind in CALLS for heading in headings)
         self._recorded = [n for n, heading in zip(made, headings, strict=True) if heading.kind == "snapshot"]
         """The numbers of the calls in front of which a state is recorded, in order."""
-        self._feeding = plan_feeding(recording, self._graph, [node.name])
+        self._feeding = plan_feeding(recording, self.graph, [node.name])
         self._kept: dict[int, FiringRecord] = {}
         """States before calls, by the call's number, as `cut` records."""
         self._sources = Sources(node.operator)
@@ -212,7 +215,13 @@ class Debugger:
         log = FiringLog.read(self._recording) if begin is None or end is None else self._window(begin, cut, end)
         log.resumed = cut
         work = Recomputation(
-            self._recording, self._graph, self._feeding, log, made=lambda stream, entry: None, begin=begin
+            self._recording,
+            self.graph,
+            self._feeding,
+            log,
+            made=lambda stream, entry: None,
+            begin=begin,
+            live_effects=self._live_effects,
         )
         runner = work.runners[self.node.name]
         self._probe = runner.calls = Probe(runner)
@@ -225,10 +234,10 @@ class Debugger:
 
     def _window(self, begin: int, cut: FiringRecord | None, end: int) -> FiringLog:
         """The records from a stamp to another, and those that these need."""
-        nodes = self._graph.nodes
+        nodes = self.graph.nodes
         again = {name: nodes[name] for name in self._feeding.operators}
         taken = {stream for node in again.values() for stream in node.taken}
-        makers = again | {name: nodes[name] for name in sorted(self._graph.streams[s].node for s in taken)}
+        makers = again | {name: nodes[name] for name in sorted(self.graph.streams[s].node for s in taken)}
         given = set() if cut is None else {cut.operator}
         stateful = {n for n, node in again.items() if not node.operator.stateless} - given
         stateless = again.keys() - stateful
@@ -292,6 +301,10 @@ class Debugger:
             error=error,
             recorded_error=recorded,
             injected=injected,
+            record=record,
+            firing=None if injected else probe.firing,
+            raised=None if injected else probe.raised,
+            parameters=dict(self._work.runners[self.node.name].changed),
             same=self._same,
         )
 

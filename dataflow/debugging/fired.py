@@ -57,6 +57,12 @@ class Fired:
     error: str | None
     recorded_error: str | None
     injected: bool
+    record: FiringRecord
+    firing: Firing | None
+    """The call as it was made; None where none was."""
+    raised: BaseException | None
+    parameters: Mapping[str, Any]
+    """Those that had been changed in the run by then."""
     same: bool
     """Outputs and the error are the recorded ones, as verification compares them."""
 
@@ -105,13 +111,14 @@ class Probe(Calls):
 
     def __init__(self, runner: RecordedRunner) -> None:
         calls = runner.calls
-        super().__init__(calls.node, calls.operator, calls.seed, version=calls.version)
+        super().__init__(calls.node, calls.operator, calls.seed, version=calls.version, effects=calls.effects)
         self._runner = runner
         self._looked_at = 0
         self.target: Call | None = None
         self.through: Through | None = None
         self.call: Call | None = None
         """The last call."""
+        self.firing: Firing | None = None
         self.inputs: Mapping[str, Any] = {}
         self.outputs: Mapping[str, Message] = {}
         self.before: bytes | None = None
@@ -122,6 +129,7 @@ class Probe(Calls):
     def process(self, firing: Firing) -> dict[str, Message]:
         """Makes the call. Raises what the operator raises."""
         self.call = call = call_of(self._runner.record)
+        self.firing = firing
         aimed = call == self.target
         looks = aimed or self._runner.work.cpu_ns - self._looked_at >= SPACING
         self.inputs = {name: value_of(given) for name, given in firing.inputs.items()}

@@ -6,11 +6,13 @@ arguments and the operator's state alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from dataflow.execution.effects.answers import EffectError
+from dataflow.execution.effects.journal import Journal
 from dataflow.execution.failure import RAISED, OperatorFailure
 from dataflow.execution.generators.loading import LOADS
 from dataflow.execution.generators.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
@@ -27,17 +29,24 @@ Place = tuple[int, int]
 
 
 class Calls:
-    """One operator. `version` is that of the seeding; `operator` may be replaced, when it is restarted."""
+    """One operator. `version` is that of the seeding; `effects` the journal of what it calls outside; `operator` may be
+    replaced, when it is restarted."""
 
-    def __init__(self, node: Node, operator: Operator, seed: int, *, version: int = VERSION) -> None:
+    def __init__(
+        self, node: Node, operator: Operator, seed: int, *, version: int = VERSION, effects: Journal | None = None
+    ) -> None:
         self.node, self.operator, self.seed, self.version = node, operator, seed, version
+        self.effects = Journal() if effects is None else effects
         self._seeded_by = f"{seed}/{node.name}/"
+        self._firing: int | None = None
+        """The stamp of the firing that is made, or was last; None in and after any other call."""
 
     def setup(self) -> dict[str, Message]:
         """`setup()`, then the messages of the static outputs. Raises `OperatorFailure`."""
         try:
             with AT_WORK.call(self.node.name, NEVER):
                 self._seed(firing_seed(self.seed, self.node.name, NEVER))
+                self.operator.journal_effects(self._effect)
                 self.operator.setup()
                 limit_threads_again()
                 return self._static_outputs()
@@ -49,6 +58,7 @@ class Calls:
         try:
             with AT_WORK.call(self.node.name, NEVER):
                 self._seed(firing_seed(self.seed, self.node.name, NEVER))
+                self.operator.journal_effects(self._effect)
                 return self._static_outputs()
         except RAISED as error:
             raise OperatorFailure(self.node.name, "static_outputs()", error) from error
@@ -62,7 +72,11 @@ class Calls:
             seed = FiringSeed(self._seeded_by, firing.stamp)
             seed_generators(seed, self.version)
             self.operator.seed_rng(seed)
-            return outputs_of(self.operator, _call(self.operator, firing))
+            self._firing = firing.stamp
+            made = outputs_of(self.operator, _call(self.operator, firing))
+            if self.effects.missed is not None:  # the operator has caught it
+                raise self.effects.missed
+            return made
         finally:
             LOADS.seed = None
             AT_WORK.ended += 1
@@ -118,11 +132,27 @@ class Calls:
                 raise OutputError(f"{self.node.name}.{name} is a {port.type_text()}, got {type(message).__name__}")
         return statics
 
+    def _effect(self, call: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        """Makes an effect of a firing. The generators are seeded anew behind it: the call may have drawn from them, and
+        is not made in a re-execution."""
+        if self._firing is None:
+            raise EffectError(
+                f"{self.node.name}: effect() is for process() and finish(): an answer is recorded with a firing"
+            )
+        try:
+            return self.effects.ask(call, args, kwargs)
+        finally:
+            what = f"effect {self.effects.asked}"
+            seed_generators(seed := change_seed(self.seed, self.node.name, what, 0, self._firing), self.version)
+            self.operator.seed_rng(seed)
+
     def _seed_change(self, what: str, place: Place) -> None:
+        self._firing = None
         if self.version >= 2:
             self._seed(change_seed(self.seed, self.node.name, what, *place))
 
     def _seed(self, seed: int) -> None:
+        self._firing = None
         seed_generators(seed, self.version)
         self.operator.seed_rng(seed)
 

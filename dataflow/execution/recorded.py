@@ -11,6 +11,7 @@ from typing import Any
 
 from dataflow.execution.align import align_spec
 from dataflow.execution.calls import Calls
+from dataflow.execution.effects.journal import RecordedJournal
 from dataflow.execution.failure import RAISED, OperatorFailure
 from dataflow.execution.generators.seeding import VERSION
 from dataflow.execution.judge import Judge
@@ -41,8 +42,9 @@ class Watcher:
 
 class RecordedRunner(Runner):
     """One operator, re-executed by its records, of which `repetition` has those that are repeated. `inputs` are the
-    digests of what it was given; `seeding` is the version by which the recorded run seeded its generators. `guard`
-    watches over what it is given in each firing; without one, only the first firings are watched."""
+    digests of what it was given; `seeding` is the version by which the recorded run seeded its generators.
+    `live_effects`: see `RecordedJournal`. `guard` watches over what it is given in each firing; without one, only the
+    first firings are watched."""
 
     def __init__(
         self,
@@ -56,11 +58,13 @@ class RecordedRunner(Runner):
         seeding: int = VERSION,
         guard: MemoryGuard | None = None,
         watcher: Watcher | None = None,
+        live_effects: bool = False,
     ) -> None:
         super().__init__(node, node.make(), emitter)
         self._guard, self._watched = guard or MemoryGuard(), FOREVER if guard is not None else WATCHED
         self._watcher = watcher or Watcher()
-        self.calls = Calls(node, self.operator, seed, version=seeding)
+        self.effects = RecordedJournal(live=live_effects)
+        self.calls = Calls(node, self.operator, seed, version=seeding, effects=self.effects)
         self.judge = Judge(node.name, tuple(self.ports.states), inputs)
         self._repetition = repetition
         self.result.began = self._repetition.began
@@ -280,6 +284,7 @@ class RecordedRunner(Runner):
         watched = self.result.verified < self._watched
         if watched:
             self._guard.take(self.node.name, firing)
+        self.effects.begin(record.detail)
         try:
             messages = self.calls.process(firing)
             if record.outcome == "error":
@@ -295,6 +300,8 @@ class RecordedRunner(Runner):
             self.ports.emit_as(name, message, seq, record.incarnation)
         if "summary" in record.detail:
             self.judge.summary(record, self.calls.summary((record.incarnation, record.stamp)))
+        if self.effects.counts:
+            self.result.effects = self.effects.summary()
         self.firings += record.kind != "finish"
         self.result.verified += 1
 

@@ -241,7 +241,7 @@ class OperatorRunner(Runner):
         *,
         injected: bool = False,
     ) -> None:
-        if error is None and kind != "finish" and not self.has_drops():
+        if error is None and kind != "finish" and not self.calls.effects.made and not self.has_drops():
             self.records.add_firing(kind, started, firing, outputs, "ok", (), _NOTHING)
             return
         detail: dict[str, Any] = {}
@@ -249,6 +249,7 @@ class OperatorRunner(Runner):
             detail = {"error": error, **({"injected": True} if injected else {})}
         elif kind == "finish" and (summary := self.calls.summary((self.records.incarnation, firing.stamp))):
             detail = {"summary": summary}
+        detail |= self.calls.effects.take()
         dropped: tuple[Drop, ...] = ()
         if self.has_drops():
             listed, more = self.take_drops()

@@ -91,8 +91,8 @@ def _plain(value: Any, place: str) -> Any:
             return value
         case _:
             raise StateError(
-                f"{place} is a {type(value).__name__}; a state holds numbers, strings, bytes, None, numpy arrays, "
-                "lists and mappings"
+                f"{place} is a {type(value).__name__}; recorded are numbers, strings, bytes, None, numpy arrays, lists "
+                "and mappings"
             )
 
 

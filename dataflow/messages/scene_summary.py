@@ -21,6 +21,9 @@ CARRYING = ("part_of", "sitting_on", "in", "on", "held_by")
 HEADS_FOR = "heads_for"
 """The predicate of an intention: its score is the probability of the goal."""
 
+MOVED = frozenset(("rolling", "driving", "resting"))
+"""Activities of what is no living being: a ball, a vehicle, a robot."""
+
 SURROUNDINGS = frozenset(("near", "left_of", "right_of", "in_front_of", "behind"))
 """Predicates that hold between so many nodes that they say little."""
 
@@ -146,11 +149,27 @@ class Row:
 
 
 def agents_in_words(graph: SceneGraph, summary: SceneSummary, activities: Activity | None = None) -> list[Row]:
-    """A row for each agent: its activity, what it is on, holds or heads for."""
-    names, acts = graph.names(), doing(activities)
-    rows = []
+    """A row for each person or animal that acts: its activity, what it is on, holds or heads for."""
+    acts = doing(activities)
+    return _agents(graph, summary, acts, summary.agents - _moved(graph, summary, acts))
+
+
+def movers_in_words(graph: SceneGraph, summary: SceneSummary, activities: Activity | None = None) -> list[Row]:
+    """The same for each thing that moves, by itself or by others, as its activity shows: one of `MOVED`."""
+    acts = doing(activities)
+    return _agents(graph, summary, acts, _moved(graph, summary, acts))
+
+
+def _moved(graph: SceneGraph, summary: SceneSummary, acts: Mapping[int, tuple[str, float]]) -> frozenset[int]:
+    return frozenset(n for n in summary.agents if acts.get(int(graph.ids[n]), ("", 0.0))[0] in MOVED)
+
+
+def _agents(
+    graph: SceneGraph, summary: SceneSummary, acts: Mapping[int, tuple[str, float]], nodes: Collection[int]
+) -> list[Row]:
+    names, rows = graph.names(), []
     going = {r.subject for r in summary.intentions}
-    for node in sorted(summary.agents, key=lambda n: (n not in going, n)):
+    for node in sorted(nodes, key=lambda n: (n not in going, n)):
         identity, words = int(graph.ids[node]), []
         if identity in acts:
             words.append(f"{spaced(acts[identity][0])} {percent(acts[identity][1])}")

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 MAX_CHUNK_BYTES = 2**29
 """A message with what is derived from it, a firing record, an event, a chunk (uncompressed), an attachment."""
+MAX_EFFECT_BYTES = 2**24
+"""Answers of one firing's effects, so that a batch of firing records stays small; a larger answer is an error."""
 MAX_RECORD_BYTES = 2**28
 """A schema, a channel, a metadata record, a message index: more than any graph or schema takes."""
 MAX_CHUNK_MESSAGES = 2**20

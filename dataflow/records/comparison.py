@@ -36,6 +36,8 @@ class Verification:
     `tainted` is the index of the first firing that was given anything other than recorded; `own_fault`: the
     first difference came before that; `states` of the differences are in snapshots, not in messages.
     `wrote` names the first message that the operator has written into, which others may be given too.
+    `effects`: by name of a call how often its recorded answer was `given`, `missed`, and, where calls were made live,
+    `again` and of these with the `same` answer.
     `began` is the state from which it was repeated: "start", "snapshot" (its recorded state) or "stateless".
     """
 
@@ -61,6 +63,7 @@ class Verification:
     missing: str = ""
     wrote: str = ""
     files_changed: list[str] = field(default_factory=list)
+    effects: dict[str, dict[str, int]] = field(default_factory=dict)
 
     @property
     def verdict(self) -> Verdict:

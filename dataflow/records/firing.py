@@ -58,7 +58,8 @@ class FiringRecord:
     `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot` (of one that is too large
     to be recorded its bytes, as `left_out`), what stands in for the records that were left out for `cut`
     (`dataflow.records.cuts`), what the operator sums up for `finish`, the error's text for the outcome `error` (with
-    `injected` where no call was made at all), and for `fire` and `finish` of a source how many steps it has not sent
+    `injected` where no call was made at all), what the operator called outside and was answered as `effects`
+    (`dataflow.execution.effects.journal`), and for `fire` and `finish` of a source how many steps it has not sent
     since the record before, by reason.
     `wall_start` (ns since the epoch) and `duration` (ns) are facts of that run and never compared.
     """

@@ -7,7 +7,7 @@ import os
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,6 +77,7 @@ class Judged:
 class Checked:
     """One recording: its report and the verdicts, or why there is none. `wall`: seconds in all.
 
+    `runs`: how often it was verified, of which only the last one may not have passed.
     `internal`: `details` is a traceback of the runtime's own code. `not_in_graph`: recorded operators that the graph
     lacks.
     """
@@ -90,6 +91,15 @@ class Checked:
     wall: float = 0.0
     internal: bool = False
     not_in_graph: tuple[str, ...] = ()
+    runs: int = 1
+
+    @property
+    def unseen(self) -> float | None:
+        """The largest share of runs that may differ although none of these did, at 95 % confidence; None where one did.
+
+        (1 - share) ** runs = 0.05: the exact binomial bound.
+        """
+        return 1 - 0.05 ** (1 / self.runs) if self.passed else None
 
     @property
     def verdict(self) -> RecordingVerdict:
@@ -132,7 +142,7 @@ class Checked:
         for node in [*report["operators"], *report["sources"]]:
             node["verdict"] = verdicts.get(node["operator"], "identical")
         more = {"culprits": list(self.culprits), "changed": list(self.changed), "not_in_graph": list(self.not_in_graph)}
-        return value | report | more
+        return value | report | more | {"runs": self.runs, "unseen": self.unseen}
 
 
 @dataclass(slots=True)
@@ -228,13 +238,28 @@ def check(
     verify: Callable[[Path], VerifyReport],
     accepted: Mapping[str, Outcome] | None = None,
     graph: Graph | None = None,
+    runs: int = 1,
 ) -> Checked:
     """Verifies one recording and judges it; whatever prevents that becomes its `error`.
 
-    `graph`: the one that it is verified against, where that is not the recorded one.
+    `graph`: the one that it is verified against, where that is not the recorded one. `runs`: how often, until it does
+    not pass.
 
     Raises only `RunFailed` for a run that was interrupted.
     """
+    checked = _check_once(path, name, verify, accepted, graph)
+    while checked.passed and checked.runs < runs:
+        checked = replace(_check_once(path, name, verify, accepted, graph), runs=checked.runs + 1)
+    return checked
+
+
+def _check_once(
+    path: Path,
+    name: str,
+    verify: Callable[[Path], VerifyReport],
+    accepted: Mapping[str, Outcome] | None,
+    graph: Graph | None,
+) -> Checked:
     started = time.monotonic()
 
     def could_not(error: str, details: str = "", *, internal: bool = False) -> Checked:

@@ -88,6 +88,7 @@ def verify(
     start: float | None = None,
     jobs: int | None = None,
     paranoid: bool = False,
+    live_effects: bool = False,
     stall_timeout: float = 120.0,
     watch: Watch | None = None,
     workers: Workers | None = None,
@@ -101,6 +102,7 @@ def verify(
     `tolerance`: absolute, in the unit of each floating-point field. Culprits are run a second time, beside those with
     which they shared a process in the run (`verification.retrial`).
     `paranoid`: look after each call whether it has written into its inputs; else after the first few of each operator.
+    `live_effects`: make effects again, and compare their answers with the recorded ones, which operators get.
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
     before that moment, one without state begins there, any other is repeated from its beginning.
     `jobs`: worker processes; by default one for each core that may be used, fewer where there is little to do.
@@ -128,6 +130,7 @@ def verify(
         "slices": {},
         "until": [],
         "guard": paranoid,
+        "live_effects": live_effects,
     }
 
     def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
@@ -135,16 +138,7 @@ def verify(
         made = [Call(function, {**request, **more, "operators": list(names)}, names) for more, names in calls]
         return workers(made, **options)
 
-    answers = attempt(
-        (
-            {
-                "checks": list(one.checks),
-                "slices": {name: (cut.begin, cut.end) for name, cut in one.slices.items()},
-            },
-            one.operators,
-        )
-        for one in task.parts
-    )
+    answers = attempt((one.request(), one.operators) for one in task.parts)
     divided, left = slices.answer(task.books, answers)
     if left:
         needed = tuple(n for n in task.operators if n in with_makers(task.held, task.graph, left))

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import Counts, Duration, In, Operator, Out, Param, Sampled
+from dataflow.operator import FINDING, Counts, Duration, In, Operator, Out, Param, Sampled
 from operators.cloud.vertical import Vertical, accelerated, find_vertical, held
 from operators.geometry.extrinsics import transform_between, with_transform
 from operators.status import counted_status
 
 Array = NDArray[np.float64]
+
+_WRONG = np.radians(10.0)  # between a given vertical and that of a view which decides; no such view is so far off
 
 
 @dataclass
@@ -24,7 +26,8 @@ class State(Counts):
     """Holds the best view so far and what was decided by it: T_base_camera (4, 4), None where the base was given.
 
     `ground` is the best view that showed the ground, `first` the stamp since when a view is sought, `known` the digest
-    of the extrinsics that were completed last.
+    of the extrinsics that were completed last. `given` (3,) is up in the cloud's frame by a given base that no view has
+    been compared with yet, `finding` what was wrong with it.
     """
 
     done: bool = False
@@ -34,6 +37,8 @@ class State(Counts):
     T: Array | None = None
     known: bytes = b""
     figures: dict[str, float] = field(default_factory=dict)
+    given: Array | None = None
+    finding: str = ""
 
 
 class CameraMount(Operator):
@@ -42,7 +47,8 @@ class CameraMount(Operator):
     The vertical comes from the level and upright surfaces of a view, and from the accelerometer where there is one; the
     ground is the lowest level surface, of that view or one before. The first view that shows the vertical without doubt
     decides, for the map's frame begins with it; after `patience` the best one so far does, with a warning. The base is
-    level where the camera's odometry began. Extrinsics that hold the base are passed on as they are.
+    level where the camera's odometry began. Extrinsics that hold the base are passed on as they are; where the first
+    view that shows the vertical without doubt is far off them, a warning and the finding at the run's end state it.
 
     Method: directions of surfaces as in Coughlan and Yuille, "Manhattan world", 1999.
     """
@@ -71,30 +77,48 @@ class CameraMount(Operator):
         motion: Odometry | None = None,
     ) -> dict[str, Any] | None:
         """Raises ValueError where no extrinsics relate the accelerometer to the cloud."""
-        if self.state.done:
+        if self.state.done and self.state.given is None:
             return self._again(cloud, extrinsics)
-        if extrinsics is not None and self.base_frame in (*extrinsics.frames, *extrinsics.child_frames):
-            self.state.done, self.state.known = True, _digest(extrinsics)
-            text = f"{self.base_frame} is given"
-            return {
-                "base_extrinsics": extrinsics,
-                "status": counted_status("camera_mount", cloud.stamp, text, Level.OK, {}),
-            }
-        self.state.counts["views"] += 1
         self.state.first = cloud.stamp if self.state.first is None else self.state.first
+        given = extrinsics is not None and self.base_frame in (*extrinsics.frames, *extrinsics.child_frames)
+        if given and not self.state.done:
+            self.state.done, self.state.known = True, _digest(extrinsics)
+            self.state.given = transform_between(extrinsics, self.base_frame, cloud.frame)[:3, 2]
+            made: dict[str, Any] = {"base_extrinsics": extrinsics}
+        else:
+            made = self._again(cloud, extrinsics) or {} if self.state.done else {}
+        self.state.counts["views"] += 1
         expected, information = self._expected(cloud, extrinsics, imu)
         found = find_vertical(cloud.points, expected, information)
         if found is not None and motion is not None:
             found = found.before(motion.matrix()) if np.isfinite(motion.matrix()).all() else None
+        patient = cloud.stamp - self.state.first < self.patience
+        decides = found is not None and found.doubt <= 1
+        if self.state.given is not None:
+            return (made if patient and not decides else made | self._judged(cloud, found if decides else None)) or None
         if found is not None:
             self._compare(found)
-        patient = cloud.stamp - self.state.first < self.patience
-        if patient and (found is None or found.doubt > 1):
+        if patient and not decides:
             return None
         if self.state.best is None:
             self.state.best = Vertical(expected, np.asarray(np.linalg.inv(information), np.float64), 1.0, None)
         self.state.done = True
         return self._decided(cloud, extrinsics, self.state.best)
+
+    def _judged(self, cloud: PointCloud, found: Vertical | None) -> dict[str, Any]:
+        """Compares the given base with a view that decides; None where there was none."""
+        given, self.state.given = self.state.given, None
+        assert given is not None
+        text = f"{self.base_frame} is given"
+        if found is None:
+            text += "; few surfaces show whether it is right"
+        elif np.arccos(np.clip(given @ found.up, -1, 1)) > _WRONG:
+            text = self.state.finding = (
+                f"by the given {self.base_frame} the camera looks {_look(given)}, by the surfaces in sight "
+                f"{_look(found.up)}: the extrinsics are wrong; without {self.base_frame} in them it is found"
+            )
+        level = Level.WARN if self.state.finding else Level.OK
+        return {"status": counted_status("camera_mount", cloud.stamp, text, level, {})}
 
     def _compare(self, found: Vertical) -> None:
         """Keeps a view that is better than those so far."""
@@ -130,12 +154,12 @@ class CameraMount(Operator):
         if found.height is None and self.state.ground is not None:
             found = replace(found, height=self.state.ground.height)
         T = _on_base(found)
-        down, roll = np.degrees(np.arcsin(-found.up[2])), np.degrees(np.arctan2(found.up[0], -found.up[1]))
-        self.state.figures = {"looks down (°)": round(float(down), 1), "roll (°)": round(float(roll), 1)}
+        down, roll = _down_and_roll(found.up)
+        self.state.figures = {"looks down (°)": round(down, 1), "roll (°)": round(roll, 1)}
         self.state.figures |= {"sigma (°)": round(float(np.degrees(found.sigma)), 1), "height (m)": round(T[2, 3], 3)}
         guess = found.doubt > 1
         ground = "no ground in sight" if found.height is None else f"{found.height:.2f} m above the ground"
-        text = f"the camera looks {down:.0f}° down, turned by {roll:.0f}°, {ground}"
+        text = f"the camera looks {_look(found.up)}, {ground}"
         text = f"few surfaces show where up is; taken so: {text}" if guess else text
         self.state.counts["guesses"] += guess
         made = with_transform(extrinsics, cloud.stamp, self.base_frame, cloud.frame, T)
@@ -144,12 +168,24 @@ class CameraMount(Operator):
         figures = {key: f"{value:g}" for key, value in self.state.figures.items()}
         return {"base_extrinsics": made, "status": counted_status("camera_mount", cloud.stamp, text, level, figures)}
 
-    def summary(self) -> Mapping[str, float | int]:
-        return {**self.state.counts, **self.state.figures}
+    def summary(self) -> Mapping[str, float | int | str]:
+        """Returns counts and how the camera looked; and the finding, where the given base is wrong."""
+        found = {FINDING: self.state.finding} if self.state.finding else {}
+        return {**self.state.counts, **self.state.figures, **found}
 
 
 def _digest(extrinsics: Transforms | None) -> bytes:
     return b"" if extrinsics is None else extrinsics.digest()
+
+
+def _down_and_roll(up: Array) -> tuple[float, float]:
+    """Returns by how much a camera looks down and is rolled, degrees, where `up` (3,) is up in its optical frame."""
+    return float(np.degrees(np.arcsin(np.clip(-up[2], -1, 1)))), float(np.degrees(np.arctan2(up[0], -up[1])))
+
+
+def _look(up: Array) -> str:
+    down, roll = _down_and_roll(up)
+    return f"{round(down)}° down, turned by {round(roll)}°"
 
 
 def _on_base(found: Vertical) -> Array:

@@ -15,6 +15,7 @@ from dataflow.messages import Activity, FeatureVector, SceneGraph
 from dataflow.messages.scene_summary import (
     agents_in_words,
     carriers_in_words,
+    movers_in_words,
     spaced,
     summarize,
 )
@@ -207,13 +208,19 @@ def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since
         f"[bold]{graph.count} nodes, {len(graph.subjects)} relations[/bold] at {since:.1f} s, in {escape(graph.frame)}"
     )
     who = [(row.name, row.text) for row in agents_in_words(graph, told, activities)]
+    moving = [(row.name, row.text) for row in movers_in_words(graph, told, activities)]
     what = [(row.name, row.text) for row in carriers_in_words(graph, told)]
     others = [
         (names[r.subject], f"{spaced(r.predicate)} {names[r.object]} {r.score:.2f}")
         for r in told.telling
         if r.subject not in told.agents
     ]
-    for title, rows in (("who does what", who), ("what carries what", what), ("strongest other relations", others)):
+    for title, rows in (
+        ("who does what", who),
+        ("what moves", moving),
+        ("what carries what", what),
+        ("strongest other relations", others),
+    ):
         if rows:
             table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2, 0, 1))
             for name, text in rows:

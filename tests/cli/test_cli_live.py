@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.cli.commands.live import _Rate
+from dataflow.cli.commands.following.live import _Rate
 from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_graph
 from dataflow.supervision.plan import RunPlan

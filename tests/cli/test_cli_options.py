@@ -27,8 +27,10 @@ TRIED: tuple[str, ...] = (
     "verify RECORDING --one-process --only sum --start 0 --paranoid --path HERE --junit OUT.xml --tolerance 1e-6"
     " --quiet --json",
     "verify RECORDING --graph GRAPH --set count=30 --process-each --jobs 2",
-    "verify RECORDING --baseline OUT.json --accept",
-    "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json",
+    "verify RECORDING --baseline OUT.json --accept --repeat 1 --live-effects",
+    "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json --live-effects",
+    "capture RECORDING --op sum --firing 3 --predicate stamp --graph GRAPH --set count=30 --path HERE --to OUT.py"
+    " --overwrite --json",
     "check GRAPH --path HERE --set count=4 --json",
     "show GRAPH --path HERE --set count=4 --json",
     "show GRAPH --mermaid",

@@ -12,9 +12,11 @@ from dataflow.messages import Activity, SceneGraph
 from dataflow.messages.scene_summary import (
     CARRYING,
     LEAST,
+    Row,
     agents_in_words,
     carriers_in_words,
     grouped,
+    movers_in_words,
     plural,
     summarize,
 )
@@ -98,7 +100,7 @@ def test_intentions_are_told_however_unlikely_and_the_likeliest_first() -> None:
     assert not told.telling
 
 
-def test_people_come_with_what_they_do_and_where_they_go() -> None:
+def test_people_come_with_what_they_do_and_a_ball_beside_them_is_what_moves() -> None:
     scene = graph("ball person chair", (1, "heads_for", 2, 0.76), (0, "on", 2, 0.9))
     acts = Activity(
         stamp=0,
@@ -107,11 +109,9 @@ def test_people_come_with_what_they_do_and_where_they_go() -> None:
         class_ids=np.array([0, 1], np.int32),
         scores=np.array([0.9, 0.5], np.float32),
     )
-    rows = agents_in_words(scene, summarize(scene, acts), acts)
-    assert [(row.name, row.text) for row in rows] == [
-        ("person 2", "walking 90 %, heads for chair 3 (76 %)"),
-        ("ball 1", "resting 50 %, on chair 3"),
-    ]
+    told = summarize(scene, acts)
+    assert agents_in_words(scene, told, acts) == [Row("person 2", "walking 90 %, heads for chair 3 (76 %)")]
+    assert movers_in_words(scene, told, acts) == [Row("ball 1", "resting 50 %, on chair 3")]
 
 
 def test_what_is_carried_is_grouped_by_class_and_the_floor_has_what_stands_alone() -> None:

@@ -1,15 +1,20 @@
-"""`dataflow debug`: to any recorded call of an operator, and into it."""
+"""`dataflow debug`: to any recorded call of an operator, and into it. `dataflow capture`: a wrong one as a test."""
 
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.text import Text
 
 from dataflow.cli.support.arguments import (
+    FLAG,
     Json,
     ModuleFolders,
     RecordingFile,
@@ -17,9 +22,14 @@ from dataflow.cli.support.arguments import (
     existing_recording,
     find_modules_in,
     graph_file,
+    output_file,
     span,
 )
-from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural
+from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, size
+from dataflow.cli.support.run_options import LiveEffects
+
+MOST_BYTES = 1_000_000
+"""Of a captured call, which is to lie beside tests under version control."""
 
 if TYPE_CHECKING:
     from dataflow.cli.support.debug_shell import Shell
@@ -42,6 +52,7 @@ def debug(
     ] = None,
     settings: Settings = None,
     path: ModuleFolders = None,
+    live_effects: LiveEffects = False,
     json: Json = False,
 ) -> None:
     """Go to any recorded call of an operator: what it was given, what it made, its state before and after.
@@ -74,17 +85,120 @@ def debug(
         from dataflow.graph import load_graph
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-        _debug(recording, operator, loaded, do, json=json)
+        _debug(recording, operator, loaded, do, live_effects=live_effects, json=json)
 
 
-def _debug(recording: Path, operator: str, graph: Graph | None, do: list[str] | None, *, json: bool) -> None:
+def capture(
+    recording: RecordingFile,
+    operator: Annotated[str, typer.Option("--op", metavar="OPERATOR", help="The operator.")],
+    firing: Annotated[
+        int | None,
+        typer.Option(
+            "--firing",
+            metavar="N",
+            help="The call, as `debug` counts them: from 0, or from the end if negative. Default: the first wrong one.",
+        ),
+    ] = None,
+    predicate: Annotated[
+        str,
+        typer.Option(
+            "--predicate",
+            metavar="EXPRESSION",
+            help="True of a wrong call; sees inp, out, stamp, error. Default: not as recorded, or an error.",
+        ),
+    ] = "",
+    to: Annotated[
+        Path | None,
+        typer.Option("--to", metavar="TEST.py", help="The file to write. Default: test_OPERATOR_N.py here."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace a file that exists.")] = False,
+    graph: Annotated[
+        Path | None,
+        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
+    ] = None,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    json: Json = False,
+) -> None:
+    """Capture a wrong call as a test: the smallest inputs that still show it, without the recording.
+
+    Writes a pytest file and a data file beside it. The test fails until the operator is mended. Wrong is a call that
+    does not give what was recorded, that raises an error, or of which --predicate is true. Calls before it are kept as
+    far as they are needed.
+
+    Exit code 0; 2: nothing is wrong, or it does not show apart from the recording.
+
+    Examples:
+
+      dataflow capture run.mcap --op tracker
+      dataflow capture run.mcap --op tracker --firing 412 --to test_lost_track.py
+      dataflow capture run.mcap --op detector --predicate "len(out.detections.boxes) > 100"
+    """
+    with friendly_errors():
+        recording = existing_recording(recording)
+        if graph is None and settings:
+            raise fail("--set changes a graph file: name it with --graph")
+        find_modules_in(path)
+        _take_environment(recording)
+        from dataflow.graph import load_graph
+
+        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+        _capture(recording, operator, loaded, firing, predicate, to, overwrite=overwrite, json=json)
+
+
+def _capture(
+    recording: Path,
+    operator: str,
+    graph: Graph | None,
+    firing: int | None,
+    predicate: str,
+    to: Path | None,
+    *,
+    overwrite: bool,
+    json: bool,
+) -> None:
+    from dataflow.capture.capture import capture as captured
+    from dataflow.capture.capture import write_test
+    from dataflow.debugging.debugger import Debugger
+    from dataflow.recording import Recording
+
+    began = time.monotonic()
+    with Recording(recording) as opened:
+        debugger = Debugger(opened, operator, graph)
+        try:
+            found = captured(opened, debugger, firing, predicate)
+        except SyntaxError as error:
+            raise fail(f"--predicate {predicate}: no Python expression: {error.msg}") from None
+        finally:
+            debugger.close()
+    name = re.sub(r"\W", "_", found.captured.setting.name)
+    path = output_file(to or Path(f"test_{name}_{found.number}.py"), ".py", overwrite=overwrite, option="--to")
+    words = ["dataflow capture", shlex.quote(recording.name), "--op", operator, "--firing", str(found.number)]
+    if predicate:
+        words += ["--predicate", shlex.quote(predicate)]
+    nbytes = write_test(found, path, recording.name, " ".join(words))
+    if json:
+        told = {"test": str(path), "call": found.number, "calls": found.calls, "kept": found.left, "bytes": nbytes}
+        print_json(told | {"wrong": found.wrong, "begins": found.begins, "seconds": time.monotonic() - began})
+        return
+    out.print(Text(f"call {found.number} of {debugger.node.name}: {found.wrong}"), soft_wrap=True)
+    out.print(Text(f"{plural(found.left, 'call')} of {found.calls} kept, begun with {found.begins}"), soft_wrap=True)
+    beside = f"{path.with_suffix('.capture').name} ({size(nbytes)})"
+    out.print(Text(f"wrote {path} and {beside}: pytest {path}"), soft_wrap=True)
+    if nbytes > MOST_BYTES:
+        out.print(Text(f"its inputs are large: more than {size(MOST_BYTES)}", style="yellow"))
+
+
+def _debug(
+    recording: Path, operator: str, graph: Graph | None, do: list[str] | None, *, live_effects: bool, json: bool
+) -> None:
     from dataflow.cli.support.debug_shell import Shell, WrongCommand
     from dataflow.debugging.debugger import Debugger
     from dataflow.recording import Recording
 
     name, _, when = operator.partition("@")
     with Recording(recording) as opened:
-        debugger = Debugger(opened, name, graph)
+        debugger = Debugger(opened, name, graph, live_effects=live_effects)
         begin, _ = span(opened, opened.streams) or (0, 0)
         shell = Shell(debugger, begin, json=json)
         try:

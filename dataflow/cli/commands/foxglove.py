@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.live import GraphName, Wait, running_graph, say_followed
+from dataflow.cli.commands.following.live import GraphName, Wait, running_graph, say_followed
 from dataflow.cli.support.arguments import (
     Clock,
     End,

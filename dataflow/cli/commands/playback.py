@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
 from dataflow.cli.support.arguments import Json, number
 from dataflow.cli.support.output import err, fail, friendly_errors, out, print_json, say
 from dataflow.cli.support.quantities import speed_text

@@ -34,7 +34,7 @@ from dataflow.cli.support.output import (
     print_json,
     say,
 )
-from dataflow.cli.support.run_options import Paranoid, Quiet
+from dataflow.cli.support.run_options import LiveEffects, Paranoid, Quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,6 +46,30 @@ if TYPE_CHECKING:
 
 _GATE = "Regression gate"
 MOST_JOBS = 1024
+MOST_RUNS = 100_000
+
+_Only = Annotated[
+    list[str] | None,
+    typer.Option("--only", metavar="OPERATOR", help="Only this operator; may be given several times."),
+]
+_Tolerance = Annotated[
+    float | None,
+    typer.Option(
+        "--tolerance",
+        metavar="T",
+        help="Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
+        "inputs. Reported as within tolerance, never as identical.",
+    ),
+]
+_Jobs = Annotated[
+    int | None,
+    typer.Option(
+        "--jobs", "-j", metavar="N", help="Worker processes. Default: one for each core, fewer where little is to do."
+    ),
+]
+_Repeat = Annotated[
+    int, typer.Option("--repeat", metavar="N", help="Verify up to N times, until something differs; gives the odds.")
+]
 
 
 def verify(
@@ -61,19 +85,8 @@ def verify(
     first: Annotated[
         str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
     ] = None,
-    only: Annotated[
-        list[str] | None,
-        typer.Option("--only", metavar="OPERATOR", help="Only this operator; may be given several times."),
-    ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            "--tolerance",
-            metavar="T",
-            help="Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
-            "inputs. Reported as within tolerance, never as identical.",
-        ),
-    ] = None,
+    only: _Only = None,
+    tolerance: _Tolerance = None,
     start: Annotated[
         float | None,
         typer.Option(
@@ -105,15 +118,9 @@ def verify(
             "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
         ),
     ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            "--jobs",
-            "-j",
-            metavar="N",
-            help="Worker processes. Default: one for each core, fewer where little is to do.",
-        ),
-    ] = None,
+    jobs: _Jobs = None,
+    repeat: _Repeat = 1,
+    live_effects: LiveEffects = False,
     paranoid: Paranoid = False,
     why: Annotated[
         bool,
@@ -152,6 +159,7 @@ def verify(
       dataflow verify run.mcap --from odometry --graph changed.yaml
       dataflow verify run.mcap --tolerance 1e-5
       dataflow verify run.mcap --start 60
+      dataflow verify run.mcap --repeat 40
       dataflow verify runs/ --junit verify.xml
       dataflow verify runs/ --baseline runs/accepted.json --accept
     """
@@ -160,6 +168,8 @@ def verify(
     with friendly_errors():
         only = only or None  # typer gives an empty list where there is none
         _refuse_deprecated(one_process, process_each, jobs)
+        if not 1 <= repeat <= MOST_RUNS:
+            raise fail(f"--repeat {repeat}: expected 1 to {MOST_RUNS}")
         _refuse_what_excludes(first, only, graph, settings, tolerance, start, baseline, accept=accept)
         for target in recordings:
             if not target.is_dir():
@@ -187,10 +197,11 @@ def verify(
                 "start": start,
                 "jobs": 1 if one_process else jobs,
                 "paranoid": paranoid,
+                "live_effects": live_effects,
             }
             found = recordings_in(recordings)
             single = len(recordings) == 1 and recordings[0] == found[0][0]
-            checked = _check(found, known, options, quiet=quiet, single=single)
+            checked = _check(found, known, options, repeat, quiet=quiet, single=single)
             reasons = [_reasons(one, only, loaded) for one in checked] if why else []
             _report(checked, reasons, _options(graph, settings, path), single=single, json=json, junit=junit)
             if known is not None:
@@ -235,7 +246,13 @@ def _refuse_what_excludes(
 
 
 def _check(
-    targets: list[tuple[Path, str]], known: Baseline | None, options: dict[str, Any], *, quiet: bool, single: bool
+    targets: list[tuple[Path, str]],
+    known: Baseline | None,
+    options: dict[str, Any],
+    repeat: int,
+    *,
+    quiet: bool,
+    single: bool,
 ) -> list[Checked]:
     from dataflow.verification.gate import check
 
@@ -244,7 +261,7 @@ def _check(
         if not quiet and not single:
             say(f"[dim]{number} of {len(targets)}: {escape(name)}[/]")
         accepted = {} if known is None else known.of(path)
-        one = check(path, name, _verifier(options, quiet=quiet), accepted, options["graph"])
+        one = check(path, name, _verifier(options, quiet=quiet), accepted, options["graph"], repeat)
         if one.not_in_graph:
             names = escape(", ".join(one.not_in_graph))
             say(f"[yellow]note:[/] {escape(name)}: recorded operators that the graph does not have: {names}")
@@ -303,7 +320,10 @@ def _report(
     elif single:
         print_one(out, checked[0])
         for name in checked[0].culprits[:1]:
-            words = ["dataflow debug", shlex.quote(str(checked[0].path)), name, *options, "--do diff"]
+            path = shlex.quote(str(checked[0].path))
+            words = ["dataflow capture", path, "--op", name, *options]
+            out.print(Text(f"as a test: {' '.join(words)}", style="dim"), soft_wrap=True)
+            words = ["dataflow debug", path, name, *options, "--do diff"]
             out.print(Text(f"next: {' '.join(words)}", style="dim"), soft_wrap=True)
     elif json:
         values = [c.as_json() | more for c, more in zip(checked, found, strict=True)]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from dataflow.cli.commands.live import GraphName, Wait, running_graph, say_followed
+from dataflow.cli.commands.following.live import GraphName, Wait, running_graph, say_followed
 from dataflow.cli.support.arguments import (
     Clock,
     End,

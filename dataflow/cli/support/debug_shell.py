@@ -84,6 +84,9 @@ class Shell(cmd.Cmd):
             out.print(f"{plural(len(self._debugger.calls), 'call')}: all give what was recorded")
         else:
             self._show(found)
+            if not self._json:
+                words = f"dataflow capture RECORDING --op {self._debugger.node.name} --firing {found.number}"
+                out.print(Text(f"  as a test: {words}", style="dim"), soft_wrap=True)
 
     # ------------------------------------------------------------------------------------------------- looking
 

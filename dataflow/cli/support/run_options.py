@@ -1,4 +1,4 @@
-"""Options that `dataflow run` and `dataflow replay` share."""
+"""Options that `dataflow run`, `dataflow replay` and other commands share."""
 
 from __future__ import annotations
 
@@ -103,6 +103,15 @@ Live = Annotated[
 ]
 Paranoid = Annotated[
     bool, typer.Option("--paranoid", metavar=FLAG, help="Catch operators that write into their inputs.")
+]
+LiveEffects = Annotated[
+    bool,
+    typer.Option(
+        "--live-effects",
+        metavar=FLAG,
+        help="Make calls to services (`self.effect`) again. Their answers are compared, and the recorded ones given; a "
+        "call that is not recorded gets the new one.",
+    ),
 ]
 LogLevel = Annotated[
     str | None,

@@ -57,6 +57,8 @@ def print_one(console: Console, checked: Checked) -> None:
     if not report.identical:
         for line in fact_lines(report):
             console.print(Text(line, style="dim"), soft_wrap=True)
+    if checked.runs > 1:
+        console.print(Text(_runs(checked)))
     console.print(Text.assemble((checked.verdict, STYLES[checked.verdict]), _conclusion(checked, report)))
 
 
@@ -107,6 +109,8 @@ def reservations(checked: Checked) -> Iterator[str]:
     for v in checked.report.operators:
         yield from _left_out(v)
     yield from _notes(checked.report)
+    if checked.runs > 1:
+        yield _runs(checked)
 
 
 def print_completion(console: Console, made: Completion) -> None:
@@ -235,8 +239,28 @@ def _notes(report: VerifyReport) -> Iterator[str]:
             first = f", the first {lost[0].stream} {_number(lost[0].first_missing)}" if lost else ""
             made = f"{plural(stand_in.missing, 'message')} that it made, not in the recording"
             yield f"{stand_in.operator}: {made} (never sent, or lost{first})"
+    for v in report.operators:
+        yield from _effects(v)
     for stream in report.unchecked:
         yield f"{stream}: not compared with its records: messages of its type are not read as they were written"
+
+
+def _effects(v: Verification) -> Iterator[str]:
+    """Returns what of an operator's calls to what cannot repeat was taken from the recording."""
+    for name, done in v.effects.items():
+        line = f"{v.operator}: {plural(done['given'], 'answer')} of {name} given as recorded"
+        if done["again"]:
+            line += f"; made again {plural(done['again'], 'time')}, {count(done['same'])} answered as recorded"
+        if done["missed"]:
+            line += f"; {plural(done['missed'], 'call')} not recorded"
+        yield line
+
+
+def _runs(checked: Checked) -> str:
+    """Returns what repeated verifications show."""
+    if checked.unseen is None:
+        return f"a difference in run {checked.runs}; the {plural(checked.runs - 1, 'run')} before passed"
+    return f"a difference was not seen in {checked.runs} runs: at most {checked.unseen:.1%} of runs, at 95 % confidence"
 
 
 def _number(place: tuple[int, int] | None) -> str:

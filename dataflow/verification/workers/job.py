@@ -24,7 +24,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
     `incomplete` (recorded streams to be made again), `records` (see `FiringLog.to_wire`), `begin` (stamp, or None),
     `tolerance`, `slices` (by operator the stamps between which its calls are made), `until` (operators: once each of
-    them has differed, the rest is left), `guard` (watch over messages in every call).
+    them has differed, the rest is left), `guard` (watch over messages in every call), `live_effects` (make them again).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
     stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: `operator` and `work` of
     those that are not repeated as a whole.
@@ -53,6 +53,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             slices=request["slices"],
             guard=MemoryGuard(keeping=True) if request["guard"] else None,
             watcher=board,
+            live_effects=request["live_effects"],
         )
         until = [work.runners[name].result for name in request["until"]]
         results = work.run(until=lambda: bool(until) and all(result.first is not None for result in until))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from dataflow.graph.model import Graph
 from dataflow.records.reading import FiringLog
@@ -27,6 +28,11 @@ class Job:
     operators: tuple[str, ...]
     checks: tuple[str, ...] = ()
     slices: Mapping[str, Slice] = field(default_factory=dict)
+
+    def request(self) -> dict[str, Any]:
+        """Returns its part of the request to a worker, as plain values."""
+        slices = {name: (cut.begin, cut.end) for name, cut in self.slices.items()}
+        return {"checks": list(self.checks), "slices": slices}
 
 
 def planned(

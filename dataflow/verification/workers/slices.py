@@ -6,6 +6,7 @@ serve only to show that all is as recorded: an operator of which one shows anyth
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from functools import reduce
@@ -90,7 +91,11 @@ def together(found: Sequence[Mapping[str, Any]], book: Book) -> Mapping[str, Any
     verified = sum(v.verified for v in verifications)
     if any(v.verdict != "identical" or v.firings != v.verified for v in verifications) or verified != book.calls:
         return None
-    return {**found[0], "firings": verified, "verified": verified, "outputs": book.outputs, "began": "start"}
+    effects: dict[str, Counter[str]] = {}
+    for name, counts in (pair for v in verifications for pair in v.effects.items()):
+        effects.setdefault(name, Counter()).update(counts)
+    more = {"outputs": book.outputs, "began": "start", "effects": {name: dict(c) for name, c in effects.items()}}
+    return {**found[0], "firings": verified, "verified": verified, **more}
 
 
 def answer(books: Books, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], set[str]]:

@@ -18,6 +18,7 @@ from dataflow.messages.scene_summary import (
     carriers_in_words,
     class_names,
     doing,
+    movers_in_words,
     percent,
     spaced,
     summarize,
@@ -82,6 +83,7 @@ def _words(canvas: Canvas, message: SceneGraph, told: SceneSummary, activities: 
     """The graph as a list in Markdown, sent where it differs from the last."""
     tables = (
         _table("who", "does", agents_in_words(message, told, activities)),
+        _table("what", "moves", movers_in_words(message, told, activities)),
         _table("what", "carries", carriers_in_words(message, told)),
     )
     counted = f"{message.count} nodes, {len(message.subjects)} relations"

@@ -102,6 +102,7 @@ def lift(
     background: Sequence[int],
     s: LiftSettings,
     bodies: Collection[int] = (),
+    instances: Sequence[Mask] | None = None,
 ) -> list[Lifted]:
     """Finds the object of each image box (M, 4) among a cloud's points; boxes without one are left out.
 
@@ -109,6 +110,8 @@ def lift(
     it that make the overlap better. `mask_classes` (M,) is the mask's class of each box, -1 for none. Where the box
     holds enough of it, only such points count. Otherwise points of `background` classes and on level surfaces that
     reach beyond the box do not. Points go to the box that they fit best, once.
+
+    `instances` (M) are masks (H, W) of the objects themselves; where they are known, only points on them count.
 
     For the boxes in `bodies` the mask counts more than the edges: the object is the connected part of its mask, also
     beyond the box, and its share of the mask in the box replaces the overlap.
@@ -126,26 +129,19 @@ def lift(
         inner = (u >= left) & (u <= right) & (v >= upper) & (v <= lower)
         if np.count_nonzero(inner) < s.min_points:
             continue
-        if classes is None or behind is None:
-            around = near[~inner & (v >= upper - ring[1]) & (v <= lower + ring[1])]
-            rows = _off_support(seen, near[inner], around, s)
-        else:
-            of_class = inner & (classes[first:last] == mask_classes[k])
-            share = s.body_share if k in bodies else s.mask_share
-            masked = mask_classes[k] >= 0 and np.count_nonzero(of_class) >= max(
-                s.min_points, share * np.count_nonzero(inner)
-            )
+        box = (left, upper, right, lower)
+        if instances is not None:
+            rows = _on(instances[k], seen, near[inner])
+        elif (rows := _of_class(near, inner, classes, first, mask_classes[k], k in bodies, s)) is None:
             if k in bodies:
-                own = classes == mask_classes[k]
-                body = _body(seen, columns, lines, own, order, (left, upper, right, lower), s) if masked else None
-                candidates += [] if body is None else [(k, *body)]
                 continue
-            if masked:
-                rows = near[of_class]
-            else:
-                around = near[~inner & (v >= upper - ring[1]) & (v <= lower + ring[1])]
-                rows = _off_support(seen, near[inner & ~behind[first:last]], around, s)
-        found = _object(seen, np.sort(rows), (left, upper, right, lower), s)
+            around = near[~inner & (v >= upper - ring[1]) & (v <= lower + ring[1])]
+            rows = _off_support(seen, near[inner if behind is None else inner & ~behind[first:last]], around, s)
+        elif k in bodies and classes is not None:
+            body = _body(seen, columns, lines, classes == mask_classes[k], order, box, s)
+            candidates += [] if body is None else [(k, *body)]
+            continue
+        found = _object(seen, np.sort(rows), box, s)
         if found is not None:
             candidates.append((k, *found))
     owned = _divided(seen.places[:2], boxes, candidates, bodies)
@@ -156,6 +152,33 @@ def lift(
         if len(own) >= max(_FEWEST, _LEFT * len(points))  # else others have it
     ]
     return sorted(kept, key=lambda c: c.detection)
+
+
+def _on(mask: Mask, seen: Seen, rows: Indices) -> Indices:
+    """Returns those of some points that are on an object's mask (H, W)."""
+    columns, lines = seen.places[:2].take(rows, axis=1).astype(np.intp)
+    return np.asarray(rows[mask[lines, columns]])
+
+
+def _of_class(
+    near: Indices,
+    inner: Mask,
+    classes: NDArray[np.int32] | None,
+    first: int,
+    wanted: int,
+    body: bool,
+    s: LiftSettings,
+) -> Indices | None:
+    """Returns the points `near` a box that are in it and of its class in the mask; None where these are too few.
+
+    `classes` are those of all points by rising column, of which `near` begin at `first`.
+    """
+    if classes is None or wanted < 0:
+        return None
+    own = inner & (classes[first : first + len(near)] == wanted)
+    share = s.body_share if body else s.mask_share
+    enough = np.count_nonzero(own) >= max(s.min_points, share * np.count_nonzero(inner))
+    return near[own] if enough else None
 
 
 def _body(

@@ -38,13 +38,16 @@ class ObjectLifter(Operator):
     """Finds the points of a cloud that belong to the boxes of an image and puts upright 3-D boxes around them.
 
     The cloud may be a depth camera's or a lidar's. The points of a box's frustum are divided into clusters (DBSCAN),
-    and that one is the object whose image overlaps the box best; the overlap is part of its score. With masks of the
-    same image only points of the box's class count. Boxes hold what is seen of an object, not its far side.
+    and that one is the object whose image overlaps the box best; the overlap is part of its score. Where the
+    detections have masks, only points on these count; with masks of the same image's classes, only points of the box's
+    class. Boxes hold what is seen of an object, not its far side.
 
     Method: frustums as in Qi et al., "Frustum PointNets for 3D object detection", 2018, with clusters for the network.
     """
 
-    detections: In[Detections2D] = In(doc="boxes in the image of a pinhole camera without distortion")
+    detections: In[Detections2D] = In(
+        doc="boxes in the image of a pinhole camera without distortion, and masks, if any"
+    )
     cloud: In[PointCloud] = In(doc="points of the same time, in the frame of their sensor")
     image_info: Sampled[CameraInfo] = Sampled(doc="calibration of the image")
     extrinsics: Sampled[Transforms] = Sampled(
@@ -112,7 +115,11 @@ class ObjectLifter(Operator):
             min_overlap=self.min_overlap,
         )
         boxes, bodies = detections.boxes[rows].astype(np.float64), frozenset(np.flatnonzero(body[rows]).tolist())
-        found = lift(seen, boxes, [known.get(names[k], -1) for k in rows], background, settings, bodies)
+        classes = [known.get(names[k], -1) for k in rows]
+        instances = (
+            None if detections.masks is None else [m for k in rows if (m := detections.mask(int(k))) is not None]
+        )
+        found = lift(seen, boxes, classes, background, settings, bodies, instances)
         labels = np.full(cloud.count, -1, np.int32)
         for number, each in enumerate(found):
             labels[usable[each.points]] = number

@@ -208,9 +208,9 @@ class ObjectMap:
         made.view = _direction(eye, cells)
         made.center = cells.middle
         image = each.image
-        if image is not None and not self._kinds.is_mover(made):  # a single view is weaker evidence than the points
+        self._fit(made)  # to its points: a single image is weaker evidence, and counts from the next fit on
+        if image is not None and not self._kinds.is_mover(made):
             made.look(image, cells.points)
-        self._fit(made)
         self.objects[made.id] = made
         self._next += 1
         return made.id

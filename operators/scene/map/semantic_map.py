@@ -185,10 +185,11 @@ class SemanticMap(Operator):
             parts = seen_surfaces(surfaces, cloud, T, self.max_range)
             self.state.surfaces.update(cloud.stamp, parts, view, known.heading)
         objects, planes = known.confirmed(), self.state.surfaces.confirmed
-        scores = [o.score * (1 - known.doubt(o)) for o in objects]
+        doubts = [known.doubt(o) for o in objects]
+        scores = [o.score * (1 - doubt) for o, doubt in zip(objects, doubts, strict=True)]
         counts = {
             "objects": len(objects),
-            "doubted": sum(known.doubt(o) > 0 for o in objects),
+            "doubted": sum(doubt > 0 for doubt in doubts),
             "tentative": len(known.objects) - len(objects),
             "seen now": sum(o.seen == cloud.stamp for o in objects),
             "moved": known.moved,

@@ -7,8 +7,9 @@ import pytest
 from made_view import HEIGHT, Array, room, turned
 
 from dataflow.execution.snapshots import pack_state, unpack_state
-from dataflow.messages import Imu, Odometry, PointCloud, Transforms
+from dataflow.messages import Diagnostics, Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
+from dataflow.operator import FINDING
 from dataflow.testing import play
 from operators.cloud import CameraMount, camera_mount
 from operators.cloud.vertical import Vertical
@@ -63,6 +64,36 @@ def test_a_base_that_is_given_is_kept() -> None:
     given = Transforms.from_matrix(np.eye(4), stamp=0, frame="base_link", child_frame="depth")
     (made,) = play(CameraMount(), {"cloud": [cloud(room(28, 5))], "extrinsics": [given]})["base_extrinsics"]
     assert made.digest() == given.digest()
+
+
+@pytest.mark.parametrize(("down", "wrong"), [(0, True), (28, False), (33, False)])
+def test_a_given_base_is_compared_with_the_first_view_that_shows_the_vertical(down: float, wrong: bool) -> None:
+    given = Transforms.from_matrix(_mounted(down), stamp=0, frame="base_link", child_frame="depth")
+    mount = CameraMount()
+    clouds = [cloud(NOTHING), *(cloud(room(28, 0), stamp) for stamp in (1, 2))]
+    played = play(mount, {"cloud": clouds, "extrinsics": [given]})
+    assert len(played["base_extrinsics"]) == 1
+    (status,) = played["status"]
+    assert isinstance(status, Diagnostics)
+    assert (status.stamp, status.levels.tolist()) == (1, [Level.WARN if wrong else Level.OK])
+    said = "looks 0° down, turned by 0°, by the surfaces in sight 28° down"
+    assert (said in status.messages[0]) is wrong
+    assert (said in str(mount.summary().get(FINDING))) is wrong
+
+
+def test_a_given_base_is_not_called_wrong_where_no_surface_shows_the_vertical() -> None:
+    given = Transforms.from_matrix(_mounted(0), stamp=0, frame="base_link", child_frame="depth")
+    nothing = [cloud(NOTHING, stamp) for stamp in (0, 1_000_000_000, 2_000_000_000, 3_000_000_000)]
+    (status,) = play(CameraMount(patience="2s"), {"cloud": nothing, "extrinsics": [given]})["status"]
+    assert isinstance(status, Diagnostics)
+    assert (status.stamp, status.levels.tolist()) == (2_000_000_000, [Level.OK])
+
+
+def _mounted(down: float) -> Array:
+    """Returns the pose (4, 4), on a level base, of an optical frame that looks down, degrees."""
+    T = np.eye(4)
+    T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]) @ turned(down, 0).T
+    return T
 
 
 def test_imu_of_a_frame_that_is_not_related_is_an_error() -> None:

@@ -10,7 +10,16 @@ import pytest
 from made_scene import INFO, Solid, camera, look
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import Boxes3D, CameraInfo, Clusters, Detections2D, Diagnostics, PointCloud, Transforms
+from dataflow.messages import (
+    Boxes3D,
+    CameraInfo,
+    Clusters,
+    Detections2D,
+    Diagnostics,
+    PointCloud,
+    Transforms,
+    pack_masks,
+)
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import Played, play
 from operators.scene import ObjectLifter
@@ -68,6 +77,23 @@ def test_a_detection_of_nothing_has_no_object_and_is_counted() -> None:
     assert status.levels[0] == 1
     assert status.pairs(0)["without an object"] == "1"
     assert cloud.count
+
+
+def test_by_the_mask_of_a_detection_a_slatted_back_is_not_what_shows_through_it() -> None:
+    pose = camera(1)
+    slats: list[Solid] = [((2.4, y, 0.45), (0.02, 0.04, 0.5), 0.0, 1) for y in (-0.3, -0.15, 0.0, 0.15, 0.3)]
+    cloud, detections, classes = look(pose, [*slats, ((2.8, 0.0, 0.6), (0.4, 1.2, 1.2), 0.0, 0)], noise=0.004)
+    own = classes.classes == classes.class_names.index(detections.class_names[1])
+    corners = detections.boxes[: len(slats)]
+    box = np.concatenate([corners[:, :2].min(axis=0), corners[:, 2:].max(axis=0)])[None]
+    back = detections.replace(
+        boxes=box, scores=np.ones(1, np.float32), class_ids=np.ones(1, np.int32), ids=None, masks=pack_masks(own[None])
+    )
+    streams = {"detections": [back], "cloud": [cloud], "image_info": [INFO], "pose": [pose]}
+    (boxes,) = play(ObjectLifter(), streams, static=["image_info"])["boxes"]
+    assert isinstance(boxes, Boxes3D)
+    assert min(boxes.sizes[0, :2]) < 0.08
+    assert transform_points(pose.matrix(), boxes.centers)[0] == pytest.approx((2.4, 0, 0.45), abs=0.05)
 
 
 def test_masks_of_another_time_are_not_used() -> None:

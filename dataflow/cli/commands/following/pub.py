@@ -12,8 +12,8 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.commands.completion import running_operators
-from dataflow.cli.commands.live import GraphName, Wait, running_graph
-from dataflow.cli.commands.param import Timeout, _check, _value
+from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.param import Timeout, _check, _value
 from dataflow.cli.support.arguments import number
 from dataflow.cli.support.output import DIFFERENT, INTERRUPTED, fail, friendly_errors, out, print_json_line
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.live import GraphName, Wait, followed_graph
+from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph
 from dataflow.cli.support.arguments import FLAG
 from dataflow.cli.support.output import INTERRUPTED, err, fail, friendly_errors, out, print_json
 

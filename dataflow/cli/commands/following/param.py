@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.commands.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
 from dataflow.cli.support.arguments import FLAG, Json, OutInstead, existing, find_modules_in, named_once
 from dataflow.cli.support.output import (
     DIFFERENT,

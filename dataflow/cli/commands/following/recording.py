@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.commands.live import GraphName, Streams, Wait, running_graph, say_followed
+from dataflow.cli.commands.following.live import GraphName, Streams, Wait, running_graph, say_followed
 from dataflow.cli.support.arguments import FLAG, Json, Overwrite, chosen_streams
 from dataflow.cli.support.material import Compression
 from dataflow.cli.support.output import (

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.commands.completion import running_operators
-from dataflow.cli.commands.live import GraphName, Wait, followed_graph, running_graph
+from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph, running_graph
 from dataflow.cli.support.arguments import FLAG, existing
 from dataflow.cli.support.output import INTERRUPTED, fail, friendly_errors, out, print_json_line, say
 

@@ -1,0 +1,47 @@
+"""Delta debugging: the smallest part of a list that still shows something.
+
+Zeller and Hildebrandt, Simplifying and isolating failure-inducing input, 2002: `ddmin`, behind a search for the
+shortest end of the list, since the latest inputs matter most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def shortest_end(items: Sequence[T], shows: Callable[[Sequence[T]], bool]) -> Sequence[T]:
+    """The shortest end of `items`, of 0, 1, 2, 4, 8... of them, that shows it; all where none of these does."""
+    size = 0
+    while size < len(items):
+        if shows(items[len(items) - size :]):
+            return items[len(items) - size :]
+        size = 2 * size or 1
+    return items
+
+
+def smallest(items: Sequence[T], shows: Callable[[Sequence[T]], bool]) -> Sequence[T]:
+    """A part of `items`, in their order, that shows it, and does no more without any one of its items.
+
+    `items` show it; `shows` is asked about parts, and False once the time is up.
+    """
+    if shows(()):
+        return ()
+    left, parts = list(items), 2
+    while len(left) >= 2:
+        size = -(-len(left) // parts)
+        cuts = [(k, min(k + size, len(left))) for k in range(0, len(left), size)]
+        found = next((left[a:b] for a, b in cuts if len(cuts) > 2 and shows(left[a:b])), None)
+        if found is not None:
+            left, parts = found, 2
+            continue
+        found = next((left[:a] + left[b:] for a, b in cuts if shows(left[:a] + left[b:])), None)
+        if found is not None:
+            left, parts = found, max(parts - 1, 2)
+        elif parts >= len(left):
+            break
+        else:
+            parts = min(2 * parts, len(left))
+    return left

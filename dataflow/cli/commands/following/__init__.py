@@ -1,0 +1,1 @@
+"""Commands that follow a running graph from another terminal, and give it messages and parameters."""

@@ -1,0 +1,217 @@
+"""`dataflow sweep`: many recordings by many settings, on this machine or a Ray cluster, into one table."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from dataflow.cli.support.arguments import FLAG, Json, ModuleFolders, find_modules_in, graph_file, number
+from dataflow.cli.support.output import (
+    DIFFERENT,
+    count,
+    err,
+    fail,
+    friendly_errors,
+    out,
+    plural,
+    print_json,
+    say,
+    seconds,
+    table,
+)
+from dataflow.cli.support.report import SCORES
+from dataflow.cli.support.run_options import Quiet, Verbose
+
+if TYPE_CHECKING:
+    from dataflow.sweep.plan import What
+    from dataflow.sweep.run import Sweep
+
+MOST_JOBS = 256
+
+Graph = Annotated[
+    Path | None,
+    typer.Argument(metavar="[GRAPH]", help="The graph. Default: of each recording the one that made it."),
+]
+Recordings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--recordings", metavar="FILE|FOLDER|URL", help="Recordings, or folders of them, at any depth. May be repeated."
+    ),
+]
+Values = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE,VALUE",
+        help="The values of a graph parameter, or OPERATOR.PARAM. May be repeated: every combination is run.",
+    ),
+]
+Done = Annotated[str, typer.Option("--what", metavar="replay|verify|evaluate", help="The work on each recording.")]
+Maps = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map", metavar="TOPIC=STREAM", help="Of bags: the topic that stands in for a stream. May be repeated."
+    ),
+]
+Folder = Annotated[
+    Path, typer.Option("--out", metavar="FOLDER", help="Where the table, the results and the logs are kept.")
+]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", "-j", metavar="N", help="Recordings at a time. Default: one for each core.")
+]
+Ray = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Work on a Ray cluster: its address, auto for the one that runs here, local for one of --jobs cores.",
+    ),
+]
+Patience = Annotated[
+    float,
+    typer.Option(
+        "--timeout", metavar="SECONDS", parser=number(1, 1e7, "seconds"), help="Give a recording up after so long."
+    ),
+]
+Again = Annotated[bool, typer.Option("--again", metavar=FLAG, help="Also run what has a result already.")]
+
+
+def sweep(
+    graph: Graph = None,
+    recordings: Recordings = None,
+    settings: Values = None,
+    what: Done = "replay",
+    maps: Maps = None,
+    path: ModuleFolders = None,
+    folder: Folder = Path("out/sweep"),
+    jobs: Jobs = None,
+    ray: Ray = None,
+    timeout: Patience = 3600.0,
+    again: Again = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    json: Json = False,
+) -> None:
+    """Run every recording by every choice of settings, and make one table of it.
+
+    Each runs in a process alone, --jobs of them at a time. One that has a result is not run again, as long as the
+    recording, the graph, its files, the operators' code and the packages are the same: a sweep that was interrupted
+    goes on, and a second one is done at once. Those that were killed or took too long are tried again.
+
+    The folder holds `sweep.parquet`, with a row for each recording and operator, `results/`, and of what failed
+    `logs/`. With --what evaluate the table holds the operators that have figures.
+
+    Exit codes:
+
+      0    every recording was replayed to its end, or is identical
+      1    one failed or differs
+      2    could not run: a wrong option, no recordings, a faulty graph
+      130  interrupted with Ctrl-C; what is done is kept
+
+    Examples:
+
+      dataflow sweep graphs/cloud.yaml --recordings recordings --set cloud.stride=4,8
+      dataflow sweep --recordings runs --what verify --jobs 2
+      dataflow sweep perception --recordings runs --what evaluate --out out/scores --json
+      dataflow sweep perception --recordings s3://bucket/runs --ray auto
+    """
+    task = _checked(what, jobs, maps)
+    with friendly_errors():
+        find_modules_in(path)
+        from dataflow.sweep.plan import SweepError, grid
+        from dataflow.sweep.run import Sweep
+
+        try:
+            file = None if graph is None else graph_file(graph)
+            choices, words = grid(settings or ()), passed_on(maps, path)
+            plan = Sweep(recordings or (), task, file, choices, words, folder, jobs or 0, ray, timeout, again)
+            spent = work(plan, quiet=quiet)
+        except SweepError as error:
+            raise fail(str(error)) from None
+    _report(plan, spent, json=json, verbose=verbose)
+
+
+def _checked(what: str, jobs: int | None, maps: Sequence[str] | None) -> What:
+    if what not in ("replay", "verify", "evaluate"):
+        raise fail(f"--what {what!r}: expected replay, verify or evaluate")
+    if jobs is not None and not 1 <= jobs <= MOST_JOBS:
+        raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}")
+    if maps and what == "verify":
+        raise fail("--map is for bags, and these hold no firing records to verify")
+    return cast("What", what)
+
+
+def passed_on(maps: Sequence[str] | None, folders: Sequence[Path] | None) -> list[str]:
+    """Returns the options that the command of each recording gets as well."""
+    words = [word for value in maps or () for word in ("--map", value)]
+    return words + [word for folder in folders or () for word in ("--path", str(folder.resolve()))]
+
+
+def work(plan: Sweep, *, quiet: bool) -> float:
+    """Runs what is left; returns the seconds that it took."""
+    begun = time.monotonic()
+    if not quiet:
+        kept = len(plan.tasks) - len(plan.left)
+        choices = len({task.settings for task in plan.tasks})
+        what = plural(len(plan.tasks) // choices, "recording") + (f" by {choices} choices" if choices > 1 else "")
+        say(f"{what}: {len(plan.left)} to {plan.what}" + (f", {kept} known" if kept else ""))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=quiet or not err.is_terminal) as progress:
+        bar, failed = progress.add_task(plan.what, total=len(plan.left)), 0
+        for task, result in plan.run():
+            if result.outcome != "done":
+                failed += 1
+                if not quiet:
+                    say(Text(f"{task.source.name}: {result.outcome}: {result.error}", style="yellow").markup)
+            progress.update(bar, advance=1, description=f"{plan.what}, {failed} failed" if failed else plan.what)
+    return time.monotonic() - begun
+
+
+def _report(plan: Sweep, spent: float, *, json: bool, verbose: bool) -> None:
+    summary = plan.summary()
+    well = all(not set(s["outcomes"]) - {"done"} and not set(s["verdicts"]) - {"identical"} for s in summary)
+    if json:
+        facts = {"table": str(plan.table), "ran": len(plan.left), "known": len(plan.tasks) - len(plan.left)}
+        print_json({**facts, "wall_s": spent, "settings": summary})
+    else:
+        _print(summary, verbose=verbose)
+        out.print(f"wrote {plan.table} in {seconds(spent)}", soft_wrap=True, markup=False)
+        if any(set(s["outcomes"]) - {"done"} for s in summary):
+            out.print(f"what the failed ones printed: {plan.folder / 'logs'}", soft_wrap=True, markup=False)
+    if not well:
+        raise typer.Exit(DIFFERENT)
+
+
+def _print(summary: Sequence[Mapping[str, Any]], *, verbose: bool) -> None:
+    verified = any(choice["verdicts"] for choice in summary)
+    columns = ("operators", "culprits") if verified else ("dropped", "CPU s")
+    made = table("settings", "recordings", "outcomes", *columns, right=("recordings", *(() if verified else columns)))
+    for choice in summary:
+        done = (count(choice["recordings"]), Text(_counts(choice["outcomes"])))
+        costs = (count(choice["dropped"]), f"{choice['cpu_s']:.1f}")
+        verdicts = (Text(_counts(choice["verdicts"])), Text(_counts(choice["culprits"])))
+        made.add_row(Text(_named(choice) or "as the graph is"), *done, *(verdicts if verified else costs))
+    out.print(made)
+    names = dict.fromkeys(name for choice in summary for name in choice["figures"])
+    shown = [name for name in names if verbose or any(part in name.replace(":", " ").split() for part in SCORES)]
+    if shown:
+        choices = [_named(choice) or "mean" for choice in summary]
+        figures = table("figure", *choices, right=tuple(choices))
+        for name in shown:
+            found = [choice["figures"].get(name) for choice in summary]
+            figures.add_row(Text(name), *("–" if f is None else f"{f['mean']:.4g} ± {f['std']:.2g}" for f in found))
+        out.print(figures)
+
+
+def _named(choice: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value}" for name, value in choice["settings"].items())
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{number:,} {name}" for name, number in counts.items())

@@ -1,0 +1,1 @@
+"""Effects: calls of an operator that cannot repeat, with their recorded answers."""

@@ -1,0 +1,158 @@
+"""The entry of a call in the journal: its key, and its answer or error in a form that a recording holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import xxhash
+
+from dataflow.execution.snapshots import pack_state, unpack_state
+from dataflow.messages.base import Message
+from dataflow.state import StateError, plain
+
+Call = Callable[..., Any]
+
+
+class EffectError(ValueError):
+    """Raised for a call that cannot be journaled; the message has the call and the reason."""
+
+
+class EffectMiss(BaseException):
+    """Raised in a re-execution for a call whose answer is not recorded.
+
+    Not an `Exception`: an operator that goes on without a service must not take a miss for a failure of the service.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """The key of a call: its name, and the digest (16 bytes) of each argument by its position or name."""
+
+    name: str
+    arguments: Mapping[str, bytes]
+
+    @staticmethod
+    def of(call: Call, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Key:
+        """Raises `EffectError` for a call without a name, or an argument that has no digest."""
+        name = getattr(call, "__qualname__", "<lambda>")
+        if name.endswith("<lambda>"):
+            raise EffectError(f"effect({call!r}): a call is known by its name: give it a function or method with `def`")
+        given = {**{str(k): value for k, value in enumerate(args)}, **kwargs}
+        return Key(name, {place: _digest(value, f"{name}({place})") for place, value in given.items()})
+
+    def differing(self, others: Sequence[Key]) -> str:
+        """Returns in words how a call differs from the recorded ones that were not asked for."""
+        alike = [other for other in others if other.name == self.name]
+        if not alike:
+            return f"recorded there: {', '.join(other.name for other in others) or 'no further call'}"
+        mine, its = self.arguments, alike[0].arguments
+        places = [place for place in {**mine, **its} if mine.get(place) != its.get(place)]
+        return f"argument {', '.join(places)} differs from the recorded call"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The outcome of a call, packed: what it returned, or the error that it raised."""
+
+    raised: bool
+    data: bytes
+
+    @staticmethod
+    def of(name: str, call: Call, args: Sequence[Any], kwargs: Mapping[str, Any], most: int) -> Answer:
+        """Makes the call. An answer of another type, or of more than `most` bytes, becomes an `EffectError`."""
+        try:
+            answer = Answer(False, _packed(call(*args, **kwargs), f"answer of {name}"))
+        except Exception as error:
+            answer = Answer(True, _packed_error(error))
+        if len(answer.data) > most:
+            problem = f"answer of {name}: {len(answer.data):,} bytes; a firing records {most:,} more: return less"
+            answer = Answer(True, _packed_error(EffectError(problem)))
+        return answer
+
+    def error(self) -> Exception:
+        """The error, of the recorded class, or of the nearest base of it that can be made again."""
+        return _remade(*unpack_state(self.data)[""])
+
+    def value(self) -> Any:
+        """Returns the answer as a new object. Raises the error that the call raised."""
+        if self.raised:
+            raise self.error()
+        return unpack_state(self.data)[""]
+
+
+def _packed(value: Any, place: str) -> bytes:
+    try:
+        return pack_state({"": value})
+    except StateError as error:
+        raise EffectError(str(error).replace("state.", place, 1)) from None
+    except (ValueError, OverflowError) as error:
+        raise EffectError(f"{place}: {error}") from None
+
+
+def _packed_error(error: Exception) -> bytes:
+    return pack_state({"": _described(error)})
+
+
+def _described(error: Exception) -> list[Any]:
+    """Its class and the bases of that, text, arguments, attributes, and attributes that are errors."""
+    kinds = [[kind.__module__, kind.__qualname__] for kind in type(error).__mro__ if issubclass(kind, Exception)]
+    args = list(error.args) if _is_plain(list(error.args)) else [str(error)]
+    attributes = {name: value for name, value in vars(error).items() if _is_plain(value)}
+    inner = {name: _described(value) for name, value in vars(error).items() if isinstance(value, Exception)}
+    return [kinds, str(error), args, attributes, inner]
+
+
+def _is_plain(value: Any) -> bool:
+    try:
+        pack_state({"": value})
+    except (ValueError, OverflowError):
+        return False
+    return True
+
+
+def _remade(
+    kinds: Sequence[Sequence[str]],
+    text: str,
+    args: Sequence[Any],
+    attributes: Mapping[str, Any],
+    inner: Mapping[str, Sequence[Any]],
+) -> Exception:
+    attributes = {**attributes, **{name: _remade(*described) for name, described in inner.items()}}
+    for module, name in kinds:
+        try:
+            if (error := _of_kind(module, name, args, attributes)) is not None and str(error) == text:
+                return error
+        except Exception:
+            continue
+    return Exception(text)
+
+
+def _of_kind(module: str, name: str, args: Sequence[Any], attributes: Mapping[str, Any]) -> Exception | None:
+    kind: Any = import_module(module)
+    for part in name.split("."):
+        kind = getattr(kind, part)
+    if not (isinstance(kind, type) and issubclass(kind, Exception)):
+        return None
+    error: Exception = kind.__new__(kind, *args)
+    if type(error) is not kind:
+        return None
+    error.args = tuple(args)
+    vars(error).update(attributes)
+    return error
+
+
+def _digest(value: Any, place: str) -> bytes:
+    if isinstance(value, Message):
+        return value.digest()
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        made = xxhash.xxh3_128(f"{value.dtype.str}{value.shape}".encode())
+        made.update(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
+        return made.digest()
+    try:
+        return xxhash.xxh3_128_digest(pack_state({"": plain(value, place)}))
+    except (ValueError, OverflowError) as error:
+        raise EffectError(f"effect: {error}") from None

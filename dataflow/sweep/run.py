@@ -1,0 +1,89 @@
+"""A sweep from its beginning to its table."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dataflow.graph import Graph, load_graph
+from dataflow.sweep.plan import Choice, Digests, SweepError, Task, What, sources_in, tasks_of
+from dataflow.sweep.pools import local, on_ray
+from dataflow.sweep.table import Store, summed_up, write_table
+from dataflow.sweep.work import Result
+
+
+@dataclass(slots=True)
+class Sweep:
+    """Recordings by settings.
+
+    - `recordings`: files, folders, URLs.
+    - `graph`: a graph file; None: of each recording the one that made it.
+    - `choices`: of settings, each as (name, value) pairs; `words`: further words of the command that runs a recording.
+    - `folder`: where results are kept. `again`: also run what has one.
+    - `jobs`: recordings at a time; 0: one for each core. `timeout`: seconds for one.
+    - `ray`: address of a Ray cluster; "local" begins one.
+
+    Raises `SweepError`, `GraphError`, `ReplayError`, `RecordingError`, `OSError` for what cannot be begun.
+    """
+
+    recordings: Sequence[str]
+    what: What = "replay"
+    graph: Path | None = None
+    choices: Sequence[Choice] = ((),)
+    words: Sequence[str] = ()
+    folder: Path = Path("out/sweep")
+    jobs: int = 0
+    ray: str | None = None
+    timeout: float = 3600.0
+    again: bool = False
+    graphs: dict[Choice, Graph | None] = field(init=False)
+    tasks: list[Task] = field(init=False)
+    left: list[Task] = field(init=False)
+    store: Store = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.graph is None and any(self.choices):
+            raise SweepError("--set changes a graph file: name one")
+        if not self.recordings:
+            raise SweepError("no recordings: name files, folders or URLs with --recordings")
+        self.graphs = {
+            choice: None if self.graph is None else load_graph(self.graph, settings=[f"{n}={v}" for n, v in choice])
+            for choice in self.choices
+        }
+        self.store = Store(self.folder)
+        digests = Digests(self.folder / "digests.json")
+        sources = sources_in(self.recordings, digests)
+        named = None if self.graph is None else str(self.graph.resolve())
+        self.tasks = tasks_of(self.what, sources, self.graphs, named, self.words, digests)
+        digests.save()
+        kept = {} if self.again else {task.key: self.store.of(task.key) for task in self.tasks}
+        self.left = [task for task in self.tasks if (result := kept.get(task.key)) is None or not result.final]
+
+    @property
+    def table(self) -> Path:
+        """The Parquet file."""
+        return self.folder / "sweep.parquet"
+
+    def run(self) -> Iterator[tuple[Task, Result]]:
+        """Yields what is left to do, with its result once that is kept. Writes the table however it ends."""
+        cores = self.jobs or len(os.sched_getaffinity(0))
+        where = (
+            local(self.left, cores, self.timeout)
+            if self.ray is None
+            else on_ray(self.left, self.ray, cores, self.timeout)
+        )
+        try:
+            with closing(where) as working:
+                for task, result in working:
+                    self.store.keep(result)
+                    yield task, result
+        finally:
+            write_table(self.table, self.tasks, self.store)
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Returns what came of each choice of settings (`dataflow.sweep.table.summed_up`)."""
+        return summed_up(self.tasks, self.store)

@@ -1,0 +1,187 @@
+"""The work on one task: the command in a separate process, and what is kept of its report."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
+from typing import Any, Literal
+
+import xxhash
+
+from dataflow.graph.search import import_path
+from dataflow.sweep.plan import Task
+
+Outcome = Literal["done", "failed", "killed", "timed out", "not fetched"]
+TRIES = 2
+"""Times that a task is begun whose process was killed from outside."""
+LOG_BYTES = 1 << 16
+"""Bytes kept of the end of a failed task's output."""
+STEP = 0.2
+"""Seconds between two looks at whether to stop."""
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The outcome of a task; `rows` hold one mapping for each operator, or a single one without it.
+
+    `code`: the exit code. `wall`: seconds. `log`: the end of what was printed, "" where all went well.
+    """
+
+    key: str
+    outcome: Outcome
+    code: int
+    error: str
+    rows: tuple[Mapping[str, Any], ...]
+    wall: float
+    log: str = ""
+
+    @property
+    def final(self) -> bool:
+        """Returns whether another try would have the same outcome: nothing from outside ended it."""
+        return self.outcome in ("done", "failed")
+
+
+def perform(task: Task, timeout: float, stop: Event | None = None) -> Result:
+    """Runs a task's command to its end, within `timeout` seconds; a second time where it was killed.
+
+    `stop`: ends it as soon as this is set.
+
+    Raises only what interrupts this process.
+    """
+    for _ in range(TRIES):
+        result = _once(task, timeout, stop)
+        if result.outcome != "killed" or (stop is not None and stop.is_set()):
+            break
+    return result
+
+
+def _once(task: Task, timeout: float, stop: Event | None) -> Result:
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="dataflow_sweep_") as folder:
+        try:
+            recording = _here(task.source.where, Path(folder))
+        except Exception as unread:  # whatever a store raises, the other recordings go on
+            text = f"{task.source.where}: {type(unread).__name__}: {unread}"
+            return Result(task.key, "not fetched", -1, text, ({},), time.monotonic() - began, text)
+        words = [recording if word is None else word for word in task.words]
+        printed, log = Path(folder) / "printed.json", Path(folder) / "log.txt"
+        code = _run([sys.executable, "-m", "dataflow.cli.start", *words], printed, log, timeout, stop)
+        said = log.read_bytes()[-LOG_BYTES:].decode(errors="replace")
+        report = _read(printed)
+    wall = time.monotonic() - began
+    if code is None:
+        error = f"not over within {timeout:g} s"
+        return Result(task.key, "timed out", -1, error, ({},), wall, f"{said}\n{error}".strip())
+    if code < 0:
+        error = f"killed by {signal.Signals(-code).name}"
+        return Result(task.key, "killed", code, error, ({},), wall, f"{said}\n{error}".strip())
+    done = report is not None and (code == 0 or (task.what == "verify" and code == 1))
+    rows = () if report is None else verified(report) if task.what == "verify" else replayed(report)
+    if task.what == "evaluate":
+        rows = tuple(row for row in rows if row["figures"])
+    error = "" if done else next((line for line in reversed(said.splitlines()) if line.strip()), f"exit code {code}")
+    return Result(task.key, "done" if done else "failed", code, error, rows or ({},), wall, "" if done else said)
+
+
+def _here(where: str, folder: Path) -> str:
+    """Returns the path of a recording, fetched into `folder` if it is elsewhere."""
+    if "://" not in where:
+        return where
+    import fsspec  # of the extra `sweep`
+
+    store, path = fsspec.core.url_to_fs(where)
+    file = folder / Path(path).name
+    store.get_file(path, str(file))
+    return str(file)
+
+
+def _run(command: list[str], printed: Path, log: Path, timeout: float, stop: Event | None) -> int | None:
+    """Returns the exit code, negative for a signal; None after `timeout`, or where it was stopped.
+
+    Nothing that it started outlives this call.
+    """
+    environment = {**os.environ, "PYTHONPATH": import_path(), "PYTHONUNBUFFERED": "1"}
+    with printed.open("wb") as out, log.open("wb") as err:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=err,
+            env=environment,
+            start_new_session=True,
+            preexec_fn=_end_with_parent,
+        )
+        deadline = time.monotonic() + timeout
+        try:
+            while (left := deadline - time.monotonic()) > 0 and not (stop is not None and stop.is_set()):
+                with suppress(subprocess.TimeoutExpired):
+                    return process.wait(min(left, STEP))
+            return None
+        finally:
+            with suppress(ProcessLookupError):  # all of them have ended
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def _end_with_parent() -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _read(printed: Path) -> dict[str, Any] | None:
+    try:
+        value = json.loads(printed.read_bytes())
+    except ValueError:  # the command failed before it had a report
+        return None
+    return value if isinstance(value, dict) and "operators" in value else None
+
+
+def replayed(report: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    """Returns a row for each operator of a run's report, as `dataflow replay --json` prints it."""
+    digests: dict[str, list[str]] = {}
+    for stream, facts in sorted(report["streams"].items()):
+        digests.setdefault(stream.rpartition("/")[0], []).append(f"{stream}={facts['digest']}")
+    rows = []
+    for name, counts in report["operators"].items():
+        own = [
+            digest for node, found in digests.items() if node.endswith(f"/{name}") or node == name for digest in found
+        ]
+        rows.append(
+            {
+                "operator": name,
+                **{key: counts[key] for key in ("firings", "emitted", "dropped", "cpu_ms", "wall_ms")},
+                "restarts": report["restarts"].get(name, 0),
+                "digest": xxhash.xxh3_128_hexdigest("\n".join(own).encode()) if own else None,
+                "figures": _numbers(report["summaries"].get(name, {})),
+            }
+        )
+    more = {name for name in report["summaries"] if name not in report["operators"]}
+    rows += [{"operator": name, "figures": _numbers(report["summaries"][name])} for name in sorted(more)]
+    return tuple(rows)
+
+
+def _numbers(summary: Mapping[str, Any]) -> dict[str, float]:
+    return {name: float(v) for name, v in summary.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+
+
+def verified(report: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    """Returns a row for each operator of a verification, as `dataflow verify --json` prints it."""
+    return tuple(
+        {
+            "operator": row["operator"],
+            "verdict": row["verdict"],
+            **{key: row[key] for key in ("firings", "differing") if key in row},
+        }
+        for row in [*report["operators"], *report["sources"]]
+    )

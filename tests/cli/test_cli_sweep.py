@@ -1,0 +1,235 @@
+"""`dataflow sweep`: recordings by settings, each run once, kept, and found again in one table."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as parquet
+import pytest
+
+from dataflow.sweep.table import TIMES
+
+MODULE = """
+import os
+import signal
+import time
+from pathlib import Path
+
+from dataflow.messages import FeatureVector
+from dataflow.operator import In, Operator, Out, Param, Source
+import numpy as np
+
+
+class Numbers(Source):
+    out: Out[FeatureVector]
+
+    def stream(self):
+        for step in range(12):
+            vectors = np.full((1, 1), step, np.float32)
+            yield {"out": FeatureVector(stamp=step * 10_000_000, vectors=vectors, model="m")}
+
+
+class Scaled(Operator):
+    x: In[FeatureVector]
+    out: Out[FeatureVector]
+    by: float = Param(2.0, doc="factor")
+    kill: str = Param("", doc="a file: it is deleted and the process killed")
+    wait: str = Param("", doc="a folder: it waits while a file named wait is there")
+    fail_at: float = Param(1e9, doc="the scaled value at which it fails")
+
+    def setup(self):
+        self.sum = 0.0
+
+    def process(self, x):
+        if self.kill and Path(self.kill).exists():
+            Path(self.kill).unlink()
+            os.kill(os.getpid(), signal.SIGKILL)
+        while self.wait and Path(self.wait, "wait").exists():
+            time.sleep(0.05)
+        value = float(x.vectors[0, 0]) * self.by
+        if value > self.fail_at:
+            raise ValueError(f"{value} is too much")
+        self.sum += value
+        return FeatureVector(stamp=x.stamp, vectors=x.vectors * np.float32(self.by), model="m")
+
+    def summary(self):
+        return {"total error": self.sum, "words": "none"}
+"""
+GRAPH = """
+graph: swept
+namespace: test
+operators:
+  numbers: {use: "swept_operators:Numbers"}
+  scaled: {use: "swept_operators:Scaled", inputs: {x: numbers/out}}
+"""
+Sweep = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def folder(dataflow, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A graph with its operators, and two recordings of it, one deeper down."""
+    path = tmp_path_factory.mktemp("sweep")
+    (path / "swept_operators.py").write_text(MODULE)
+    (path / "graph.yaml").write_text(GRAPH)
+    (path / "runs" / "deep").mkdir(parents=True)
+    dataflow("run", path / "graph.yaml", "--record", path / "runs" / "first.mcap", "--one-process", "-q")
+    shutil.copy(path / "runs" / "first.mcap", path / "runs" / "deep" / "second.mcap")
+    return path
+
+
+@pytest.fixture
+def sweep(dataflow, folder: Path, tmp_path: Path) -> Sweep:
+    def run(*words: object, code: int = 0, graph: bool = True) -> dict[str, Any]:
+        first = (folder / "graph.yaml",) if graph else ()
+        given = ("--recordings", folder / "runs", "--path", folder, "--out", tmp_path, "-q", "--json")
+        return json.loads(dataflow("sweep", *first, *given, *words, code=code).stdout)
+
+    return run
+
+
+def rows(tmp_path: Path) -> list[dict[str, Any]]:
+    return parquet.read_table(tmp_path / "sweep.parquet").to_pylist()
+
+
+def without_times(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{name: value for name, value in row.items() if name not in TIMES} for row in found]
+
+
+def test_every_recording_by_every_value_has_a_row_for_each_operator(sweep: Sweep, tmp_path: Path) -> None:
+    told = sweep("--set", "scaled.by=1,3", "--jobs", "2")
+    found = rows(tmp_path)
+
+    assert told["ran"] == 4
+    assert told["known"] == 0
+    scaled = [row for row in found if row["operator"] == "scaled"]
+    assert [(row["set scaled.by"], row["recording"]) for row in scaled] == [
+        ("1", "deep/second.mcap"),
+        ("1", "first.mcap"),
+        ("3", "deep/second.mcap"),
+        ("3", "first.mcap"),
+    ]
+    assert [dict(row["figures"]) for row in scaled] == [{"total error": 66.0 * by} for by in (1, 1, 3, 3)]
+    assert all(row["firings"] == row["emitted"] == 12 and row["outcome"] == "done" for row in scaled)
+    assert len({row["digest"] for row in scaled}) == 2
+    means = [choice["figures"]["scaled: total error"] for choice in told["settings"]]
+    assert means == [{"mean": 66.0 * by, "std": 0.0, "recordings": 2} for by in (1, 3)]
+
+
+def test_a_second_sweep_runs_nothing_until_something_is_changed(sweep: Sweep, folder: Path, tmp_path: Path) -> None:
+    assert sweep()["ran"] == 2
+    first = rows(tmp_path)
+
+    again = sweep()
+    assert (again["ran"], again["known"]) == (0, 2)
+    assert rows(tmp_path) == first
+
+    module = folder / "swept_operators.py"
+    module.write_text(MODULE + "\n# another version\n")
+    assert sweep()["ran"] == 2
+    module.write_text(MODULE)
+    assert sweep("--again")["ran"] == 2
+    assert without_times(rows(tmp_path)) == without_times(first)
+
+
+def test_a_failure_is_kept_with_what_it_printed_and_the_others_go_on(sweep: Sweep, tmp_path: Path) -> None:
+    told = sweep("--set", "scaled.fail_at=5,1e9", code=1)
+
+    assert [choice["outcomes"] for choice in told["settings"]] == [{"failed": 2}, {"done": 2}]
+    failed = [row for row in rows(tmp_path) if row["outcome"] == "failed"]
+    assert len(failed) == 2
+    assert all("6.0 is too much" in row["error"] for row in failed)
+    assert all("ValueError: 6.0 is too much" in Path(row["log"]).read_text() for row in failed)
+    assert sweep("--set", "scaled.fail_at=5,1e9", code=1)["ran"] == 0
+
+
+@pytest.mark.long
+def test_a_killed_process_loses_and_doubles_nothing(sweep: Sweep, tmp_path: Path) -> None:
+    marker = tmp_path / "kill"
+    marker.write_text("")
+    told = sweep("--set", f"scaled.kill={marker}", "--jobs", "1")
+
+    assert not marker.exists()
+    assert told["settings"][0]["outcomes"] == {"done": 2}
+    assert [row["firings"] for row in rows(tmp_path) if row["operator"] == "scaled"] == [12, 12]
+
+
+@pytest.mark.long
+def test_what_takes_too_long_is_ended_and_tried_again_by_the_next_sweep(sweep: Sweep, tmp_path: Path) -> None:
+    marker = tmp_path / "wait"
+    marker.write_text("")
+    words = ("--set", f"scaled.wait={tmp_path}", "--jobs", "2")
+    assert sweep(*words, "--timeout", "1", code=1)["settings"][0]["outcomes"] == {"timed out": 2}
+    assert all(row["error"] == "not over within 1 s" for row in rows(tmp_path))
+
+    marker.unlink()
+    assert sweep(*words)["settings"][0]["outcomes"] == {"done": 2}
+
+
+@pytest.mark.long
+def test_verification_names_the_culprits(sweep: Sweep, folder: Path, tmp_path: Path) -> None:
+    assert sweep("--what", "verify", graph=False)["settings"][0]["verdicts"] == {"identical": 4}
+    told = sweep("--what", "verify", "--set", "scaled.by=2,3", code=1)
+
+    assert [choice["verdicts"].get("culprit", 0) for choice in told["settings"]] == [0, 2]
+    assert told["settings"][1]["culprits"] == {"scaled": 2}
+
+
+@pytest.mark.long
+def test_an_evaluation_has_the_operators_with_figures(sweep: Sweep, tmp_path: Path) -> None:
+    sweep("--what", "evaluate")
+    assert {row["operator"] for row in rows(tmp_path)} == {"scaled"}
+
+
+@pytest.mark.long
+def test_recordings_of_a_store_are_fetched(dataflow, folder: Path, tmp_path: Path) -> None:
+    given = ("--recordings", f"file://{folder / 'runs'}", "--path", folder, "--out", tmp_path, "-q", "--json")
+    assert json.loads(dataflow("sweep", folder / "graph.yaml", *given).stdout)["settings"][0]["outcomes"] == {"done": 2}
+    assert {row["recording"] for row in rows(tmp_path)} == {"first.mcap", "deep/second.mcap"}
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (("--what", "guess"), "expected replay, verify or evaluate"),
+        (("--jobs", "0"), "expected 1 to"),
+        (("--set", "scaled.by"), "expected NAME=VALUE"),
+        (("--set", "scaled.bye=1"), "bye"),
+        (("--recordings", "nowhere"), "no file or folder nowhere"),
+        (("--recordings", "file:///nowhere/at/all"), "no file or folder file:///nowhere/at/all"),
+    ],
+)
+def test_what_cannot_be_swept_is_refused_before_anything_runs(
+    dataflow, folder: Path, tmp_path: Path, words: tuple[str, ...], what: str
+) -> None:
+    given = ("--recordings", folder / "runs", "--path", folder, "--out", tmp_path)
+    assert what in dataflow("sweep", folder / "graph.yaml", *given, *words, code=2).stderr
+    assert not (tmp_path / "sweep.parquet").exists()
+
+
+def test_two_settings_are_compared_pair_by_pair(dataflow, folder: Path, tmp_path: Path) -> None:
+    given = ("--recordings", folder / "runs", "--path", folder, "--out", tmp_path, "-q", "--json")
+    told = json.loads(dataflow("compare", folder / "graph.yaml", *given, "--set", "b:scaled.by=3").stdout)
+
+    (figure,) = told["figures"]
+    assert (figure["figure"], figure["a"], figure["b"]) == ("scaled: total error", 132.0, 198.0)
+    assert dict(figure["recordings"]) == {"first.mcap": 66.0, "deep/second.mcap": 66.0}
+    assert told["operators"] == [{"operator": "scaled", "recordings": 2, "first": 2}]
+
+    words = ("--set", "b:scaled.by=3", "--set", "a:scaled.fail_at=5")
+    failed = json.loads(dataflow("compare", folder / "graph.yaml", *given, *words, code=1).stdout)
+    assert failed["failed"] == [{"settings": {"scaled.fail_at": "5"}, "outcomes": {"failed": 2}}]
+    for word, what in (("scaled.by", "expected NAME=VALUE"), ("scaled.by=3", "A and B are the same")):
+        assert what in dataflow("compare", folder / "graph.yaml", *given, "--set", word, code=2).stderr
+
+
+@pytest.mark.long
+def test_a_cluster_makes_the_same_table(sweep: Sweep, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'robot-dataflow[ray]'")
+    sweep("--set", "scaled.by=1,3")
+    here = rows(tmp_path)
+    assert sweep("--set", "scaled.by=1,3", "--again", "--ray", "local", "--jobs", "2")["ran"] == 4
+    assert without_times(rows(tmp_path)) == without_times(here)

@@ -1,0 +1,345 @@
+"""What cannot repeat is recorded at the call: re-execution gives the recorded answers, and nothing else."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import urllib.error
+from collections.abc import Callable, Iterator
+from email.message import Message as Headers
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from firing_operators import Collector, entry, node, run_all, value
+
+from dataflow.execution.effects.answers import EffectError, EffectMiss, Key
+from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.recorded import RecordedRunner
+from dataflow.execution.runner import OperatorRunner
+from dataflow.messages import FeatureVector
+from dataflow.operator import In, Operator, Out
+from dataflow.recording.limits import MAX_EFFECT_BYTES
+from dataflow.records.firing import decode_batch, encode_batch
+from dataflow.records.repetition import Repetition, look_at
+
+STREAM = "t/s/x"
+MESSAGES = [entry(STREAM, 100, 0), entry(STREAM, 200, 1), entry(STREAM, 300, 2)]
+WORLD = itertools.count(1)
+"""Never answers twice alike."""
+
+
+def ask(*question: Any, answer: Any = None) -> Any:
+    random.random()
+    return next(WORLD) if answer is None else answer
+
+
+def refuse(error: Exception) -> None:
+    random.random()
+    raise error
+
+
+class Asking(Operator):
+    """Emits what `body`, set by a test, makes of an input."""
+
+    x: In[FeatureVector]
+    out: Out[FeatureVector]
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        return value(x.stamp, BODY[0](self, x))
+
+    def setup(self) -> None:
+        SETUP[0](self)
+
+
+Body = Callable[[Asking, FeatureVector], float]
+BODY: list[Body] = []
+SETUP: list[Callable[[Asking], Any]] = [lambda operator: None]
+
+
+@pytest.fixture(autouse=True)
+def _bodies(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr("firing_operators.Asking", Asking, raising=False)
+    yield
+    BODY.clear()
+    SETUP[:] = [lambda operator: None]
+
+
+def recorded(body: Body) -> Collector:
+    BODY[:] = [body]
+    collector = Collector()
+    runner = OperatorRunner(node(Asking, {"x": [STREAM]}), collector, static=frozenset())
+    runner.setup()
+    for message in MESSAGES:
+        runner.push(STREAM, message)
+    runner.end(STREAM, None, "")
+    run_all(runner)
+    [*collector.records] = decode_batch(encode_batch(collector.records)).records
+    return collector
+
+
+def again(ran: Collector, body: Body | None = None, **options: Any) -> RecordedRunner:
+    """Re-executes, without that anything is answered unless `options` ask for it."""
+    BODY[:] = [body or BODY[0]]
+    inputs = {STREAM: {(m.incarnation, m.seq): m.digest for m in MESSAGES}}
+    asking = node(Asking, {"x": [STREAM]})
+    repetition = Repetition(lambda: ran.records, stateless=asking.operator.stateless)
+    look_at([repetition])
+    runner = RecordedRunner(
+        asking,
+        Collector(),
+        static=frozenset(),
+        repetition=repetition,
+        inputs=inputs,
+        **options,
+    )
+    runner.setup()
+    for message in MESSAGES:
+        runner.push(STREAM, message)
+    runner.end(STREAM, None, "")
+    run_all(runner)
+    return runner
+
+
+def line_of(text: str) -> int:
+    lines = Path(__file__).read_text().splitlines()
+    return next(n for n, line in enumerate(lines, 1) if text in line and "line_of" not in line)
+
+
+def test_recorded_answers_are_given_again_without_a_call() -> None:
+    ran = recorded(lambda operator, x: operator.effect(ask, "how far?", x) + operator.effect(ask, "how far?", x))
+    before = next(WORLD)
+
+    result = again(ran).result
+
+    assert result.verdict == "identical"
+    assert result.verified == 4
+    assert result.effects == {"ask": {"given": 6, "missed": 0, "again": 0, "same": 0}}
+    assert next(WORLD) == before + 1
+
+
+def test_numbers_drawn_behind_a_call_do_not_depend_on_what_it_drew() -> None:
+    ran = recorded(lambda operator, x: operator.effect(ask) + random.random() + operator.rng.random())
+
+    assert again(ran).result.verdict == "identical"
+
+
+def test_a_changed_argument_is_a_miss_with_call_and_line_never_the_next_answer() -> None:
+    ran = recorded(lambda operator, x: operator.effect(ask, "A", x.stamp) + operator.effect(ask, "B", x.stamp))
+
+    def changed(operator: Asking, x: FeatureVector) -> float:
+        first = operator.effect(ask, "A", x.stamp)
+        question = "B" if x.stamp == 100 else "C"
+        return first + operator.effect(ask, question, x.stamp)  # the changed question
+
+    result = again(ran, changed).result
+
+    assert result.verdict == "culprit"
+    assert result.first is not None
+    assert result.first.stamp == 200
+    assert result.first.got == (
+        f"error: EffectMiss: miss at call 3 (test_effects.py:{line_of('# the changed question')}), ask: "
+        "argument 0 differs from the recorded call"
+    )
+    assert result.effects["ask"] == {"given": 4, "missed": 2, "again": 0, "same": 0}
+
+
+@pytest.mark.parametrize("caught", [Exception, BaseException])
+def test_a_miss_is_no_failure_of_the_service_and_cannot_be_passed_over(caught: type[BaseException]) -> None:
+    ran = recorded(lambda operator, x: operator.effect(ask, "A"))
+
+    def careless(operator: Asking, x: FeatureVector) -> float:
+        try:
+            return float(operator.effect(ask, "B"))
+        except caught:
+            return 1.0
+
+    result = again(ran, careless).result
+
+    assert result.verdict == "culprit"
+    assert result.first is not None
+    assert "EffectMiss: miss at call 0" in result.first.got
+
+
+GRID = np.arange(6, dtype=np.float32).reshape(2, 3)
+
+
+@pytest.mark.parametrize(
+    "other", [GRID.reshape(3, 2), GRID.astype(np.float64), GRID.T.copy(), GRID + 1, GRID.tolist(), GRID[:0]]
+)
+def test_arrays_are_told_apart_by_type_shape_and_values(other: Any) -> None:
+    def key(value: Any) -> Key:
+        return Key.of(ask, (value,), {})
+
+    assert key(np.asfortranarray(GRID)) == key(GRID)
+    assert key(other) != key(GRID)
+
+
+def test_calls_may_be_left_out_or_made_in_another_order() -> None:
+    ran = recorded(lambda operator, x: 0 * operator.effect(ask, "A") + operator.effect(ask, "B"))
+
+    assert again(ran, lambda operator, x: operator.effect(ask, "B")).result.verdict == "identical"
+    swapped = again(ran, lambda operator, x: operator.effect(ask, "B") + 0 * operator.effect(ask, "A"))
+    assert swapped.result.verdict == "identical"
+
+
+def test_answers_are_in_the_run_what_they_are_in_a_re_execution() -> None:
+    seen: list[Any] = []
+    given = {"list": (1, [2.5, None]), "array": np.arange(6, dtype=np.int16).reshape(2, 3), "bytes": b"\x00"}
+
+    def look(operator: Asking, x: FeatureVector) -> float:
+        seen.append(operator.effect(ask, answer=given))
+        seen[-1]["array"][0, 0] = x.stamp  # an own copy, which may be written to
+        return float(seen[-1]["array"].sum())
+
+    ran = recorded(look)
+
+    assert again(ran).result.verdict == "identical"
+    assert [repr(one) for one in seen[:3]] == [repr(one) for one in seen[3:]]
+    assert seen[0]["list"] == [1, [2.5, None]]
+
+
+class Declined(ConnectionError):
+    """An error with attributes, and another constructor than its base."""
+
+    def __init__(self, code: int, reply: object) -> None:
+        super().__init__(f"code {code}")
+        self.code, self.reply = code, reply
+
+
+def _local() -> Exception:
+    class Local(LookupError):
+        pass
+
+    return Local("not importable")
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "text"),
+    [
+        (TimeoutError("timed out"), TimeoutError, "timed out"),
+        (OSError(110, "Connection timed out"), TimeoutError, "[Errno 110] Connection timed out"),
+        (KeyError("absent"), KeyError, "'absent'"),
+        (Declined(7, object()), Declined, "code 7"),
+        (urllib.error.URLError(TimeoutError("t")), urllib.error.URLError, "<urlopen error t>"),
+        (urllib.error.HTTPError("u", 503, "busy", Headers(), None), urllib.error.HTTPError, "HTTP Error 503: busy"),
+        (_local(), LookupError, "not importable"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
+)  # fmt: skip
+def test_errors_are_raised_again_alike(error: Exception, kind: type[Exception], text: str) -> None:
+    seen: list[Exception] = []
+
+    ran = recorded(lambda operator, x: _tried(operator, error, seen))
+
+    assert again(ran).result.verdict == "identical"
+    assert len(seen) == 6
+    for met in seen:
+        assert type(met) is kind
+        assert str(met) == text
+    assert getattr(seen[3], "code", None) == getattr(seen[0], "code", None)
+
+
+def _tried(operator: Asking, error: Exception, seen: list[Exception]) -> float:
+    def raising() -> None:
+        refuse(error)
+
+    try:
+        operator.effect(raising)
+    except Exception as met:
+        seen.append(met)
+    return random.random()
+
+
+def test_an_error_that_ends_the_firing_is_re_executed() -> None:
+    BODY[:] = [lambda operator, x: _refused(operator)]
+    with pytest.raises(OperatorFailure, match="TimeoutError: gone") as raised:
+        recorded(BODY[0])
+
+    assert raised.value.where.startswith("test_effects.py:")
+
+
+def _refused(operator: Asking) -> float:
+    def gone() -> None:
+        raise TimeoutError("gone")
+
+    operator.effect(gone)
+    return 0.0
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (object(), "answer of ask is a object; recorded are numbers, strings"),
+        ([1, {"a": {2: 3}}], r"answer of ask\[1\].a: key 2 is no string"),
+        (2**70, "answer of ask: "),
+        (bytes(MAX_EFFECT_BYTES), "answer of ask: 16,777,.* bytes; a firing records 16,777,216 more"),
+    ],
+)
+def test_an_answer_that_cannot_be_recorded_is_an_error_which_is_recorded(answer: Any, told: str) -> None:
+    def answering() -> Any:
+        return answer
+
+    def tries(operator: Asking, x: FeatureVector) -> float:
+        with pytest.raises(EffectError, match=told.replace("ask", ".*answering")):
+            operator.effect(answering)
+        return random.random()
+
+    ran = recorded(tries)
+
+    assert again(ran).result.verdict == "identical"
+
+
+def test_the_answers_of_one_firing_are_bounded_together() -> None:
+    def tries(operator: Asking, x: FeatureVector) -> float:
+        operator.effect(ask, answer=bytes(MAX_EFFECT_BYTES - 100))
+        with pytest.raises(EffectError, match="a firing records"):
+            operator.effect(ask, answer=bytes(100))
+        return 0.0
+
+    assert again(recorded(tries)).result.verdict == "identical"
+
+
+def test_what_has_no_key_or_no_firing_is_refused() -> None:
+    def tries(operator: Asking, x: FeatureVector) -> float:
+        with pytest.raises(EffectError, match="a call is known by its name"):
+            operator.effect(lambda: 1)
+        with pytest.raises(EffectError, match=r"effect: ask\(0\) is a object"):
+            operator.effect(ask, object())
+        return 0.0
+
+    SETUP[:] = [lambda operator: operator.effect(ask)]
+    with pytest.raises(OperatorFailure, match="EffectError: n: effect\\(\\) is for process\\(\\) and finish\\(\\)"):
+        recorded(tries)
+    SETUP[:] = [lambda operator: None]
+    assert again(recorded(tries)).result.verdict == "identical"
+
+
+def test_without_a_run_the_call_is_made() -> None:
+    assert Asking().effect(ask, answer=3) == 3
+
+
+def test_live_calls_are_compared_and_misses_get_new_answers() -> None:
+    ran = recorded(lambda operator, x: operator.effect(ask, "A") + operator.effect(ask, "B", answer=1))
+
+    alike = again(ran, live_effects=True)
+    assert alike.result.verdict == "identical"
+    assert alike.result.effects == {"ask": {"given": 6, "missed": 0, "again": 6, "same": 3}}
+
+    changed = again(ran, lambda operator, x: operator.effect(ask, "C"), live_effects=True)
+    assert changed.result.verdict == "culprit"
+    assert changed.result.first is not None
+    assert changed.result.first.port == "out"
+    assert changed.result.effects["ask"]["missed"] == 3
+
+
+def test_a_firing_without_effects_leaves_its_record_as_it_is() -> None:
+    ran = recorded(lambda operator, x: 1.0)
+
+    assert all(not record.detail for record in ran.records if record.kind == "fire")
+    assert "EffectMiss" in again(ran, lambda operator, x: operator.effect(ask)).result.first.got  # type: ignore[union-attr]
+
+
+def test_a_miss_is_no_exception_that_operators_expect() -> None:
+    assert not issubclass(EffectMiss, Exception)

@@ -1,0 +1,64 @@
+"""Paired comparison: small differences between hard and easy recordings are found, and none where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom, mannwhitneyu, wilcoxon
+
+from dataflow.sweep.paired import compared
+
+
+def worlds(rng: np.random.Generator, gain: float, count: int = 40) -> dict[str, tuple[float, float]]:
+    """Scores of two versions: worlds differ by 10 points, one world's two runs by half a point."""
+    hard = rng.normal(60, 10, count)
+    noise = rng.normal(0, 0.5, (2, count))
+    return {f"w{k}": (hard[k] + noise[0, k], hard[k] + gain + noise[1, k]) for k in range(count)}
+
+
+def test_half_a_point_is_found_in_pairs_and_not_between_means() -> None:
+    rng = np.random.default_rng(1)
+    found = unpaired = 0
+    for _ in range(40):
+        pairs = worlds(rng, 0.5)
+        (one,) = compared({"detector: precision": pairs})
+        found += one.differs
+        unpaired += mannwhitneyu(*np.array(list(pairs.values())).T).pvalue < 0.05
+    assert found >= 38
+    assert unpaired <= 4
+
+
+def test_equal_versions_differ_no_more_often_than_the_level_allows() -> None:
+    rng = np.random.default_rng(2)
+    alarms = sum(compared({"detector: precision": worlds(rng, 0.0)})[0].differs for _ in range(200))
+    assert alarms <= binom.ppf(0.99, 200, 0.05)
+
+
+def test_p_is_that_of_scipy_and_the_interval_holds_the_difference() -> None:
+    pairs = worlds(np.random.default_rng(3), 0.3)
+    (one,) = compared({"x: recall": pairs})
+    differences = np.diff(np.array(list(pairs.values()))).ravel()
+    assert one.p == one.adjusted == pytest.approx(wilcoxon(differences).pvalue)
+    assert one.difference == pytest.approx(differences.mean())
+    assert one.low < one.difference < one.high
+
+
+def test_many_figures_are_judged_together() -> None:
+    rng = np.random.default_rng(4)
+    figures = {f"x: figure {k}": worlds(rng, 0.0) for k in range(100)} | {"x: recall": worlds(rng, 1.0)}
+    assert [one.figure for one in compared(figures) if one.differs] == ["x: recall"]
+
+
+def test_the_worst_recordings_for_b_come_first() -> None:
+    pairs = {"one": (1.0, 2.0), "two": (1.0, 0.5), "three": (1.0, 1.0)}
+    names = {name: [n for n, _ in compared({name: pairs})[0].recordings] for name in ("o: rmse", "o: recall", "o: n")}
+    assert names == {
+        "o: rmse": ["one", "three", "two"],
+        "o: recall": ["two", "three", "one"],
+        "o: n": ["one", "two", "three"],
+    }
+
+
+def test_figures_that_are_equal_do_not_differ() -> None:
+    (one,) = compared({"x: n": {"a": (1.0, 1.0), "b": (2.0, 2.0)}})
+    assert (one.p, one.difference, one.low, one.high, one.differs) == (1.0, 0.0, 0.0, 0.0, False)
