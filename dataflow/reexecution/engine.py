@@ -16,7 +16,7 @@ from dataflow.execution.feeds.log import LogFeed
 from dataflow.execution.memory import MemoryGuard
 from dataflow.execution.recorded import RecordedRunner, Watcher
 from dataflow.execution.threads import limit_threads
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
@@ -116,10 +116,7 @@ class Recomputation:
         begins = {} if begin is None else _begins(graph, records, frozenset(feeding.streams), begin)
         begins |= {name: first for name, (first, _) in slices.items() if first is not None}
         nodes = [graph.nodes[name] for name in feeding.operators]
-        repetitions = {
-            n.name: Repetition(records[n.name], begin=begins.get(n.name), stateless=n.operator.stateless) for n in nodes
-        }
-        look_at(repetitions.values())
+        repetitions = _repetitions(nodes, records, begins)
         taken = {stream for node in nodes for stream in node.taken}
         inputs = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in taken}], taken)
         self.runners = {
@@ -198,6 +195,17 @@ class Recomputation:
     def results(self) -> Mapping[str, Verification]:
         """The outcome for each operator so far."""
         return {name: runner.result for name, runner in self.runners.items()}
+
+
+def _repetitions(
+    nodes: Iterable[Node], records: Mapping[str, Callable[[], Iterable[FiringRecord]]], begins: Mapping[str, int]
+) -> Mapping[str, Repetition]:
+    """What of each operator's records is repeated, read side by side."""
+    found = {
+        n.name: Repetition(records[n.name], begin=begins.get(n.name), stateless=n.operator.stateless) for n in nodes
+    }
+    look_at(found.values())
+    return found
 
 
 def _begins(
