@@ -9,6 +9,7 @@ import bisect
 import pdb
 from bdb import BdbQuit
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import accumulate
 from types import CodeType
 
 from dataflow.debugging.fired import Call, Fired, Made, Probe, Process, Through, call_of
@@ -20,11 +21,16 @@ from dataflow.recording import Recording
 from dataflow.recording.streams.diff import differences
 from dataflow.records.cuts import Taken, cut_record
 from dataflow.records.firing import CALLS, FiringRecord
-from dataflow.records.reading import FiringLog, Maker
+from dataflow.records.reading import FiringLog
+from dataflow.records.window import records_from
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, recorded_message
 from dataflow.sync import Firing
 
+AHEAD = 60 * 10**9
+"""Span (ns) behind a call that is gone to in which records are read: those that follow are gone to as well."""
+NEAR = 16
+"""Calls to a state further on, beyond which an operator is set up anew and begins there."""
 MOST_BYTES = 2**28
 """Of the states that are kept; beyond it every other one is let go."""
 
@@ -47,15 +53,20 @@ class Debugger:
     ) -> None:
         self._recording, self._live_effects = recording, live_effects
         self.graph = graph_that_is_here(recording)[0] if graph is None else graph
-        log = _ResumedLog(recording)
+        log = FiringLog.read(recording)
         self.node = node = self.graph.nodes[_named(operator, self.graph, log)]
-        self._log = log
-        self.calls: Sequence[Call] = [call_of(record) for record in log.ordered(node) if record.kind in CALLS]
+        headings = log.headings(node)
+        self.calls: Sequence[Call] = [Call(*heading) for heading in headings if heading.kind in CALLS]
+        made = accumulate(heading.kind in CALLS for heading in headings)
+        self._recorded = [n for n, heading in zip(made, headings, strict=True) if heading.kind == "snapshot"]
+        """The numbers of the calls in front of which a state is recorded, in order."""
         self._feeding = plan_feeding(recording, self.graph, [node.name])
         self._kept: dict[int, FiringRecord] = {}
         """States before calls, by the call's number, as `cut` records."""
         self._sources = Sources(node.operator)
         self._work: Recomputation | None = None
+        self._bounded = False
+        """True while only the records up to some time behind a call are read."""
         self._probe: Probe | None = None
         self._reached = -1
         self._same = True
@@ -72,17 +83,34 @@ class Debugger:
         number = range(len(self.calls))[number] if -len(self.calls) <= number < len(self.calls) else number
         if not 0 <= number < len(self.calls):
             raise DebugError(f"{self.node.name} has calls 0 to {len(self.calls) - 1}, there is no {number}")
-        if self._work is None or number <= self._reached:
+        state = number if self.node.operator.stateless else max(self._nearest_kept(number), self._nearest(number))
+        if self._work is None or number <= self._reached or state > self._reached + NEAR:
+            self._begin(number, self.calls[number].stamp + AHEAD)
+        if self._reach(number) != number and self._bounded:
             self._begin(number)
+            self._reach(number)
+        if self._reached != number:
+            raise DebugError(self._unreached(number))
+        self.at = self._fired()
+        return self.at
+
+    def _reach(self, number: int) -> int:
+        """Goes on to a call; returns the number of the one that was made last."""
         assert self._probe is not None
         self._probe.target = self.calls[number]
         for reached in self._onwards():
             if reached >= number:
                 break
-        if self._reached != number:
-            raise DebugError(self._unreached(number))
-        self.at = self._fired()
-        return self.at
+        return self._reached
+
+    def _nearest_kept(self, number: int) -> int:
+        """The number of the call at or before `number` in front of which a state is kept; -1 where none is."""
+        return max((n for n in self._kept if n <= number), default=-1)
+
+    def _nearest(self, number: int) -> int:
+        """The same, in front of which a state is recorded."""
+        place = bisect.bisect_right(self._recorded, number)
+        return self._recorded[place - 1] if place else -1
 
     def number_at(self, stamp: int) -> int:
         """The number of the last call at or before a stamp (ns), of the first one where there is none.
@@ -99,7 +127,7 @@ class Debugger:
         after = -1 if self.at is None else self.at.number
         if after + 1 == len(self.calls):
             return None
-        if self._work is None:
+        if self._work is None or self._bounded:
             self._begin(after + 1)
         for reached in self._onwards():
             if reached > after and condition(self._fired()):
@@ -122,7 +150,7 @@ class Debugger:
         """
         if self.at is None:
             raise DebugError("no call was made yet: goto one")
-        self._begin(self.at.number)
+        self._begin(self.at.number, self.at.call.stamp + AHEAD)
         assert self._probe is not None
         self._probe.through = through
         try:
@@ -167,27 +195,30 @@ class Debugger:
 
     # ------------------------------------------------------------------------------------------------- inside
 
-    def _begin(self, number: int) -> None:
-        """Sets the operator up for a call that lies behind the nearest state in front of it."""
+    def _begin(self, number: int, end: int | None = None) -> None:
+        """Sets the operator up for a call that lies behind the nearest state in front of it. `end`: the stamp (ns) up
+        to which records are read."""
         self._leave()
         call = self.calls[number]
         stateless = self.node.operator.stateless
-        kept = max((n for n in self._kept if n <= number), default=None)
+        kept = self._nearest_kept(number)
         begin: int | None = call.stamp if stateless else call.stamp - 1
         if any(c.stamp >= call.stamp for c in self.calls[:number]):
             begin = None  # stamps went back: they do not show where it is
-        cut = self._kept[kept] if kept is not None and not stateless else None
+        cut = self._kept[kept] if kept >= max(0, self._nearest(number)) and not stateless else None
         if cut is not None:
             begin = cut.stamp
-        self._start(begin, cut)
+        self._bounded = begin is not None and end is not None
+        self._start(begin, cut, end)
 
-    def _start(self, begin: int | None, cut: FiringRecord | None) -> None:
-        self._log.cut = cut
+    def _start(self, begin: int | None, cut: FiringRecord | None, end: int | None) -> None:
+        log = FiringLog.read(self._recording) if begin is None or end is None else self._window(begin, cut, end)
+        log.resumed = cut
         work = Recomputation(
             self._recording,
             self.graph,
             self._feeding,
-            self._log,
+            log,
             made=lambda stream, entry: None,
             begin=begin,
             live_effects=self._live_effects,
@@ -200,6 +231,17 @@ class Debugger:
         except BaseException:
             self._leave()
             raise
+
+    def _window(self, begin: int, cut: FiringRecord | None, end: int) -> FiringLog:
+        """The records from a stamp to another, and those that these need."""
+        nodes = self.graph.nodes
+        again = {name: nodes[name] for name in self._feeding.operators}
+        taken = {stream for node in again.values() for stream in node.taken}
+        makers = again | {name: nodes[name] for name in sorted(self.graph.streams[s].node for s in taken)}
+        given = set() if cut is None else {cut.operator}
+        stateful = {n for n, node in again.items() if not node.operator.stateless} - given
+        stateless = again.keys() - stateful
+        return records_from(self._recording, makers.values(), begin, stateless=stateless, stateful=stateful, end=end)
 
     def _onwards(self) -> Iterator[int]:
         """Makes one call after the other; yields their numbers."""
@@ -293,25 +335,6 @@ class Debugger:
         if self._work is not None:
             self._work.close()
         self._work, self._reached = None, -1
-
-
-class _ResumedLog(FiringLog):
-    """The records of a recording, of which those of one operator begin with a state that was taken (`cut`), if any."""
-
-    def __init__(self, recording: Recording) -> None:
-        super().__init__({}, str(recording.path), recording)
-        self.cut: FiringRecord | None = None
-
-    def ordered(self, maker: Maker) -> Iterator[FiringRecord]:
-        records = super().ordered(maker)
-        return records if self.cut is None or maker.name != self.cut.operator else self._resumed(records, self.cut)
-
-    @staticmethod
-    def _resumed(records: Iterator[FiringRecord], cut: FiringRecord) -> Iterator[FiringRecord]:
-        """The first `setup()`, then the state, then what followed."""
-        yield next(records)
-        yield cut
-        yield from (r for r in records if (r.incarnation, r.index) > (cut.incarnation, cut.index))
 
 
 def _first_line(code: CodeType) -> int:

@@ -6,7 +6,7 @@ live run are repeated exactly. A `Judge` compares what comes out, digest by dige
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from dataflow.execution.align import align_spec
@@ -41,10 +41,10 @@ class Watcher:
 
 
 class RecordedRunner(Runner):
-    """One operator, re-executed by its records: `records` reads them in the order of its calls, each once. `inputs` are
-    the digests of what it was given; `seeding` is the version by which the recorded run seeded its generators; `begin`
-    the stamp from which it is to be repeated. `live_effects`: see `RecordedJournal`. `guard` watches over what it is
-    given in each firing; without one, only the first firings are watched."""
+    """One operator, re-executed by its records, of which `repetition` has those that are repeated. `inputs` are the
+    digests of what it was given; `seeding` is the version by which the recorded run seeded its generators.
+    `live_effects`: see `RecordedJournal`. `guard` watches over what it is given in each firing; without one, only the
+    first firings are watched."""
 
     def __init__(
         self,
@@ -52,12 +52,11 @@ class RecordedRunner(Runner):
         emitter: Emitter,
         *,
         static: frozenset[str],
-        records: Callable[[], Iterable[FiringRecord]],
+        repetition: Repetition,
         inputs: Digests,
         seed: int = 0,
         seeding: int = VERSION,
         guard: MemoryGuard | None = None,
-        begin: int | None = None,
         watcher: Watcher | None = None,
         live_effects: bool = False,
     ) -> None:
@@ -67,7 +66,7 @@ class RecordedRunner(Runner):
         self.effects = RecordedJournal(live=live_effects)
         self.calls = Calls(node, self.operator, seed, version=seeding, effects=self.effects)
         self.judge = Judge(node.name, tuple(self.ports.states), inputs)
-        self._repetition = Repetition(records, begin=begin, stateless=self.operator.stateless)
+        self._repetition = repetition
         self.result.began = self._repetition.began
         self.result.unknown, self.result.lost_records = self._repetition.unknown, self._repetition.lost
         self._calls_left = self._repetition.calls

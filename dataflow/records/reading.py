@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from dataflow.recording import Recording, RecordingError
-from dataflow.records.firing import CALLS, KINDS, FiringRecord, FiringRecordError, decode_rows, unpack_batch
+from dataflow.records.firing import CALLS, KINDS, FiringRecord, FiringRecordError, Rows, decode_rows, unpack_batch
 from dataflow.records.order import Outline, Outliner, Place, emitted, in_order
 from dataflow.sync import InputRef, MessageRef
 
@@ -37,12 +37,22 @@ Digests = Mapping[str, Lookup]
 """Stream → the recorded digests of its messages."""
 
 
+class Heading(NamedTuple):
+    """Place, kind and stamp (ns) of a record, which is the one of number `record` in its incarnation."""
+
+    incarnation: int
+    record: int
+    kind: str
+    stamp: int
+
+
 class FiringLog:
     """The firing records of many operators, read whenever they are asked for.
 
-    `kept`: batches in memory, by operator. Behind them come those of `recording`, all or those with log times from
-    `start` (ns) on. `begins`: by operator the index from which on there are all records, where those before were not
-    read. `outlines`: how the records of operators lie in the file, where that is known; else a pass finds it.
+    `kept`: batches in memory, by operator. Behind them come those of `recording`, all or those from `start` to
+    `end` (ns; see `Recording.firings`). `begins`: by operator the index from which on there are all records, where
+    those before were not read. `outlines`: how the records of operators lie in the file, where that is known; else a
+    pass finds it.
     """
 
     def __init__(
@@ -52,10 +62,13 @@ class FiringLog:
         recording: Recording | None = None,
         *,
         start: int | None = None,
+        end: int | None = None,
         begins: Mapping[str, int] | None = None,
         outlines: Mapping[str, Outline] | None = None,
     ) -> None:
-        self._kept, self._origin, self._recording, self._start = kept, origin, recording, start
+        self._kept, self._origin, self._recording, self._start, self._end = kept, origin, recording, start, end
+        self.resumed: FiringRecord | None = None
+        """A state that was taken on the way: the records of its operator go on there behind the first `setup()`."""
         self.begins: Mapping[str, int] = begins or {}
         self._outlines = dict(outlines or {})
         stored = [] if recording is None else [n for n, count in recording.firing_batches().items() if count]
@@ -86,7 +99,7 @@ class FiringLog:
         yield from kept[first:end]
         if self._recording is not None and operator in self.operators and (end is None or end > len(kept)):
             skipped = max(0, first - len(kept))
-            stored = self._recording.firings(operator, self._start, skip=skipped)
+            stored = self._recording.firings(operator, self._start, self._end, skip=skipped)
             yield from (payload for _, payload in islice(stored, None if end is None else end - len(kept) - skipped))
 
     def all_batches(self) -> Iterator[tuple[str, bytes]]:
@@ -94,12 +107,24 @@ class FiringLog:
         for operator, kept in self._kept.items():
             yield from ((operator, payload) for payload in kept)
         if self._recording is not None:
-            yield from self._recording.firings(start=self._start)
+            yield from self._recording.firings(start=self._start, end=self._end)
 
     def decoded(self, operator: str, payload: bytes) -> tuple[FiringRecord, ...]:
         """The records of a batch that is filed under an operator. Raises `RecordingError`, with the file and the
         operator."""
         return _decoded(payload, operator, self._origin)
+
+    def headings(self, maker: Maker) -> Sequence[Heading]:
+        """The headings of all records of `maker`, in order. Of records that lie in order no more is decoded."""
+        last, found = (-1, -1), list[Heading]()
+        for payload in self.batches(maker.name):
+            batch = _unpacked(payload, maker.name, self._origin)
+            for index, row in enumerate(batch.rows, batch.first):
+                if last >= (batch.incarnation, index):
+                    return [Heading(r.incarnation, r.index, r.kind, r.stamp) for r in self.ordered(maker)]
+                last = batch.incarnation, index
+                found.append(Heading(*last, KINDS[row[0]], row[1]))
+        return found
 
     def records(self, operator: str, first: int = 0, end: int | None = None) -> Iterator[FiringRecord]:
         """The records of one operator in the order of the file, of the batches from `first` to before `end`.
@@ -130,9 +155,10 @@ class FiringLog:
     def ordered(self, maker: Maker) -> Iterator[FiringRecord]:
         """The records of `maker` by (incarnation, index), each once."""
         runs = self.outline(maker).runs
-        if len(runs) == 1:
-            return self.records(maker.name, 0, runs[0].end)
-        return in_order(runs, partial(self.records, maker.name))
+        read = partial(self.records, maker.name)
+        records = read(0, runs[0].end) if len(runs) == 1 else in_order(runs, read)
+        at = self.resumed
+        return records if at is None or maker.name != at.operator else _resumed(records, at)
 
     def emissions(self, maker: Maker, stream: str) -> Iterator[tuple[Place, bytes]]:
         """(place, digest) of what `maker` sent on a stream, by its records, in the order of the places."""
@@ -161,6 +187,13 @@ class FiringLog:
         """Returns what `makers` sent on `streams`, by their records: to be asked for in the order of each stream."""
         made = {stream: maker for maker in makers for stream in maker.outputs.values()}
         return {stream: RecordedDigests(self, made[stream], stream) for stream in streams if stream in made}
+
+
+def _resumed(records: Iterator[FiringRecord], at: FiringRecord) -> Iterator[FiringRecord]:
+    """The first `setup()`, then the state, then what followed."""
+    yield next(records)
+    yield at
+    yield from (r for r in records if (r.incarnation, r.index) > (at.incarnation, at.index))
 
 
 class RecordedDigests:
@@ -196,16 +229,27 @@ def recorded_firings(recording: Recording, operator: str) -> Iterator[FiringReco
 
 
 def _decoded(payload: bytes, operator: str, origin: str) -> tuple[FiringRecord, ...]:
+    batch = _unpacked(payload, operator, origin)
+    try:
+        return decode_rows(batch)
+    except FiringRecordError as error:
+        raise _damaged(operator, origin, error) from error
+
+
+def _unpacked(payload: bytes, operator: str, origin: str) -> Rows:
     try:
         batch = unpack_batch(payload)
-        records = decode_rows(batch)
     except FiringRecordError as error:
-        raise RecordingError(f"{origin}: firing records of operator {operator!r} are damaged: {error}") from error
+        raise _damaged(operator, origin, error) from error
     if batch.operator != operator:
         raise RecordingError(
             f"{origin}: a batch of firing records of operator {batch.operator!r} is filed under {operator!r}"
         )
-    return records
+    return batch
+
+
+def _damaged(operator: str, origin: str, error: FiringRecordError) -> RecordingError:
+    return RecordingError(f"{origin}: firing records of operator {operator!r} are damaged: {error}")
 
 
 def first_places(ref: InputRef) -> Sequence[tuple[str, tuple[int, int]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Iterable, Iterator
 
 from dataflow.records.cuts import Knowledge, is_known
@@ -11,7 +12,8 @@ from dataflow.sync import Uses
 
 
 class Repetition:
-    """The records of one operator that are repeated, from a place in the middle on if asked. Iterating reads them.
+    """The records of one operator that are repeated, from a place in the middle on if asked. `look_at` finds the place
+    and counts; iterating reads them.
 
     With `begin` that place is after the last recorded state at or before that stamp, or at `begin` itself for an
     operator without state; for any other at the start, since its state in the middle is not known.
@@ -28,17 +30,14 @@ class Repetition:
         self, records: Callable[[], Iterable[FiringRecord]], *, begin: int | None = None, stateless: bool
     ) -> None:
         """`records` reads the records in the order of the calls, each once."""
-        self._records, self._stateless = records, stateless
-        self._skipped = 0 if begin is None else self._place(begin)
+        self._records, self._begin, self._stateless = records, begin, stateless
+        self._skipped = 0
         self.began = "start"
-        if begin is not None and (stateless or self._skipped):
-            self.began = "stateless" if stateless else "snapshot"
         self.setup: FiringRecord | None = None
         self.before: list[FiringRecord] = []
         self.calls = self.lost = self.unknown = 0
         self.uses = Uses()
         self.needed: dict[str, tuple[int, int]] = {}
-        self._look()
 
     def __iter__(self) -> Iterator[FiringRecord]:
         knowledge = Knowledge()
@@ -60,21 +59,15 @@ class Repetition:
             elif known is not None:
                 yield None, record
 
-    def _place(self, begin: int) -> int:
-        """The number of the record at which the repetition begins."""
-        place = 0
-        for number, record in self._numbered():
-            if number is None or number < 0:
-                continue
-            if not self._stateless:
-                place = number + 1 if is_known(record) and record.stamp <= begin else place
-            elif record.kind in CALLS and record.stamp >= begin:
-                return number
-            else:
-                place = number + 1
-        return place
-
-    def _look(self) -> None:
+    def looking(self) -> Iterator[tuple[int, int]]:
+        """Reads the records once, and once more before where a place in the middle is looked for. Yields which time it
+        is and the stamp of the record."""
+        if self._begin is not None:
+            for place, stamp in self._placing(self._begin):
+                self._skipped = place
+                yield 0, stamp
+            if self._stateless or self._skipped:
+                self.began = "stateless" if self._stateless else "snapshot"
         knowledge = Knowledge()
         for number, record in self._numbered():
             if number is None:
@@ -85,6 +78,22 @@ class Repetition:
                 self._count(record, record if self._stateless else knowledge.of(record))
             elif record.kind in ("setup", "param", "cut") or number == self._skipped - 1:
                 self.before.append(record)
+            yield 1, record.stamp
+
+    def _placing(self, begin: int) -> Iterator[tuple[int, int]]:
+        """Yields the number of the record at which the repetition begins, as far as the records up to this one show,
+        and its stamp."""
+        place = 0
+        for number, record in self._numbered():
+            if number is not None and number >= 0:
+                if not self._stateless:
+                    place = number + 1 if is_known(record) and record.stamp <= begin else place
+                elif record.kind in CALLS and record.stamp >= begin:
+                    yield number, record.stamp
+                    return
+                else:
+                    place = number + 1
+            yield place, record.stamp
 
     def _count(self, record: FiringRecord, kept: FiringRecord | None) -> None:
         if kept is None:
@@ -94,3 +103,10 @@ class Repetition:
         if kept.kind in CALLS:
             self.calls += 1
             self.uses.add(kept.inputs)
+
+
+def look_at(repetitions: Iterable[Repetition]) -> None:
+    """Reads the records of several operators side by side: they lie in the same chunks, so these are decompressed
+    once."""
+    for _ in heapq.merge(*(repetition.looking() for repetition in repetitions)):
+        pass

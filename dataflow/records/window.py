@@ -1,4 +1,5 @@
-"""The firing records that the end of a recording needs: a run of days is not read to verify its last minute.
+"""The firing records that a span of a recording needs: a run of days is not read to verify its last minute, or to go to
+one of its calls.
 
 Earlier records are left out as from a recording that was cut: a `cut` record replaces them (`dataflow.records.cuts`).
 """
@@ -6,6 +7,7 @@ Earlier records are left out as from a recording that was cut: a `cut` record re
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import islice
 
 from dataflow.recording import Recording
 from dataflow.recording.layout import PARAMETERS, RECOVERED, TOLD
@@ -30,9 +32,10 @@ def records_from(
     *,
     stateless: Collection[str],
     stateful: Collection[str],
+    end: int | None = None,
 ) -> FiringLog:
-    """Reads the records that repeating all operators from `stamp` (ns) on needs, or all of them where that is not
-    known.
+    """Reads the records that repeating all operators from `stamp` (ns) on needs, up to about `end` (ns), or all of them
+    where that is not known.
 
     It is known of recordings whose events tell of what happens to operators besides firings, if nothing did before. Of
     an operator with a state it takes one recorded at or before `stamp`. `makers`: the nodes of the graph, of which the
@@ -45,7 +48,7 @@ def records_from(
         heads = _heads(recording)
         reach = FIRST_REACH
         while stamp - reach > min(firsts) and (history is None or stamp - reach < 0):
-            found = _window(recording, heads, stamp - reach)
+            found = _window(recording, heads, makers, stamp - reach, end)
             if found is not None and _suffices(found, makers, stamp, stateless, stateful):
                 return found
             reach *= 4
@@ -65,15 +68,20 @@ def _heads(recording: Recording) -> Mapping[str, bytes]:
     return heads
 
 
-def _window(recording: Recording, heads: Mapping[str, bytes], start: int) -> FiringLog | None:
-    """The records from about `start` on, behind those of each operator's beginning; None where one has none there."""
+def _window(
+    recording: Recording, heads: Mapping[str, bytes], makers: Collection[Maker], start: int, end: int | None
+) -> FiringLog | None:
+    """The records of `makers` from about `start` on, behind those of each one's beginning; None where one has none
+    there."""
     firsts: dict[str, bytes] = {}
-    for operator, payload in recording.firings(start=start):
-        firsts.setdefault(operator, payload)
-    counts = {name: count for name, count in recording.firing_batches().items() if name not in firsts}
+    for maker in makers:
+        firsts |= islice(recording.firings(maker.name, start, end), 1)
+    names = {maker.name for maker in makers}
+    batches = {name: count for name, count in recording.firing_batches().items() if name in names}
+    counts = {name: count for name, count in batches.items() if name not in firsts}
     if any(count > 1 or (count and name not in heads) for name, count in counts.items()):
         return None
-    kept: dict[str, list[bytes]] = {name: [] if name in firsts else [head] for name, head in heads.items()}
+    kept: dict[str, list[bytes]] = {n: [] if n in firsts else [head] for n, head in heads.items() if n in names}
     begins: dict[str, int] = {}
     for operator, found in firsts.items():
         head = heads.get(operator)
@@ -95,7 +103,7 @@ def _window(recording: Recording, heads: Mapping[str, bytes], start: int) -> Fir
             begins[operator] = first.index
         elif first.index == last.index + 1:
             kept[operator] = [head]
-    return FiringLog(kept, str(recording.path), recording, start=start, begins=begins)
+    return FiringLog(kept, str(recording.path), recording, start=start, end=end, begins=begins)
 
 
 def _suffices(
@@ -148,4 +156,6 @@ def _made_from(
         for stream, emission in zip(streams, record.outputs, strict=False):
             if emission is not None and (record.kind == "setup" or record.index >= begin):
                 found.setdefault(stream, (record.incarnation, emission.seq))
+        if len(found) == len(streams):
+            break
     return dict.fromkeys(streams, NEVER_MADE) | found

@@ -16,12 +16,12 @@ from dataflow.execution.feeds.log import LogFeed
 from dataflow.execution.memory import MemoryGuard
 from dataflow.execution.recorded import RecordedRunner, Watcher
 from dataflow.execution.threads import limit_threads
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog
-from dataflow.records.repetition import Repetition
+from dataflow.records.repetition import Repetition, look_at
 from dataflow.reexecution.needed import NeededStreams, first_needed
 from dataflow.reexecution.recorded_run import NotRecorded, check_type, final_stamps, seeding_of
 from dataflow.sync import Entry
@@ -116,6 +116,7 @@ class Recomputation:
         begins = {} if begin is None else _begins(graph, records, frozenset(feeding.streams), begin)
         begins |= {name: first for name, (first, _) in slices.items() if first is not None}
         nodes = [graph.nodes[name] for name in feeding.operators]
+        repetitions = _repetitions(nodes, records, begins)
         taken = {stream for node in nodes for stream in node.taken}
         inputs = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in taken}], taken)
         self.runners = {
@@ -123,12 +124,11 @@ class Recomputation:
                 node,
                 outlet,
                 static=graph.static,
-                records=records[node.name],
+                repetition=repetitions[node.name],
                 inputs=inputs,
                 seed=graph.seed,
                 seeding=seeding_of(recording),
                 guard=guard,
-                begin=begins.get(node.name),
                 watcher=watcher,
                 live_effects=live_effects,
             )
@@ -197,6 +197,17 @@ class Recomputation:
         return {name: runner.result for name, runner in self.runners.items()}
 
 
+def _repetitions(
+    nodes: Iterable[Node], records: Mapping[str, Callable[[], Iterable[FiringRecord]]], begins: Mapping[str, int]
+) -> Mapping[str, Repetition]:
+    """What of each operator's records is repeated, read side by side."""
+    found = {
+        n.name: Repetition(records[n.name], begin=begins.get(n.name), stateless=n.operator.stateless) for n in nodes
+    }
+    look_at(found.values())
+    return found
+
+
 def _begins(
     graph: Graph, records: Mapping[str, Callable[[], Iterable[FiringRecord]]], fed: frozenset[str], begin: int
 ) -> dict[str, int]:
@@ -207,6 +218,7 @@ def _begins(
     while moved:
         node = graph.nodes[moved.pop()]
         repeated = Repetition(records[node.name], begin=begins[node.name], stateless=node.operator.stateless)
+        look_at([repeated])
         for stream, place in repeated.needed.items():
             maker = graph.streams[stream].node
             if stream in fed or maker not in begins:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from dataflow.graph.model import Graph, Node
 from dataflow.operator import Operator
-from dataflow.recording import Recording
+from dataflow.recording import Recorded, Recording
 from dataflow.records.cuts import is_known, taken_by
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog, recorded_firings
@@ -36,10 +37,9 @@ def fresh_because(recording: Recording, graph: Graph, node: Node, stamp: int) ->
         return "the recording does not hold the graph that made it"
     if recorded is None or (recorded.use, recorded.params, recorded.inputs) != (node.use, node.params, node.inputs):
         return "it is not the operator that was recorded"
-    records = list(recorded_firings(recording, node.name))
-    if not records:
+    if not recording.firing_batches().get(node.name):
         return "it left no firing records"
-    if _is_unknown(records, stamp):
+    if _is_unknown(recorded_firings(recording, node.name), stamp):
         return "the recording was cut, and holds no state of it before that"
     try:
         plan_feeding(recording, graph, [node.name])
@@ -98,32 +98,29 @@ def held_before(path: Path, node: Node, stamp: int, static: frozenset[str]) -> t
         ]
         if not known:
             return [], False
-        records = list(recorded_firings(recording, node.name))
-        calls = [r for r in records if r.kind in CALLS]
-        taken = _taken_from(calls, stamp)
+        before = {stream: recording.index(stream, end=stamp - 1) for stream in known}
+        newest = {stream: index.read(len(index) - 1) for stream, index in before.items() if len(index)}
+        last = {stream: (item.incarnation, item.seq) for stream, item in newest.items()}
+        taken, began = _taken_from(recorded_firings(recording, node.name), stamp, last)
         held: list[Entry] = []
-        for stream in known:
-            found = _last_taken(recording, stream, stamp, taken.get(stream, set()), or_newest=stream not in others)
+        for stream, item in newest.items():
+            earlier = (before[stream].read(at) for at in reversed(range(len(before[stream]) - 1)))
+            found = _last_taken(chain([item], earlier), taken.get(stream, set()), or_newest=stream not in others)
             held += reversed(found)
-        began = any(r.stamp < stamp for r in calls) or any(taken_by(r) is not None for r in records)
         return held, began
 
 
-def _last_taken(
-    recording: Recording, stream: str, stamp: int, taken: Collection[tuple[int, int]], *, or_newest: bool
-) -> list[Entry]:
-    """The messages of a stream before `stamp` that are among `taken` (incarnation, number), the newest first; of none,
-    the newest if `or_newest`. Only what lies after the first of them is read."""
-    index = recording.index(stream, end=stamp - 1)
+def _last_taken(items: Iterable[Recorded], taken: Collection[tuple[int, int]], *, or_newest: bool) -> list[Entry]:
+    """Of the messages of a stream, the newest first, those that are among `taken` (incarnation, number); of none, the
+    newest if `or_newest`. Only what lies after the first of them is read."""
     found: list[Entry] = []
     newest: Entry | None = None
     first = min(taken, default=None)
     if first is None and not or_newest:
         return found
-    for at in reversed(range(len(index))):
-        item = index.read(at)
+    for item in items:
         message, place = item.message, (item.incarnation, item.seq)
-        entry = Entry(message.stamp, message, item.seq, item.incarnation, message.digest(), stream)
+        entry = Entry(message.stamp, message, item.seq, item.incarnation, message.digest(), item.stream)
         newest = newest or entry
         if place in taken:
             found.append(entry)
@@ -132,12 +129,18 @@ def _last_taken(
     return found or ([newest] if or_newest and newest is not None else [])
 
 
-def _taken_from(calls: Iterable[FiringRecord], stamp: int) -> dict[str, set[tuple[int, int]]]:
-    """By stream, (incarnation, number) of what the recorded firings from `stamp` on took."""
+def _taken_from(
+    records: Iterable[FiringRecord], stamp: int, newest: Mapping[str, tuple[int, int]]
+) -> tuple[Mapping[str, set[tuple[int, int]]], bool]:
+    """By stream, (incarnation, number) of what the recorded firings from `stamp` on took, up to the message `newest`;
+    and whether there are any before."""
     taken: dict[str, set[tuple[int, int]]] = {}
-    for record in calls:
-        if record.stamp >= stamp:
-            for ref in record.inputs.values():
-                for message in messages_of(ref):
-                    taken.setdefault(message.stream, set()).add((message.incarnation, message.seq))
-    return taken
+    began = False
+    for record in records:
+        began = began or taken_by(record) is not None or (record.kind in CALLS and record.stamp < stamp)
+        if record.kind in CALLS and record.stamp >= stamp:
+            for message in (message for ref in record.inputs.values() for message in messages_of(ref)):
+                place = (message.incarnation, message.seq)
+                if place <= newest.get(message.stream, (-1, -1)):
+                    taken.setdefault(message.stream, set()).add(place)
+    return taken, began

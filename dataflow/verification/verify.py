@@ -19,7 +19,7 @@ from dataflow.recording.streams.cutting import cut_of
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog
-from dataflow.records.repetition import Repetition
+from dataflow.records.repetition import Repetition, look_at
 from dataflow.records.window import records_from
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, final_stamps, graph_that_is_here, processes_of
@@ -236,6 +236,7 @@ def _locate(task: _Task) -> Locate:
         with Recording(task.path) as recording:
             log = FiringLog.from_wire(task.records, recording)
             ahead = Repetition(partial(log.ordered, node), begin=begin, stateless=node.operator.stateless)
+            look_at([ahead])
             record = next(islice((r for r in ahead if r.kind in CALLS), repeated, None), None)
         return "its end" if record is None else f"firing {record.index} ({record.kind}) at stamp {record.stamp}"
 

@@ -1,9 +1,9 @@
-"""Makes the operators of the kept recordings importable."""
+"""Makes the operators of the kept recordings, and of the runtime's tests, importable."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
-sys.path.append(str(KEPT))
+TESTS = Path(__file__).resolve().parent.parent
+sys.path += [str(TESTS / "recordings_of"), str(TESTS / "runtime")]

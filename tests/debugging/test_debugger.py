@@ -14,7 +14,11 @@ import dataflow
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import SPACING
 from dataflow.execution.failure import OperatorFailure
+from dataflow.graph import load_graph
 from dataflow.recording import Recording
+from dataflow.records import reading
+from dataflow.records.firing import FiringRecord, Rows
+from dataflow.supervision.run import run
 
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
 
@@ -153,6 +157,50 @@ def test_going_back_begins_from_a_state_on_the_way(added: Recording, monkeypatch
     assert debugger.at is not None
     assert debugger.at.states()[0] == {"total": sum(range(20))}
     assert debugger.at.changed() == ("total",)
+
+
+LONG = """
+graph: long
+namespace: test
+operators:
+  left: {{use: runtime_operators:Counter, params: {{count: {count}, period: 100000000}}}}
+  tuned: {{use: runtime_operators:Tuned, inputs: {{x: left/fast}}}}
+record: {{snapshots: 2s}}
+"""
+
+
+def test_the_way_to_a_call_does_not_depend_on_the_length_of_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dataflow.records.window.FIRST_REACH", 3 * 10**9)
+    monkeypatch.setattr("dataflow.debugging.debugger.AHEAD", 10**9)
+    decode, decoded = reading.decode_rows, list[int]()
+
+    def noting(batch: Rows) -> tuple[FiringRecord, ...]:
+        decoded.append(len(batch.rows))
+        return decode(batch)
+
+    monkeypatch.setattr(reading, "decode_rows", noting)
+    costs = []
+    for count in (400, 1600):
+        (tmp_path / "long.yaml").write_text(LONG.format(count=count))
+        run(load_graph(tmp_path / "long.yaml"), placement="one_process", record=tmp_path / f"{count}.mcap")
+        with Recording(tmp_path / f"{count}.mcap") as recording:
+            debugger = Debugger(recording, "tuned")
+            decoded.clear()
+            there = debugger.goto(count // 2 + 7)
+            assert there.same
+            assert debugger._work is not None
+            assert debugger._work.results()["tuned"].verified <= 21
+            costs.append(sum(decoded))
+            assert debugger.goto(count - 10).same
+            assert debugger._work.results()["tuned"].verified <= 21
+            assert debugger.goto(count - 10 - 40).same
+            further = debugger.until(lambda fired: fired.inputs["x"].stamp % 10**9 == 0)
+            assert further is not None
+            assert further.same
+            debugger.close()
+    assert costs[1] <= costs[0] + 2 * 64  # records of a batch
 
 
 def test_edited_source_is_taken_over_and_compared_from_the_same_state(added: Recording, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from dataflow.messages import FeatureVector
 from dataflow.operator import In, Operator, Out
 from dataflow.recording.limits import MAX_EFFECT_BYTES
 from dataflow.records.firing import decode_batch, encode_batch
+from dataflow.records.repetition import Repetition, look_at
 
 STREAM = "t/s/x"
 MESSAGES = [entry(STREAM, 100, 0), entry(STREAM, 200, 1), entry(STREAM, 300, 2)]
@@ -82,11 +83,14 @@ def again(ran: Collector, body: Body | None = None, **options: Any) -> RecordedR
     """Re-executes, without that anything is answered unless `options` ask for it."""
     BODY[:] = [body or BODY[0]]
     inputs = {STREAM: {(m.incarnation, m.seq): m.digest for m in MESSAGES}}
+    asking = node(Asking, {"x": [STREAM]})
+    repetition = Repetition(lambda: ran.records, stateless=asking.operator.stateless)
+    look_at([repetition])
     runner = RecordedRunner(
-        node(Asking, {"x": [STREAM]}),
+        asking,
         Collector(),
         static=frozenset(),
-        records=lambda: ran.records,
+        repetition=repetition,
         inputs=inputs,
         **options,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +20,7 @@ from dataflow.execution.recorded import RecordedRunner
 from dataflow.execution.runner import OperatorRunner
 from dataflow.graph.model import Live, Node, Restart
 from dataflow.records.firing import FiringRecord
+from dataflow.records.repetition import Repetition, look_at
 from dataflow.sync import Entry, Firing
 
 STREAM = "t/s/x"
@@ -48,11 +49,20 @@ def live_run(made: Node, messages: Iterable[Entry], version: int, gains: Iterabl
     return collector
 
 
-def again(made: Node, ran: Collector, messages: Iterable[Entry], **fields: Any) -> RecordedRunner:
+def repeated_by(made: Node, records: Sequence[FiringRecord], begin: int | None = None) -> Repetition:
+    repetition = Repetition(lambda: records, begin=begin, stateless=made.operator.stateless)
+    look_at([repetition])
+    return repetition
+
+
+def again(
+    made: Node, ran: Collector, messages: Iterable[Entry], begin: int | None = None, **fields: Any
+) -> RecordedRunner:
     messages = list(messages)
     inputs = {STREAM: {(m.incarnation, m.seq): m.digest for m in messages}}
+    repetition = repeated_by(made, ran.records, begin)
     runner = RecordedRunner(
-        made, Collector(), **{"static": frozenset(), "records": lambda: ran.records, "inputs": inputs, **fields}
+        made, Collector(), **{"static": frozenset(), "repetition": repetition, "inputs": inputs, **fields}
     )
     runner.setup()
     for message in messages:
@@ -185,8 +195,8 @@ def test_done_rises_with_every_firing_that_is_repeated() -> None:
     made = node(Echo, {"x": [STREAM]}, Live("block", 16, {"x": 0}))
     messages = [entry(STREAM, 100 + seq, seq) for seq in range(3)]
     ran = live_run_echo(made, messages)
-    records: list[FiringRecord] = ran.records
-    runner = RecordedRunner(made, Collector(), static=frozenset(), records=lambda: records, inputs={})
+    repetition = repeated_by(made, ran.records)
+    runner = RecordedRunner(made, Collector(), static=frozenset(), repetition=repetition, inputs={})
     runner.setup()
     for message in messages:
         runner.push(STREAM, message)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from mcap.opcode import Opcode
 from dataflow.messages import Image, Pose
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.mcap import chunk_indexes, contents, message_index, summary
+from dataflow.recording.mcap.chunks import Column
+from dataflow.recording.mcap.index import McapFile
 
 
 def write(path: Path, pose: Callable[..., Pose]) -> None:
@@ -124,9 +127,9 @@ def test_only_the_chunks_of_a_span_are_looked_up(path: Path, monkeypatch: pytest
     taken: list[int] = []
     real = message_index.take_messages
 
-    def noting(contents: Any, indexes: Any, number: int, **options: Any) -> None:
-        taken.append(number)
-        real(contents, indexes, number, **options)
+    def noting(contents: Any, indexes: Any, numbers: Column, **options: Any) -> None:
+        taken.extend(numbers.tolist())
+        real(contents, indexes, numbers, **options)
 
     with Recording(path) as recording:
         monkeypatch.setattr(message_index, "take_messages", noting)
@@ -140,15 +143,28 @@ def test_records_that_are_passed_over_are_not_looked_up_again(path: Path, monkey
     taken: list[int] = []
     real = message_index.take_messages
 
-    def noting(contents: Any, indexes: Any, number: int, **options: Any) -> None:
-        taken.append(number)
-        real(contents, indexes, number, **options)
+    def noting(contents: Any, indexes: Any, numbers: Column, **options: Any) -> None:
+        taken.extend(numbers.tolist())
+        real(contents, indexes, numbers, **options)
 
     with Recording(path) as recording:
         every = list(recording.firings("pose"))
         monkeypatch.setattr(message_index, "take_messages", noting)
         assert list(recording.firings("pose", skip=50)) == every[50:]
     assert 10 <= len(taken) <= 14  # of 60
+
+
+def test_message_indexes_looked_up_together_are_those_of_each_chunk(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(McapFile(path)) as file:
+        together = {channel: file.index.entries(channel) for channel in file.channels}
+
+    monkeypatch.setattr(message_index, "_sound_entries", lambda *_: None)
+    with closing(McapFile(path)) as file:
+        for channel, entries in together.items():
+            np.testing.assert_array_equal(file.index.entries(channel).columns, entries.columns)
+            assert len(entries)
 
 
 def test_damaged_message_indexes_are_noted_when_they_are_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from dataflow.recording import Recording, RecordingError
 from dataflow.records.firing import Emission, FiringRecord, encode_batch
 from dataflow.records.reading import FiringLog, recorded_firings, whole
-from dataflow.records.repetition import Repetition
+from dataflow.records.repetition import Repetition, look_at
 
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of" / "live.mcap"
 
@@ -122,6 +122,7 @@ def test_records_of_a_long_run_are_not_in_memory_while_they_are_gone_through() -
     maker = SimpleNamespace(name="a", outputs={"out": "a/out"})
     before = held()
     repetition = Repetition(partial(log.ordered, maker), stateless=False)
+    look_at([repetition])
 
     assert repetition.calls == 199
     assert max(held() - before for number, _ in enumerate(repetition) if number % 90 == 0) < 10

@@ -5,15 +5,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dataflow.recording import Recording, RecordingWriter
+from dataflow.recording.mcap.chunks import Chunks
 from dataflow.records.cuts import is_known, taken_by
-from dataflow.records.firing import CALLS, FiringRecord, Kind
-from dataflow.records.reading import whole
-from dataflow.records.repetition import Repetition
+from dataflow.records.firing import CALLS, FiringRecord, Kind, encode_batch
+from dataflow.records.order import Outline, Run
+from dataflow.records.reading import FiringLog, whole
+from dataflow.records.repetition import Repetition, look_at
 from dataflow.sync import MessageRef, Uses
 
 TAKEN = {"left_out": 1, "again": False, "params": [{}, {}]}
@@ -65,6 +72,7 @@ def test_it_is_that_of_the_list(records: list[FiringRecord], begin: int | None, 
     before, repeated, unknown = listed(records, begin, stateless=stateless)
 
     found = Repetition(lambda: records, begin=begin, stateless=stateless)
+    look_at([found])
 
     calls = [record for record in repeated if record.kind in CALLS]
     assert list(found) == repeated
@@ -91,3 +99,32 @@ def test_a_message_is_left_until_its_last_use(told: list[tuple[int, int, int]]) 
         assert [uses.take(message) for _ in range(times)] == [False] * (times - 1) + [True]
         assert not uses.left("s", message.incarnation, message.seq)
     assert not uses.left("other", 0, 0)
+
+
+def test_records_of_several_operators_are_read_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They lie in the same chunks; what is decompressed is let go long before the end of a long recording."""
+    makers = [SimpleNamespace(name=name, outputs={"out": f"g/{name}/out"}) for name in "abc"]
+    with RecordingWriter(tmp_path / "run.mcap", metadata={}, namespace="g", chunk_seconds=1e9) as writer:
+        for index in range(40):
+            for maker in makers:
+                record = FiringRecord(maker.name, 0, index, "fire" if index else "setup", 10 * index)
+                writer.write_firings(maker.name, 10 * index, encode_batch([record]))
+            writer.flush()
+    decompressed: list[int] = []
+    decompress = Chunks._decompress
+
+    def noting(chunks: Chunks, number: int) -> bytes:
+        decompressed.append(number)
+        return decompress(chunks, number)
+
+    monkeypatch.setattr(Chunks, "_decompress", noting)
+    monkeypatch.setattr("dataflow.recording.mcap.cache.KEPT_BYTES", 1000)
+
+    with Recording(tmp_path / "run.mcap") as recording:
+        outlines = {maker.name: Outline((Run(0, 40, (0, 0)),)) for maker in makers}
+        log = FiringLog({}, "run.mcap", recording, outlines=outlines)
+        repetitions = [Repetition(partial(log.ordered, maker), stateless=False) for maker in makers]
+        look_at(repetitions)
+
+    assert [repetition.calls for repetition in repetitions] == [39, 39, 39]
+    assert sorted(decompressed) == list(range(40))

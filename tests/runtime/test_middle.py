@@ -13,13 +13,14 @@ from dataflow.execution.recorded import RecordedRunner
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.recording.streams import reader
+from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog, recorded_firings
 from dataflow.reexecution import engine
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError
-from dataflow.reexecution.warm_start import held_before
+from dataflow.reexecution.warm_start import _taken_from, held_before
 from dataflow.supervision.run import replay, run
-from dataflow.sync import Entry
+from dataflow.sync import Entry, MessageRef
 from dataflow.verification.verify import verify
 
 pytestmark = pytest.mark.usefixtures("in_process")
@@ -216,3 +217,10 @@ def test_what_an_operator_held_is_found_without_reading_the_whole_recording(
     assert held
     assert all(entry.stamp < messages[90].message.stamp for entry in held)
     assert len(decoded) <= len(held) + len(graph.nodes["mix"].inputs)
+
+
+def test_of_what_later_calls_took_only_messages_before_the_stamp_are_noted() -> None:
+    records = (FiringRecord("op", 0, k, "fire", 10 * k, inputs={"x": MessageRef("s", 0, k - 2)}) for k in range(5000))
+    taken, began = _taken_from(records, 40, {"s": (0, 3)})
+    assert began
+    assert taken == {"s": {(0, 2), (0, 3)}}

@@ -53,6 +53,12 @@ class ChunkIndexes:
         found: list[int] = self.channels[self.rows[number] : self.rows[number + 1]].tolist()
         return found
 
+    def channels_of_all(self, numbers: Column) -> tuple[Column, npt.NDArray[np.uint16]]:
+        """The channels of the messages of some chunks: each with the place of its chunk among `numbers`, which come
+        first."""
+        places, rows = _spread(self.rows, numbers)
+        return np.repeat(np.arange(len(numbers)), np.diff(rows)), self.channels[places]
+
     @property
     def ordered(self) -> bool:
         """Tells whether no chunk begins before the one in front of it."""
@@ -99,13 +105,13 @@ class ChunkIndexReader:
             return
         data = np.frombuffer(block, np.uint8)
         self._require(records + _LEAST <= len(block), records, offset)
-        head = _gathered(data, records, _HEAD)
+        head = gathered(data, records, _HEAD)
         table = head["table"].astype(np.int64)
-        lengths = _gathered(data, records + 1, np.dtype([("length", "<i8")]))["length"]
+        lengths = gathered(data, records + 1, np.dtype([("length", "<i8")]))["length"]
         after = records + _HEAD.itemsize + table
         self._require((lengths >= 0) & (table % _PLACE.itemsize == 0), records, offset)
         self._require(after + _MIDDLE.itemsize + _SIZES.itemsize <= records + RECORD.size + lengths, records, offset)
-        middle = _gathered(data, after, _MIDDLE)
+        middle = gathered(data, after, _MIDDLE)
         after += _MIDDLE.itemsize + middle["name"].astype(np.int64)
         self._require(after + _SIZES.itemsize <= records + RECORD.size + lengths, records, offset)
         counts = table // _PLACE.itemsize
@@ -114,7 +120,7 @@ class ChunkIndexReader:
         values = (
             head["start"],
             _clipped(head["length"]),
-            _clipped(_gathered(data, after, _SIZES)["size"]),
+            _clipped(gathered(data, after, _SIZES)["size"]),
             _clipped(middle["index_length"]),
             head["first"],
             head["last"],
@@ -123,7 +129,7 @@ class ChunkIndexReader:
         for column, value in zip(self._columns, values, strict=True):
             column[self._count : self._count + len(records)] = value
         self._count += len(records)
-        self._channels[self._entries : self._entries + len(places)] = _gathered(data, places, _PLACE)["channel"]
+        self._channels[self._entries : self._entries + len(places)] = gathered(data, places, _PLACE)["channel"]
         self._entries += len(places)
 
     def done(self) -> ChunkIndexes:
@@ -174,7 +180,9 @@ def _clipped(values: Column) -> npt.NDArray[np.uint32]:
     return np.where((values < 0) | (values >= 2**32), 2**32 - 1, values).astype(np.uint32)
 
 
-def _gathered(data: npt.NDArray[np.uint8], places: Column, kind: np.dtype[Any]) -> npt.NDArray[Any]:
+def gathered(data: npt.NDArray[np.uint8], places: Column, kind: np.dtype[Any]) -> npt.NDArray[Any]:
     """The structures at some places of the data, which has them whole."""
+    if not len(places):
+        return np.empty(0, kind)
     windows = np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)
     return windows[places].view(kind)[:, 0]

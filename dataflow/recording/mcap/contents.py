@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -56,10 +57,9 @@ class _Growing:
         self.chunks.append(chunk)
         self.offsets.append(offset)
 
-    def extend(self, entries: npt.NDArray[Any], chunk: int) -> None:
-        self.times.frombytes(entries["time"].astype("<i8").tobytes())
-        self.offsets.frombytes(entries["offset"].astype("<i8").tobytes())
-        self.chunks.extend([chunk] * len(entries))
+    def extend(self, entries: Entries) -> None:
+        for mine, more in zip((self.times, self.chunks, self.offsets), entries.columns, strict=True):
+            mine.frombytes(more.tobytes())
 
     def done(self) -> Entries:
         columns = (self.times, self.chunks, self.offsets)
@@ -154,9 +154,14 @@ class Contents:
             if len(entries) and int(entries["offset"].max()) >= self.chunks.ref(chunk).uncompressed_size:
                 return False
             found[channel] = entries
-        for channel, entries in found.items():
-            self._entries_of(channel).extend(entries, chunk)
+        columns = {c: (e["time"].astype(np.int64), e["offset"].astype(np.int64)) for c, e in found.items()}
+        self.add_entries({c: Entries(times, np.full_like(times, chunk), at) for c, (times, at) in columns.items()})
         return True
+
+    def add_entries(self, found: Mapping[int, Entries]) -> None:
+        """Takes messages by channel, all of them sound."""
+        for channel, entries in found.items():
+            self._entries_of(channel).extend(entries)
 
     def take_chunk(self, number: int) -> None:
         """Takes a chunk's messages, schemas and channels from its content."""

@@ -7,9 +7,10 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 from mcap.opcode import Opcode
 
-from dataflow.recording.mcap.chunk_indexes import ChunkIndexes
+from dataflow.recording.mcap.chunk_indexes import ChunkIndexes, gathered
 from dataflow.recording.mcap.chunks import Chunks, Column
 from dataflow.recording.mcap.contents import Contents, Entries
 from dataflow.recording.mcap.rawfile import RECORD, RawFile
@@ -20,11 +21,15 @@ STEP = 4096
 STEP_BYTES = 2**22
 """Bytes of their message indexes, 16 a message, beyond which no further chunk is: so much of a long file is in memory
 meanwhile."""
+MANY = 8
+"""Channels of a chunk, for each chunk that is looked up, beyond which record by record is quicker."""
 SAMPLED = 1024
 """Chunks of a long file by which the sizes of its streams are estimated, at most."""
 SAMPLED_BYTES = 2**23
 """Bytes of their message indexes, about."""
 
+_HEAD = np.dtype([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("nbytes", "<u4")])
+_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
 _NONE = Entries(*(np.empty(0, np.int64) for _ in range(3)))
 
 
@@ -157,17 +162,7 @@ class LongIndex:
             numbers = np.concatenate([np.empty(0, np.int64), *found])
             found = iter([numbers[np.argsort(self._indexes.firsts[numbers], kind="stable")]])
         for numbers in found:
-            yield from self._steps(numbers)
-
-    def _steps(self, numbers: Column) -> Iterator[Column]:
-        """Divides chunks into such as are looked up together."""
-        sizes = np.cumsum(self._indexes.index_lengths[numbers], dtype=np.int64)
-        at = 0
-        while at < len(numbers):
-            before = int(sizes[at - 1]) if at else 0
-            end = min(max(int(np.searchsorted(sizes, before + STEP_BYTES, "right")), at + 1), at + STEP)
-            yield numbers[at:end]
-            at = end
+            yield from steps(self._indexes, numbers)
 
     @cached_property
     def _ordered(self) -> bool:
@@ -178,7 +173,7 @@ class LongIndex:
     ) -> Iterator[tuple[int, Mapping[int, Entries]]]:
         before, whole = 0, start is None and end is None
         for found in self._indexes.holding(list(channels), start, end):
-            for numbers in self._steps(found):
+            for numbers in steps(self._indexes, found):
                 key = (*sorted(channels), int(numbers[0]))
                 count = self._steps_known.get(key) if whole else None
                 if count is None or before + count > skip:
@@ -200,24 +195,104 @@ class LongIndex:
         """The messages of some channels in some chunks."""
         wanted = frozenset(channels)
         found = Contents(self._file, self._chunks)
-        for number in numbers.tolist():
-            take_messages(found, self._indexes, number, sealed=self._sealed, wanted=wanted)
+        take_messages(found, self._indexes, numbers, sealed=self._sealed, wanted=wanted)
         self._damage += [note for note in found.damage if note not in self._damage]
         loaded = found.entries()
         return {channel: loaded.get(channel, _NONE) for channel in channels}
 
 
+def steps(indexes: ChunkIndexes, numbers: Column) -> Iterator[Column]:
+    """Divides chunks into such as are looked up together."""
+    sizes = np.cumsum(indexes.index_lengths[numbers], dtype=np.int64)
+    at = 0
+    while at < len(numbers):
+        before = int(sizes[at - 1]) if at else 0
+        end = min(max(int(np.searchsorted(sizes, before + STEP_BYTES, "right")), at + 1), at + STEP)
+        yield numbers[at:end]
+        at = end
+
+
 def take_messages(
-    contents: Contents, indexes: ChunkIndexes, number: int, *, sealed: bool, wanted: frozenset[int] | None = None
+    contents: Contents, indexes: ChunkIndexes, numbers: Column, *, sealed: bool, wanted: frozenset[int] | None = None
 ) -> None:
-    """Takes the messages of a chunk: by its message indexes, or where they are damaged by its content, with a note."""
-    at = int(indexes.starts[number]) + int(indexes.lengths[number])
-    bodies = _message_indexes(contents.file, at, indexes, number, sealed, wanted)
-    if bodies is None or not contents.add_indexes(number, bodies):
-        contents.take_chunk(number)
-        contents.damage.append(
-            f"the message index at byte {at} is damaged; {contents.chunks.where(number)} was read instead"
-        )
+    """Takes the messages of some chunks: by their message indexes, or where these are damaged by the content of the
+    chunk, with a note."""
+    sound = _sound_entries(contents.file, indexes, numbers, sealed, wanted)
+    if sound is not None:
+        contents.add_entries(sound)
+        return
+    for number in numbers.tolist():
+        at = int(indexes.starts[number]) + int(indexes.lengths[number])
+        bodies = _message_indexes(contents.file, at, indexes, number, sealed, wanted)
+        if bodies is None or not contents.add_indexes(number, bodies):
+            contents.take_chunk(number)
+            contents.damage.append(
+                f"the message index at byte {at} is damaged; {contents.chunks.where(number)} was read instead"
+            )
+
+
+def _sound_entries(
+    file: RawFile, indexes: ChunkIndexes, numbers: Column, sealed: bool, wanted: frozenset[int] | None
+) -> dict[int, Entries] | None:
+    """The messages of some chunks by channel, of all channels or of `wanted` ones; None where a message index is
+    damaged or contradicts the chunk index, or few chunks hold many channels: this goes from channel to channel."""
+    if int(np.diff(indexes.rows)[numbers].max(initial=0)) > MANY * len(numbers):
+        return None
+    lengths = indexes.index_lengths[numbers].astype(np.int64)
+    starts = indexes.starts[numbers] + indexes.lengths[numbers]
+    data = b"".join(map(file.read, starts.tolist(), lengths.tolist()))
+    view, ends = np.frombuffer(data, np.uint8), np.cumsum(lengths)
+    walked = _walked(view, ends - lengths, ends)
+    if walked is None:
+        return None
+    owners, places, heads = walked
+    holders, channels = indexes.channels_of_all(numbers)
+    there = np.sort((owners << 16) + heads["channel"])
+    if not np.array_equal(np.sort((holders << 16) + channels), there) or not np.diff(there).all():
+        return None
+    order = np.lexsort((owners, heads["channel"]))
+    if wanted is not None:
+        order = order[np.isin(heads["channel"][order], list(wanted))]
+    owners, places, heads = owners[order], places[order], heads[order]
+    if sealed:
+        records = zip(places.tolist(), (places + RECORD.size + heads["length"]).tolist(), strict=True)
+        if any(seal_of(data[place:end]) is not Seal.SOUND for place, end in records):
+            return None
+    counts = heads["nbytes"].astype(np.int64) // _ENTRY.itemsize
+    ordinals = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
+    entries = gathered(view, np.repeat(places + _HEAD.itemsize, counts) + _ENTRY.itemsize * ordinals, _ENTRY)
+    chunks = np.repeat(numbers[owners], counts)
+    if ((entries["offset"] < 0) | (entries["offset"] >= indexes.sizes[chunks])).any():
+        return None
+    columns = entries["time"].astype(np.int64), chunks, entries["offset"].astype(np.int64)
+    channels, firsts = np.unique(heads["channel"], return_index=True)
+    cuts = (np.cumsum(counts) - counts)[firsts[1:]]
+    parts = zip(*(np.split(column, cuts) for column in columns), strict=True)
+    return {channel: Entries(*part) for channel, part in zip(channels.tolist(), parts, strict=False)}
+
+
+def _walked(
+    data: npt.NDArray[np.uint8], places: Column, ends: Column
+) -> tuple[Column, Column, npt.NDArray[np.void]] | None:
+    """The message indexes in areas of `data` from `places` to `ends`: the number of the area of each, its place, its
+    head; None where an area does not consist of them."""
+    owners, found, heads = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0, _HEAD)]
+    left = np.flatnonzero(places < ends)
+    at = places[left]
+    while len(left):
+        if (at + _HEAD.itemsize > ends[left]).any():
+            return None
+        head = gathered(data, at, _HEAD)
+        room, nbytes = ends[left] - at - RECORD.size, head["nbytes"].astype(np.int64)
+        sound = (head["opcode"] == Opcode.MESSAGE_INDEX) & (head["length"] <= room) & (nbytes % _ENTRY.itemsize == 0)
+        if not (sound & (nbytes + _HEAD.itemsize - RECORD.size <= head["length"])).all():
+            return None
+        owners.append(left)
+        found.append(at)
+        heads.append(head)
+        more = head["length"] < room
+        left, at = left[more], (at + RECORD.size + head["length"])[more]
+    return np.concatenate(owners), np.concatenate(found), np.concatenate(heads)
 
 
 def _message_indexes(

@@ -17,7 +17,7 @@ from dataflow.recording.mcap.chunk_indexes import ChunkIndexes, ChunkIndexReader
 from dataflow.recording.mcap.chunks import Column
 from dataflow.recording.mcap.contents import Contents
 from dataflow.recording.mcap.ending import MAGIC
-from dataflow.recording.mcap.message_index import LoadedIndex, LongIndex, MessageIndex, take_messages
+from dataflow.recording.mcap.message_index import LoadedIndex, LongIndex, MessageIndex, steps, take_messages
 from dataflow.recording.mcap.rawfile import RECORD, RawFile
 from dataflow.recording.mcap.seals import Seal, seal_of
 
@@ -143,8 +143,8 @@ def _blocks(file: RawFile, footer: Footer) -> Iterator[tuple[bytes, int, Column,
 
 
 def _loaded(contents: Contents, indexes: ChunkIndexes, sealed: bool) -> LoadedIndex:
-    for number in range(len(indexes)):
-        take_messages(contents, indexes, number, sealed=sealed)
+    for numbers in steps(indexes, np.arange(len(indexes))):
+        take_messages(contents, indexes, numbers, sealed=sealed)
     return LoadedIndex(contents.entries())
 
 

@@ -150,11 +150,11 @@ class Recording:
             del record
 
     def firings(
-        self, operator: str | None = None, start: int | None = None, *, skip: int = 0
+        self, operator: str | None = None, start: int | None = None, end: int | None = None, *, skip: int = 0
     ) -> Iterator[tuple[str, bytes]]:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order: all of them,
-        or those with log times from `start` (ns) on, which are those of a batch's last record, without the first
-        `skip`.
+        or those with log times from `start` to `end` (ns) and the next one of each operator, without the first `skip`.
+        A batch's log time is the stamp of its last record.
 
         One pass: they lie in separate chunks, without the messages of streams (in older recordings among them).
         """
@@ -163,8 +163,15 @@ class Recording:
             for c in self._channels_of(Kind.FIRINGS)
             if operator is None or c.metadata.get("operator", "") == operator
         }
+        left = set(channels)
         for raw in self._in_file_order(list(channels), start, skip=skip):
+            if raw.channel not in left:
+                continue
             yield channels[raw.channel], bytes(raw.data)
+            if end is not None and raw.log_time > end:
+                left.discard(raw.channel)
+                if not left:
+                    break
 
     def firing_batches(self) -> Mapping[str, int]:
         """Number of batches of firing records by operator."""
