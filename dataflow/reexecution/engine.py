@@ -200,7 +200,7 @@ class Recomputation:
 def _repetitions(
     nodes: Iterable[Node], records: Mapping[str, Callable[[], Iterable[FiringRecord]]], begins: Mapping[str, int]
 ) -> Mapping[str, Repetition]:
-    """What of each operator's records is repeated, read side by side."""
+    """Reads, side by side, what is repeated of each operator's records."""
     found = {
         n.name: Repetition(records[n.name], begin=begins.get(n.name), stateless=n.operator.stateless) for n in nodes
     }

@@ -130,6 +130,7 @@ def lift(
         if np.count_nonzero(inner) < s.min_points:
             continue
         box = (left, upper, right, lower)
+        rows: Indices | None
         if instances is not None:
             rows = _on(instances[k], seen, near[inner])
         elif (rows := _of_class(near, inner, classes, first, mask_classes[k], k in bodies, s)) is None:
