@@ -7,6 +7,7 @@ arguments and the operator's state alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,11 @@ class Calls:
         self.effects = Journal() if effects is None else effects
         self._seeded_by = f"{seed}/{node.name}/"
         self._firing: int | None = None
-        """The stamp of the firing that is made, or was last; None in and after any other call."""
+        """The stamp of the firing under way; None outside of one."""
+        self._thread = 0
+        """The thread that makes it."""
+        self._asking = False
+        """True in an effect."""
 
     def setup(self) -> dict[str, Message]:
         """`setup()`, then the messages of the static outputs. Raises `OperatorFailure`."""
@@ -73,13 +78,19 @@ class Calls:
             seed = FiringSeed(self._seeded_by, firing.stamp)
             seed_generators(seed, self.version)
             self.operator.seed_rng(seed)
-            self._firing = firing.stamp
+            self._firing, self._thread, self.effects.asked = firing.stamp, get_ident(), 0
             outputs = outputs_of(self.operator, _call(self.operator, firing))
             if self.effects.missed is not None:  # the operator has caught it
                 raise self.effects.missed
             complete_outputs(self.operator.spec, outputs, firing)
             return outputs
+        except RAISED as error:
+            missed = self.effects.missed
+            if missed is None or error is missed or isinstance(error, KeyboardInterrupt):
+                raise
+            raise missed from error  # the operator has raised another error in its place
         finally:
+            self._firing = None
             LOADS.seed = None
             AT_WORK.ended += 1
 
@@ -138,24 +149,27 @@ class Calls:
     def _effect(self, call: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Makes an effect of a firing. The generators are seeded anew behind it: the call may have drawn from them, and
         is not made in a re-execution."""
-        if self._firing is None:
-            raise EffectError(
-                f"{self.node.name}: effect() is for process() and finish(): an answer is recorded with a firing"
-            )
-        try:
-            return self.effects.ask(call, args, kwargs)
-        finally:
-            what = f"effect {self.effects.asked}"
-            seed_generators(seed := change_seed(self.seed, self.node.name, what, 0, self._firing), self.version)
-            self.operator.seed_rng(seed)
+        stamp = self._firing
+        if stamp is None:
+            problem = "effect() is for process() and finish(): an answer is recorded with a firing"
+        elif get_ident() != self._thread:
+            problem = "effect() on another thread than process(): use the threads inside the call"
+        elif self._asking:
+            problem = "effect() inside an effect: its answer is part of the outer one's"
+        else:
+            self._asking = True
+            try:
+                return self.effects.ask(call, args, kwargs)
+            finally:
+                self._asking = False
+                self._seed(change_seed(self.seed, self.node.name, f"effect {self.effects.asked}", 0, stamp))
+        raise EffectError(f"{self.node.name}: {problem}")
 
     def _seed_change(self, what: str, place: Place) -> None:
-        self._firing = None
         if self.version >= 2:
             self._seed(change_seed(self.seed, self.node.name, what, *place))
 
     def _seed(self, seed: int) -> None:
-        self._firing = None
         seed_generators(seed, self.version)
         self.operator.seed_rng(seed)
 

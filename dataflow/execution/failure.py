@@ -58,11 +58,16 @@ class TooManyTicks(RuntimeError):
 
 def readable(error: BaseException) -> str:
     """The type and text of an error, whatever it is made of."""
+    text = text_of(error)
+    return cut(f"{type(error).__name__}: {text}" if text else type(error).__name__)
+
+
+def text_of(error: BaseException) -> str:
+    """The text of an error, whatever it is made of."""
     try:
-        text = str(error)
+        return _printable(str(error))
     except Exception as problem:
-        text = f"(its text cannot be made: {type(problem).__name__})"
-    return cut(_printable(f"{type(error).__name__}: {text}" if text else type(error).__name__))
+        return f"(its text cannot be made: {type(problem).__name__})"
 
 
 def cut(text: str, most: int = 2000) -> str:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import random
+import sys
 import urllib.error
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from email.message import Message as Headers
 from pathlib import Path
 from typing import Any
@@ -14,10 +18,11 @@ import numpy as np
 import pytest
 from firing_operators import Collector, entry, node, run_all, value
 
-from dataflow.execution.effects.answers import EffectError, EffectMiss, Key
+from dataflow.execution.effects.answers import Answer, EffectError, EffectMiss, Key
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.recorded import RecordedRunner
 from dataflow.execution.runner import OperatorRunner
+from dataflow.execution.snapshots import pack_state
 from dataflow.messages import FeatureVector
 from dataflow.operator import In, Operator, Out
 from dataflow.recording.limits import MAX_EFFECT_BYTES
@@ -35,7 +40,7 @@ def ask(*question: Any, answer: Any = None) -> Any:
     return next(WORLD) if answer is None else answer
 
 
-def refuse(error: Exception) -> None:
+def refuse(error: BaseException) -> None:
     random.random()
     raise error
 
@@ -66,7 +71,7 @@ def _bodies(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     SETUP[:] = [lambda operator: None]
 
 
-def recorded(body: Body) -> Collector:
+def recorded(body: Body, *, fails: bool = False) -> Collector:
     BODY[:] = [body]
     collector = Collector()
     runner = OperatorRunner(node(Asking, {"x": [STREAM]}), collector, static=frozenset())
@@ -74,7 +79,8 @@ def recorded(body: Body) -> Collector:
     for message in MESSAGES:
         runner.push(STREAM, message)
     runner.end(STREAM, None, "")
-    run_all(runner)
+    with pytest.raises(OperatorFailure) if fails else nullcontext():
+        run_all(runner)
     [*collector.records] = decode_batch(encode_batch(collector.records)).records
     return collector
 
@@ -162,6 +168,28 @@ def test_a_miss_is_no_failure_of_the_service_and_cannot_be_passed_over(caught: t
     assert "EffectMiss: miss at call 0" in result.first.got
 
 
+def test_a_miss_cannot_hide_behind_the_error_that_was_recorded() -> None:
+    def asking(question: str) -> Body:
+        def gone(question: str) -> None:
+            raise OSError("gone")
+
+        def body(operator: Asking, x: FeatureVector) -> float:
+            try:
+                return float(operator.effect(gone, question))
+            except BaseException:
+                raise RuntimeError("no service") from None
+
+        return body
+
+    ran = recorded(asking("A"), fails=True)
+
+    assert again(ran).result.verdict == "identical"
+    result = again(ran, asking("B")).result
+    assert result.verdict == "culprit"
+    assert result.first is not None
+    assert "EffectMiss: miss at call 0" in result.first.got
+
+
 GRID = np.arange(6, dtype=np.float32).reshape(2, 3)
 
 
@@ -208,11 +236,45 @@ class Declined(ConnectionError):
         self.code, self.reply = code, reply
 
 
+class Unreachable(ConnectionError):
+    """An error with a text that needs an attribute which is not recorded."""
+
+    def __init__(self, place: object) -> None:
+        super().__init__(111, "refused")
+        self.place = [place]
+
+    def __str__(self) -> str:
+        return f"cannot connect to {type(self.place[0]).__name__}"
+
+
+class Textless(LookupError):
+    """An error whose text cannot be made."""
+
+    def __str__(self) -> str:
+        return str(self.absent)  # type: ignore[attr-defined]
+
+
 def _local() -> Exception:
     class Local(LookupError):
         pass
 
     return Local("not importable")
+
+
+def _cyclic() -> Exception:
+    error = ValueError("loop")
+    error.origin = error  # type: ignore[attr-defined]
+    error.all = loop = []  # type: ignore[attr-defined, var-annotated]
+    loop.append(loop)
+    return error
+
+
+def _caught(call: Callable[[], Any]) -> Exception:
+    try:
+        call()
+    except Exception as error:
+        return error
+    raise AssertionError
 
 
 @pytest.mark.parametrize(
@@ -225,11 +287,19 @@ def _local() -> Exception:
         (urllib.error.URLError(TimeoutError("t")), urllib.error.URLError, "<urlopen error t>"),
         (urllib.error.HTTPError("u", 503, "busy", Headers(), None), urllib.error.HTTPError, "HTTP Error 503: busy"),
         (_local(), LookupError, "not importable"),
+        (_caught(Path("absent/x").open), FileNotFoundError, "[Errno 2] No such file or directory: 'absent/x'"),
+        (_caught(b"\xff".decode), UnicodeDecodeError, "'utf-8' codec can't decode byte 0xff in position 0: "
+         "invalid start byte"),
+        (Unreachable(object()), ConnectionError, "cannot connect to object"),
+        (OSError("bad name \udcff"), OSError, "bad name \\udcff"),
+        (Textless("x"), LookupError, "(its text cannot be made: AttributeError)"),
+        (_cyclic(), ValueError, "loop"),
+        (asyncio.CancelledError("late"), asyncio.CancelledError, "late"),
     ],
-    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
 )  # fmt: skip
-def test_errors_are_raised_again_alike(error: Exception, kind: type[Exception], text: str) -> None:
-    seen: list[Exception] = []
+def test_errors_are_raised_again_alike(error: BaseException, kind: type[BaseException], text: str) -> None:
+    seen: list[BaseException] = []
 
     ran = recorded(lambda operator, x: _tried(operator, error, seen))
 
@@ -238,16 +308,20 @@ def test_errors_are_raised_again_alike(error: Exception, kind: type[Exception], 
     for met in seen:
         assert type(met) is kind
         assert str(met) == text
-    assert getattr(seen[3], "code", None) == getattr(seen[0], "code", None)
+        if (name := FIELDS.get(kind)) is not None:
+            assert getattr(met, name) == getattr(error, name)
 
 
-def _tried(operator: Asking, error: Exception, seen: list[Exception]) -> float:
+FIELDS = {Declined: "code", urllib.error.HTTPError: "code", FileNotFoundError: "errno", UnicodeDecodeError: "start"}
+
+
+def _tried(operator: Asking, error: BaseException, seen: list[BaseException]) -> float:
     def raising() -> None:
         refuse(error)
 
     try:
         operator.effect(raising)
-    except Exception as met:
+    except BaseException as met:
         seen.append(met)
     return random.random()
 
@@ -314,6 +388,78 @@ def test_what_has_no_key_or_no_firing_is_refused() -> None:
         recorded(tries)
     SETUP[:] = [lambda operator: None]
     assert again(recorded(tries)).result.verdict == "identical"
+
+
+def test_an_effect_within_an_effect_is_refused() -> None:
+    def tries(operator: Asking, x: FeatureVector) -> float:
+        def outer() -> Any:
+            return operator.effect(ask)
+
+        with pytest.raises(EffectError, match=r"n: effect\(\) inside an effect"):
+            operator.effect(outer)
+        return float(operator.effect(ask)) + random.random()
+
+    assert again(recorded(tries)).result.verdict == "identical"
+
+
+def test_an_effect_on_another_thread_is_refused() -> None:
+    def several(questions: list[str]) -> list[Any]:
+        with ThreadPoolExecutor(2) as pool:
+            return [*pool.map(ask, questions)]
+
+    def tries(operator: Asking, x: FeatureVector) -> float:
+        with ThreadPoolExecutor(2) as pool, pytest.raises(EffectError, match="on another thread than process"):
+            pool.submit(operator.effect, ask, "A").result()
+        return float(sum(operator.effect(several, ["A", "B"])))
+
+    assert again(recorded(tries)).result.verdict == "identical"
+
+
+def test_an_effect_behind_a_firing_is_refused_and_the_verdict_comes(capsys: pytest.CaptureFixture[str]) -> None:
+    class Closing(Asking):
+        def close(self) -> None:
+            self.effect(ask, "goodbye")
+
+    SETUP[:] = [lambda operator: setattr(operator, "close", Closing.close.__get__(operator))]
+    runner = again(recorded(lambda operator, x: 1.0))
+    runner.close()
+
+    assert runner.result.verdict == "identical"
+    assert "EffectError: n: effect() is for process() and finish()" in capsys.readouterr().err
+
+
+def test_the_number_of_a_call_counts_from_the_beginning_of_its_firing() -> None:
+    def body(operator: Asking, x: FeatureVector) -> float:
+        def interrupted() -> None:
+            raise KeyboardInterrupt
+
+        if x.stamp == 100:
+            with pytest.raises(KeyboardInterrupt):
+                operator.effect(interrupted)
+            return 0.0
+        operator.effect(ask)
+        return random.random()
+
+    ran = recorded(body)
+
+    assert again(ran, lambda operator, x: 0.0 if x.stamp == 100 else body(operator, x)).result.verdict == "identical"
+
+
+def test_functions_of_two_modules_have_two_keys() -> None:
+    other = type(ask)(ask.__code__, {"__name__": "other"}, "ask")
+    other.__qualname__, other.__module__ = "ask", "other"
+
+    assert Key.of(other, (), {}) != Key.of(ask, (), {})
+    assert Key.of(other, (), {}).differing([Key.of(ask, (), {})]) == f"recorded there: {ask.__module__}:ask"
+
+
+def test_an_error_of_a_recording_imports_no_package() -> None:
+    described = [[["antigravity", "Any"], ["dataflow.doctor", "Any"], ["builtins", "ValueError"]], "t", ["t"], {}, {}]
+
+    error = Answer(True, pack_state({"": described})).error()
+
+    assert type(error) is ValueError
+    assert "antigravity" not in sys.modules
 
 
 def test_without_a_run_the_call_is_made() -> None:

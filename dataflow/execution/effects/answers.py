@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -10,11 +11,14 @@ from typing import Any
 import numpy as np
 import xxhash
 
+from dataflow.execution.failure import text_of
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages.base import Message
 from dataflow.state import StateError, plain
 
 Call = Callable[..., Any]
+DEPTH = 3
+"""Errors within errors that are recorded."""
 
 
 class EffectError(ValueError):
@@ -30,10 +34,15 @@ class EffectMiss(BaseException):
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """The key of a call: its name, and the digest (16 bytes) of each argument by its position or name."""
+    """The key of a call: its `module:name`, and the digest (16 bytes) of each argument by its position or name."""
 
-    name: str
+    function: str
     arguments: Mapping[str, bytes]
+
+    @property
+    def name(self) -> str:
+        """The name without the module."""
+        return self.function.rpartition(":")[2]
 
     @staticmethod
     def of(call: Call, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Key:
@@ -42,13 +51,16 @@ class Key:
         if name.endswith("<lambda>"):
             raise EffectError(f"effect({call!r}): a call is known by its name: give it a function or method with `def`")
         given = {**{str(k): value for k, value in enumerate(args)}, **kwargs}
-        return Key(name, {place: _digest(value, f"{name}({place})") for place, value in given.items()})
+        return Key(
+            f"{getattr(call, '__module__', None)}:{name}",
+            {place: _digest(value, f"{name}({place})") for place, value in given.items()},
+        )
 
     def differing(self, others: Sequence[Key]) -> str:
         """Returns in words how a call differs from the recorded ones that were not asked for."""
-        alike = [other for other in others if other.name == self.name]
+        alike = [other for other in others if other.function == self.function]
         if not alike:
-            return f"recorded there: {', '.join(other.name for other in others) or 'no further call'}"
+            return f"recorded there: {', '.join(other.function for other in others) or 'no further call'}"
         mine, its = self.arguments, alike[0].arguments
         places = [place for place in {**mine, **its} if mine.get(place) != its.get(place)]
         return f"argument {', '.join(places)} differs from the recorded call"
@@ -66,14 +78,16 @@ class Answer:
         """Makes the call. An answer of another type, or of more than `most` bytes, becomes an `EffectError`."""
         try:
             answer = Answer(False, _packed(call(*args, **kwargs), f"answer of {name}"))
-        except Exception as error:
+        except (KeyboardInterrupt, EffectMiss):
+            raise
+        except BaseException as error:
             answer = Answer(True, _packed_error(error))
         if len(answer.data) > most:
             problem = f"answer of {name}: {len(answer.data):,} bytes; a firing records {most:,} more: return less"
             answer = Answer(True, _packed_error(EffectError(problem)))
         return answer
 
-    def error(self) -> Exception:
+    def error(self) -> BaseException:
         """The error, of the recorded class, or of the nearest base of it that can be made again."""
         return _remade(*unpack_state(self.data)[""])
 
@@ -93,23 +107,27 @@ def _packed(value: Any, place: str) -> bytes:
         raise EffectError(f"{place}: {error}") from None
 
 
-def _packed_error(error: Exception) -> bytes:
-    return pack_state({"": _described(error)})
+def _packed_error(error: BaseException) -> bytes:
+    return pack_state({"": _described(error, DEPTH)})
 
 
-def _described(error: Exception) -> list[Any]:
-    """Its class and the bases of that, text, arguments, attributes, and attributes that are errors."""
-    kinds = [[kind.__module__, kind.__qualname__] for kind in type(error).__mro__ if issubclass(kind, Exception)]
-    args = list(error.args) if _is_plain(list(error.args)) else [str(error)]
-    attributes = {name: value for name, value in vars(error).items() if _is_plain(value)}
-    inner = {name: _described(value) for name, value in vars(error).items() if isinstance(value, Exception)}
-    return [kinds, str(error), args, attributes, inner]
+def _described(error: BaseException, depth: int) -> list[Any]:
+    """Its class and the bases of that, text, arguments, attributes, and attributes that are errors, `depth` deep."""
+    kinds = [[kind.__module__, kind.__qualname__] for kind in type(error).__mro__ if issubclass(kind, BaseException)]
+    text, args = text_of(error), list(error.args)
+    if isinstance(error, OSError) and type(error).__module__ == "builtins" and error.filename is not None:
+        args += [error.filename, None, error.filename2]
+    held = {name: value for name, value in vars(error).items() if _is_plain(name)}
+    attributes = {name: value for name, value in held.items() if _is_plain(value)}
+    errors = {name: value for name, value in held.items() if depth and isinstance(value, BaseException)}
+    inner = {name: _described(value, depth - 1) for name, value in errors.items()}
+    return [kinds, text, args if _is_plain(args) else [text], attributes, inner]
 
 
 def _is_plain(value: Any) -> bool:
     try:
         pack_state({"": value})
-    except (ValueError, OverflowError):
+    except (ValueError, OverflowError, RecursionError):
         return False
     return True
 
@@ -120,27 +138,34 @@ def _remade(
     args: Sequence[Any],
     attributes: Mapping[str, Any],
     inner: Mapping[str, Sequence[Any]],
-) -> Exception:
+) -> BaseException:
     attributes = {**attributes, **{name: _remade(*described) for name, described in inner.items()}}
-    for module, name in kinds:
-        try:
-            if (error := _of_kind(module, name, args, attributes)) is not None and str(error) == text:
-                return error
-        except Exception:
-            continue
+    for given in (args, [text]):
+        for module, name in kinds:
+            try:
+                if (error := _of_kind(module, name, given, attributes)) is not None and str(error) == text:
+                    return error
+            except Exception:
+                continue
     return Exception(text)
 
 
-def _of_kind(module: str, name: str, args: Sequence[Any], attributes: Mapping[str, Any]) -> Exception | None:
+def _of_kind(module: str, name: str, args: Sequence[Any], attributes: Mapping[str, Any]) -> BaseException | None:
+    """None where there is no such class of errors. Imports no package that is not loaded already."""
+    if module.partition(".")[0] not in sys.modules:
+        return None
     kind: Any = import_module(module)
     for part in name.split("."):
         kind = getattr(kind, part)
-    if not (isinstance(kind, type) and issubclass(kind, Exception)):
+    if not (isinstance(kind, type) and issubclass(kind, BaseException)) or kind in (KeyboardInterrupt, EffectMiss):
         return None
-    error: Exception = kind.__new__(kind, *args)
+    if kind.__module__ == "builtins":
+        error: BaseException = kind(*args)
+    else:
+        error = kind.__new__(kind, *args)
+        error.args = tuple(args)
     if type(error) is not kind:
         return None
-    error.args = tuple(args)
     vars(error).update(attributes)
     return error
 

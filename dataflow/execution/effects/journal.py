@@ -12,8 +12,8 @@ from dataflow.execution.effects.answers import Answer, Call, EffectMiss, Key
 from dataflow.recording.limits import MAX_EFFECT_BYTES
 
 EFFECTS = "effects"
-"""The key of a record's detail: the number of the firing's first call, and of each call its name, the digests of its
-arguments, whether it raised, and its packed answer."""
+"""The key of a record's detail: the number of the firing's first call, and of each call its function, the digests of
+its arguments, whether it raised, and its packed answer."""
 GIVEN, MISSED, AGAIN, SAME = "given", "missed", "again", "same"
 """Counts of a re-execution: recorded answers that were given, misses, calls made again, equal answers of these."""
 _ENGINE = Path(__file__).parents[2]
@@ -35,7 +35,7 @@ class Journal:
         self.asked += 1
         left = MAX_EFFECT_BYTES - sum(len(data) for *_, data in self.made)
         answer = Answer.of(key.name, call, args, kwargs, left)
-        self.made.append([key.name, dict(key.arguments), answer.raised, answer.data])
+        self.made.append([key.function, dict(key.arguments), answer.raised, answer.data])
         return answer.value()
 
     def take(self) -> dict[str, Any]:
@@ -61,7 +61,7 @@ class RecordedJournal(Journal):
         """Begins a firing; `detail` is that of its record."""
         self.missed, self.asked = None, 0
         self._before, made = detail.get(EFFECTS, (0, ()))
-        self._left = [(Key(name, arguments), Answer(raised, data)) for name, arguments, raised, data in made]
+        self._left = [(Key(function, arguments), Answer(raised, data)) for function, arguments, raised, data in made]
 
     def summary(self) -> dict[str, dict[str, int]]:
         """The counts by name of a call."""
