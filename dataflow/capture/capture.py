@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import bisect
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import CodeType
-from typing import Any
+from typing import Any, NamedTuple
 
-from dataflow.capture.captured import BEFORE, Captured, Outcome, Setting, Shot
+from dataflow.capture.captured import BEFORE, Captured, Change, Outcome, Predicate, Setting, Shot
 from dataflow.capture.reduce import shortest_end, smallest
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Fired
-from dataflow.execution.failure import place_of
+from dataflow.execution.failure import place_of, readable
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
-from dataflow.records.cuts import is_known
-from dataflow.records.firing import WITHHELD
+from dataflow.records.cuts import is_known, parameters_at
+from dataflow.records.firing import CALLS, WITHHELD, FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import seeding_of
+from dataflow.sync.entries import entries_of
+from dataflow.text import visible
 
 SECONDS = 60.0
 """Time to reduce the calls from one beginning; there are at most three."""
@@ -28,6 +31,8 @@ SMALL = 100
 """Of so many calls, one is few: the first beginning from which no more are needed is taken."""
 MOST_CALLS = 20_000
 """Calls whose inputs are held in memory to be reduced."""
+MOST_BYTES = 2**29
+"""Of these inputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +55,9 @@ class Wrong:
     are not the recorded ones."""
 
     def __init__(self, fired: Fired, predicate: str) -> None:
-        self.predicate, self.error, self.digests = predicate, None, None
+        self.predicate = Predicate(predicate) if predicate else None
+        self.error, self.digests = None, None
         if predicate:
-            self._code = compile(predicate, "<predicate>", "eval")
             self.text = predicate
         elif fired.error is not None and fired.raised is not None:
             self.error, self.text = _sort(fired.raised), fired.error.strip().splitlines()[-1]
@@ -64,19 +69,21 @@ class Wrong:
         """Returns whether the last of some calls is wrong in the same way."""
         if outcome.broken:
             return False
-        if self.predicate:
-            return _true(self._code, outcome.names())
+        if self.predicate is not None:
+            return self.predicate.is_true(outcome.names())
         if self.error is not None:
             return outcome.error is not None and _sort(outcome.error) == self.error
         return outcome.error is None and outcome.digests == self.digests
 
 
-def _true(code: CodeType, names: dict[str, Any]) -> bool:
-    """Whether an expression is true; one that raises is not."""
-    try:
-        return bool(eval(code, names))
-    except Exception:
-        return False
+class Beginning(NamedTuple):
+    """A state (None: a new operator), the number of the first call behind it, and the place in the operator's records
+    up to which parameters were changed before. `text`: in words."""
+
+    state: bytes | None
+    first: int
+    place: tuple[int, int]
+    text: str
 
 
 def _sort(error: BaseException) -> tuple[type, str, int]:
@@ -98,17 +105,29 @@ def capture(
     if wrong.digests is not None:
         recorded_error = fired.recorded_error or ""
         expected = _recorded(fired)
-    setting = _setting(recording, debugger, fired)
+    setting = _setting(recording, debugger)
+    ordered = FiringLog.read(recording).ordered(debugger.node)
+    records = [r for r in ordered if r.kind not in CALLS and r.outcome != "error"]
     best: tuple[Captured, str] | None = None
     few = max(1, len(debugger.calls) // SMALL)
-    for state, first, begins in _beginnings(recording, debugger, fired, wrong):
-        shots = _shots(debugger, first, fired)
-        found = Captured(setting, state, tuple(shots), expected, recorded_error, predicate)
+    too_large = False
+    for begin in _beginnings(records, debugger, fired, wrong):
+        changes = _changes(records, debugger, begin, fired)
+        if (shots := _shots(debugger, begin.first, fired, changes)) is None:
+            too_large = True
+            continue
+        parameters = parameters_at(r for r in records if (r.incarnation, r.index) <= begin.place)
+        found = Captured(setting, *parameters, begin.state, tuple(shots), expected, recorded_error, predicate)
         reduced = _reduced(found, wrong, time.monotonic() + seconds)
         if reduced is not None and (best is None or len(reduced.shots) < len(best[0].shots)):
-            best = reduced, begins
+            best = reduced, begin.text
         if best is not None and len(best[0].shots) <= few:
             break
+    if best is None and too_large:
+        raise DebugError(
+            f"call {fired.number} of {debugger.node.name}: the inputs up to it are more than {MOST_BYTES:,} bytes: "
+            "record states (record: {snapshots: 1s}), to begin nearer to it"
+        )
     if best is None:
         raise DebugError(
             f"call {fired.number} of {debugger.node.name} is not wrong when it is made apart from its recording: what "
@@ -120,21 +139,26 @@ def capture(
 
 def _aimed(debugger: Debugger, number: int | None, predicate: str) -> Fired:
     name = debugger.node.name
+    true = Predicate(predicate) if predicate else None
     if number is not None:
         fired = debugger.goto(number)
-        wrong = _true(compile(predicate, "<predicate>", "eval"), fired.names()) if predicate else not fired.same
-        if not (wrong or (fired.error is not None and not predicate)):
-            raise DebugError(f"call {number} of {name}: {'not ' + predicate if predicate else 'as recorded, no error'}")
+        wrong = not fired.same or fired.error is not None if true is None else true.is_true(fired.names())
+        if not wrong:
+            what = "as recorded, no error" if true is None else f"not {predicate}{_raised(true)}"
+            raise DebugError(f"call {number} of {name}: {what}")
         return fired
-    if predicate:
-        code = compile(predicate, "<predicate>", "eval")
-        found = debugger.until(lambda fired: _true(code, fired.names()))
+    if true is not None:
+        found = debugger.until(lambda fired: true.is_true(fired.names()))
     else:
         found = debugger.until(lambda fired: not fired.same or (fired.error is not None and not fired.injected))
     if found is None:
-        what = f"none for which {predicate}" if predicate else "all as recorded, without an error"
+        what = "all as recorded, without an error" if true is None else f"none for which {predicate}{_raised(true)}"
         raise DebugError(f"{name} has {len(debugger.calls)} calls: {what}")
     return found
+
+
+def _raised(predicate: Predicate) -> str:
+    return "" if predicate.problem is None else f", which raises {readable(predicate.problem)}"
 
 
 def _recorded(fired: Fired) -> dict[str, Message]:
@@ -148,13 +172,12 @@ def _recorded(fired: Fired) -> dict[str, Message]:
     return {each.port: each.recorded for each in made if each.recorded is not None}
 
 
-def _setting(recording: Recording, debugger: Debugger, fired: Fired) -> Setting:
+def _setting(recording: Recording, debugger: Debugger) -> Setting:
     node = debugger.node
     return Setting(
         node.name,
         node.use,
         dict(node.params),
-        dict(fired.parameters),
         debugger.graph.seed,
         seeding_of(recording),
         debugger.graph.threads,
@@ -162,72 +185,107 @@ def _setting(recording: Recording, debugger: Debugger, fired: Fired) -> Setting:
     )
 
 
-def _beginnings(
-    recording: Recording, debugger: Debugger, fired: Fired, wrong: Wrong
-) -> Iterator[tuple[bytes | None, int, str]]:
-    """States and the first calls behind them, the surest first.
+def _beginnings(records: Sequence[FiringRecord], debugger: Debugger, fired: Fired, wrong: Wrong) -> Iterator[Beginning]:
+    """Where the calls may begin, the surest first.
 
     The state of a new operator is right, and so is a recorded one where the recorded outputs are. The state that the
     operator has here just before the call may be wrong already.
     """
-    number = fired.number
+    number, incarnation = fired.number, fired.call.incarnation
+    here = (incarnation, fired.call.record)
     if debugger.node.operator.stateless:
-        yield None, number, "nothing, as it is stateless"
+        yield Beginning(None, number, here, "nothing, as it is stateless")
         return
-    incarnation = fired.call.incarnation
     first = next(k for k, call in enumerate(debugger.calls) if call.incarnation == incarnation)
-    known = None
-    if wrong.digests is not None:
-        for record in FiringLog.read(recording).ordered(debugger.node):
-            if is_known(record) and record.incarnation == incarnation and record.index < fired.call.record:
-                known = record
-    if known is not None:
-        after = next(k for k in range(first, number + 1) if debugger.calls[k].record > known.index)
-        yield known.detail["state"], after, "the recorded state"
+    before = [r for r in records if r.incarnation == incarnation and r.index < fired.call.record]
+    known = [r for r in before if is_known(r)]
+    if known and wrong.digests is not None:
+        index = known[-1].index
+        after = next(k for k in range(first, number + 1) if debugger.calls[k].record > index)
+        yield Beginning(known[-1].detail["state"], after, (incarnation, index), "the recorded state")
     if number - first < MOST_CALLS:
-        yield None, first, "a new operator"
+        begun = [r.index for r in before if r.kind in ("setup", "cut") and r.index < debugger.calls[first].record]
+        yield Beginning(None, first, (incarnation, max(begun, default=-1)), "a new operator")
     if fired.before is not None:
-        yield fired.before, number, "the state that it has here before the call, which may be wrong already"
+        text = "the state that it has here before the call, which may be wrong already"
+        yield Beginning(fired.before, number, here, text)
 
 
-def _shots(debugger: Debugger, first: int, fired: Fired) -> list[Shot]:
-    """The calls from `first` to that of `fired`."""
+def _changes(
+    records: Sequence[FiringRecord], debugger: Debugger, begin: Beginning, fired: Fired
+) -> Mapping[int, Sequence[Change]]:
+    """The changes behind a beginning, by the number of the call before which they were made."""
+    changes: dict[int, list[Change]] = defaultdict(list)
+    for r in records:
+        place = r.incarnation, r.index
+        if r.kind in ("param", "reset") and begin.place < place:
+            number = bisect.bisect_left(debugger.calls, place, key=lambda call: (call.incarnation, call.record))
+            if number <= fired.number:
+                name = r.detail["name" if r.kind == "param" else "input"]
+                changes[number].append(Change(r.kind, name, r.detail.get("value"), (r.incarnation, r.stamp)))
+    return changes
+
+
+def _shots(
+    debugger: Debugger, first: int, fired: Fired, changes: Mapping[int, Sequence[Change]]
+) -> Sequence[Shot] | None:
+    """The calls from `first` to that of `fired`; None where their inputs are more than `MOST_BYTES`."""
     shots: list[Shot] = []
+    held: set[bytes] = set()
+    nbytes = 0
+    pending: list[Change] = []
 
     def take(each: Fired) -> bool:
+        nonlocal nbytes
+        if each.number >= first:
+            pending.extend(changes.get(each.number, ()))
         if each.number >= first and each.firing is not None:
-            shots.append(_shot(debugger, each))
-        return each.number >= fired.number
+            shots.append(_shot(debugger, each, tuple(pending)))
+            pending.clear()
+            entries = [entry for given in each.firing.inputs.values() for entry in entries_of(given)]
+            new = {entry.digest: entry.value for entry in entries if entry.digest not in held}
+            held.update(new)
+            nbytes += sum(message.nbytes() for message in new.values())
+        return each.number >= fired.number or nbytes > MOST_BYTES
 
     if not take(debugger.goto(first)):
         debugger.until(take)
-    return shots
+    return shots if nbytes <= MOST_BYTES else None
 
 
-def _shot(debugger: Debugger, fired: Fired) -> Shot:
+def _shot(debugger: Debugger, fired: Fired, changes: tuple[Change, ...]) -> Shot:
     record, firing = fired.record, fired.firing
     assert firing is not None
     effects = {name: value for name, value in record.detail.items() if name == "effects"}
     emitted = zip(debugger.node.outputs, record.outputs, strict=False)
-    return Shot(firing, effects, {port: e.digest for port, e in emitted if e is not None and e.seq != WITHHELD})
+    recorded = {port: e.digest for port, e in emitted if e is not None and e.seq != WITHHELD}
+    here = {made.port: made.here.digest() for made in fired.made if made.here is not None}
+    return Shot(firing, effects, recorded, changes, here)
 
 
 def _reduced(whole: Captured, wrong: Wrong, deadline: float) -> Captured | None:
     """The smallest part of the calls that is wrong in the same way; None where all of them are not.
 
     Calls that right code needs for what was recorded must stay: behind a state all do, and behind a new operator the
-    latest ones, so many that those before the wrong one make what was recorded.
+    latest ones, so many that those before the wrong one make what was recorded. All of them must make what they make in
+    the debugger: else they depend on something that is not captured, and right code may not make what was recorded.
     """
-    if not whole.shots or not wrong.shows(whole.play()):
+    if not whole.shots:
         return None
-    *earlier, last = whole.shots
+    outcome = whole.play()
+    here = [shot.here for shot in whole.shots[:-1][-BEFORE:]]
+    if not wrong.shows(outcome) or (wrong.digests is not None and list(outcome.before) != here):
+        return None
+    *earlier, last = range(len(whole.shots))
 
-    def shows(shots: Sequence[Shot]) -> bool:
+    def shows(numbers: Sequence[int]) -> bool:
         if time.monotonic() > deadline:
             return False
-        outcome = replace(whole, shots=(*shots, last)).play()
-        return wrong.shows(outcome) and (wrong.digests is None or _as_recorded(outcome, shots))
+        part = _part(whole, (*numbers, last))
+        outcome = part.play()
+        return wrong.shows(outcome) and (wrong.digests is None or _as_recorded(outcome, part.shots[:-1]))
 
+    left: Sequence[int]
     if wrong.digests is None:
         left = smallest(shortest_end(earlier, shows), shows)
     elif whole.state is None:
@@ -236,7 +294,18 @@ def _reduced(whole: Captured, wrong: Wrong, deadline: float) -> Captured | None:
             left = left[1:]
     else:
         left = earlier
-    return _fewer_messages(replace(whole, shots=(*left, last)), wrong, deadline)
+    return _fewer_messages(_part(whole, (*left, last)), wrong, deadline)
+
+
+def _part(whole: Captured, numbers: Sequence[int]) -> Captured:
+    """Of the calls those of these numbers; changes before the others are made before the next of them."""
+    shots: list[Shot] = []
+    after = 0
+    for number in numbers:
+        changes = tuple(change for shot in whole.shots[after : number + 1] for change in shot.changes)
+        shots.append(whole.shots[number]._replace(changes=changes))
+        after = number + 1
+    return replace(whole, shots=tuple(shots))
 
 
 def _as_recorded(outcome: Outcome, earlier: Sequence[Shot]) -> bool:
@@ -272,10 +341,10 @@ def write_test(found: Found, path: Path, recording: str, command: str) -> int:
     """Writes the test to `path` and what it needs beside it (`.capture`); returns the bytes of that file."""
     data = found.captured.to_bytes()
     path.with_suffix(".capture").write_bytes(data)
-    name = re.sub(r"\W", "_", f"{found.captured.setting.name}_{found.number}")
+    name = re.sub(r"[^a-zA-Z0-9_]", "_", f"{found.captured.setting.name}_{found.number}")
     text = TEST.format(
-        what=f"{found.captured.setting.name}, call {found.number} of {recording}: {found.wrong}",
-        command=command,
+        what=visible(f"{found.captured.setting.name}, call {found.number} of {recording}: {found.wrong}"),
+        command=visible(command),
         left=found.left,
         calls=found.calls,
         begins=found.begins,
@@ -285,11 +354,12 @@ def write_test(found: Found, path: Path, recording: str, command: str) -> int:
     return len(data)
 
 
-TEST = '''"""{what}
+TEST = '''"""A captured call: fails until the operator is mended."""
 
-Captured by `{command}`:
-{left} of {calls} calls, begun with {begins}. Fails until the operator is mended.
-"""
+# {what}
+#
+# Captured by `{command}`:
+# {left} of {calls} calls, begun with {begins}.
 
 from pathlib import Path
 

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 from dataflow.execution.calls import Calls, value_of
 from dataflow.execution.effects.journal import RecordedJournal
 from dataflow.execution.failure import RAISED, readable
+from dataflow.execution.restarts import close_quietly
 from dataflow.execution.snapshots import pack_state, unpack_state
-from dataflow.execution.threads import limit_threads
+from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Live, Node
 from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import differences
@@ -26,28 +27,40 @@ from dataflow.state import plain, typed
 from dataflow.sync import NEVER, Entry, Firing, InputValue
 from dataflow.sync.entries import entries_of
 
-FORMAT = 1
+FORMAT = 2
 BEFORE = 2
 """Calls before the wrong one of which the outputs are compared, too."""
 
 
+class Change(NamedTuple):
+    """A change of a parameter (`kind` "param", with its value), or the reset of an input (`kind` "reset")."""
+
+    kind: str
+    name: str
+    value: Any
+    place: tuple[int, int]
+    """(incarnation, stamp in ns)."""
+
+
 class Shot(NamedTuple):
-    """One call: what it was given, and what was recorded of its effects and, by port, of its outputs (digests)."""
+    """One call: what it was given, what was recorded of its effects and, by port, of its outputs (digests), and the
+    changes between the call before and this one. `here`: the digests of its outputs in the debugger."""
 
     firing: Firing
     effects: Mapping[str, Any]
     digests: Mapping[str, bytes]
+    changes: tuple[Change, ...] = ()
+    here: Mapping[str, bytes] = {}
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """The operator: its name and class (`module:Class`), parameters, those that had been changed, seed of the graph,
-    version of the seeding, threads of libraries, output ports."""
+    """The operator: its name and class (`module:Class`), parameters, seed of the graph, version of the seeding,
+    threads of libraries, output ports."""
 
     name: str
     use: str
     params: Mapping[str, Any]
-    changed: Mapping[str, Any]
     seed: int
     seeding: int
     threads: int
@@ -56,10 +69,11 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The outcome of the last call, and the digests (by port) of `BEFORE` calls before it; `broken`: an earlier call
-    raised."""
+    """The outcome of the last call, and the digests (by port) of `BEFORE` calls before it; `ports`: all outputs;
+    `broken`: an earlier call raised."""
 
     firing: Firing
+    ports: Sequence[str]
     outputs: Mapping[str, Message]
     error: BaseException | None
     before: Sequence[Mapping[str, bytes]] = ()
@@ -71,12 +85,12 @@ class Outcome:
         return {port: message.digest() for port, message in self.outputs.items()}
 
     def names(self) -> dict[str, Any]:
-        """Names for an expression: `inp` and `out` by input and port, `stamp` (ns), `error`."""
+        """Names for an expression: `inp` and `out` by input and port (None where it is silent), `stamp` (ns),
+        `error`."""
         given = {name: value_of(value) for name, value in self.firing.inputs.items()}
-        outputs = dict.fromkeys(self.digests) | dict(self.outputs)
         return {
             "inp": SimpleNamespace(**given),
-            "out": SimpleNamespace(**outputs),
+            "out": SimpleNamespace(**dict.fromkeys(self.ports) | dict(self.outputs)),
             "stamp": self.firing.stamp,
             "error": None if self.error is None else readable(self.error),
         }
@@ -84,13 +98,16 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """Calls of one operator; the last one is that in which something is wrong.
+    """Calls of one operator; the last one is that in which something is wrong. They begin with the `state`, if there is
+    one, and the parameters that had been changed by then: before the last `setup()`, and `since`.
 
     Expected of it are the messages in `expected`, by port, or the error `recorded_error`, or, where there is a
     `predicate`, that this expression is false; where neither is given, that it raises nothing.
     """
 
     setting: Setting
+    at_setup: Mapping[str, Any]
+    since: Mapping[str, Any]
     state: bytes | None
     shots: tuple[Shot, ...]
     expected: Mapping[str, Message] | None = None
@@ -108,24 +125,26 @@ class Captured:
             outputs=dict(setting.outputs),
             live=Live("block", 64, {}),
         )
-        limit_threads(setting.threads)
         journal = RecordedJournal()
-        calls = Calls(node, node.make(), setting.seed, version=setting.seeding, effects=journal)
-        try:
-            calls.setup()
-            for name, value in setting.changed.items():
-                calls.parameter(name, value, (0, NEVER))
-            if self.state is not None:
-                calls.restore(self.state, (0, self.shots[0].firing.stamp - 1))
-            return _made(calls, journal, self.shots)
-        finally:
-            calls.operator.close()
+        with limited_threads(setting.threads):
+            calls = Calls(node, node.make(), setting.seed, version=setting.seeding, effects=journal)
+            try:
+                for name, value in self.at_setup.items():
+                    calls.parameter(name, value, (0, NEVER))
+                calls.setup()
+                for name, value in self.since.items():
+                    calls.parameter(name, value, (0, NEVER))
+                if self.state is not None:
+                    calls.restore(self.state, (0, self.shots[0].firing.stamp - 1))
+                return _made(calls, journal, self.shots)
+            finally:
+                close_quietly(calls.operator)
 
     def check(self) -> None:
         """Makes the calls; raises `AssertionError`, or the operator's own error, where the last one is wrong."""
         outcome = self.play()
         if self.predicate:
-            assert not eval(self.predicate, outcome.names()), f"{self.setting.name}: {self.predicate}"
+            assert not Predicate(self.predicate).is_true(outcome.names()), f"{self.setting.name}: {self.predicate}"
         elif self.recorded_error:
             error = "nothing" if outcome.error is None else readable(outcome.error)
             assert error == self.recorded_error, f"{self.setting.name}: raised {error}, expected {self.recorded_error}"
@@ -152,6 +171,8 @@ class Captured:
         content = {
             "format": FORMAT,
             "setting": asdict(self.setting),
+            "at_setup": dict(self.at_setup),
+            "since": dict(self.since),
             "state": self.state,
             "shots": shots,
             "expected": expected,
@@ -176,12 +197,36 @@ class Captured:
         expected = content["expected"]
         return Captured(
             setting,
+            content["at_setup"],
+            content["since"],
             content["state"],
             tuple(_unpacked(shot, messages) for shot in content["shots"]),
             None if expected is None else {port: messages[key] for port, key in expected.items()},
             content["recorded_error"],
             content["predicate"],
         )
+
+
+class Predicate:
+    """An expression about a call. Raises SyntaxError for another text.
+
+    It is not true where it raises. `problem` is the last error, None once it has raised none.
+    """
+
+    def __init__(self, text: str) -> None:
+        self._code = compile(text, "<predicate>", "eval")
+        self._answered = False
+        self.problem: Exception | None = None
+
+    def is_true(self, names: dict[str, Any]) -> bool:
+        """Returns whether it is true of a call, given its names."""
+        try:
+            found = bool(eval(self._code, names))
+        except Exception as error:
+            self.problem = None if self._answered else error
+            return False
+        self._answered, self.problem = True, None
+        return found
 
 
 def check(path: Path) -> None:
@@ -192,17 +237,29 @@ def check(path: Path) -> None:
 
 def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[Shot]) -> Outcome:
     """Makes the calls, to the last or to the first that raises."""
+    ports = tuple(calls.node.outputs)
     before: deque[dict[str, bytes]] = deque(maxlen=BEFORE)
     outputs: dict[str, Message] = {}
     for left, shot in zip(range(len(shots) - 1, -1, -1), shots, strict=True):
         journal.begin(shot.effects)
         try:
+            for change in shot.changes:
+                _change(calls, change)
             outputs = calls.process(shot.firing)
+        except KeyboardInterrupt:
+            raise
         except RAISED as error:
-            return Outcome(shot.firing, {}, error, tuple(before), broken=left > 0)
+            return Outcome(shot.firing, ports, {}, error, tuple(before), broken=left > 0)
         if 0 < left <= BEFORE:
             before.append({port: message.digest() for port, message in outputs.items()})
-    return Outcome(shots[-1].firing, outputs, None, tuple(before))
+    return Outcome(shots[-1].firing, ports, outputs, None, tuple(before))
+
+
+def _change(calls: Calls, change: Change) -> None:
+    if change.kind == "param":
+        calls.parameter(change.name, change.value, change.place)
+    else:
+        calls.reset(change.name, change.place)
 
 
 def _differences(expected: Mapping[str, Message], outputs: Mapping[str, Message]) -> list[str]:
@@ -232,6 +289,7 @@ def _packed(shot: Shot, kept: Any) -> dict[str, Any]:
         "late": sorted(firing.late),
         "inputs": entries,
         "effects": dict(shot.effects),
+        "changes": [[*change] for change in shot.changes],
     }
 
 
@@ -253,4 +311,5 @@ def _unpacked(values: Mapping[str, Any], messages: Mapping[str, Message]) -> Sho
     firing = Firing(
         values["stamp"], values["kind"], values["tick"], inputs, frozenset(values["stale"]), frozenset(values["late"])
     )
-    return Shot(firing, values["effects"], {})
+    changes = tuple(Change(kind, name, value, tuple(place)) for kind, name, value, place in values["changes"])
+    return Shot(firing, values["effects"], {}, changes)

@@ -304,7 +304,7 @@ class Debugger:
             record=record,
             firing=None if injected else probe.firing,
             raised=None if injected else probe.raised,
-            parameters=dict(self._work.runners[self.node.name].changed),
+            ports=tuple(self.node.outputs),
             same=self._same,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -61,8 +61,8 @@ class Fired:
     firing: Firing | None
     """The call as it was made; None where none was."""
     raised: BaseException | None
-    parameters: Mapping[str, Any]
-    """Those that had been changed in the run by then."""
+    ports: Sequence[str]
+    """All that the operator declares for its outputs."""
     same: bool
     """Outputs and the error are the recorded ones, as verification compares them."""
 
@@ -82,11 +82,11 @@ class Fired:
         return tuple(dict.fromkeys(place.partition(".")[0] for place, _, _ in changes(before, after)))
 
     def names(self) -> dict[str, Any]:
-        """Names for an expression about the call: `inp` and `out` by input and port, `stamp`, `number`, `same`,
-        `error`."""
+        """Names for an expression about the call: `inp` and `out` by input and port (None where it is silent),
+        `stamp`, `number`, `same`, `error`."""
         return {
             "inp": SimpleNamespace(**self.inputs),
-            "out": SimpleNamespace(**self.outputs),
+            "out": SimpleNamespace(**dict.fromkeys(self.ports) | dict(self.outputs)),
             "stamp": self.call.stamp,
             "number": self.number,
             "same": self.same,

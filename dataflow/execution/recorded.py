@@ -23,7 +23,7 @@ from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import ParameterError
 from dataflow.records.comparison import Verification
-from dataflow.records.cuts import is_known, taken_by
+from dataflow.records.cuts import is_known, parameters_at, taken_by
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import Digests
 from dataflow.records.repetition import Repetition
@@ -102,17 +102,9 @@ class RecordedRunner(Runner):
     def _take_up(self) -> None:
         """Returns where re-execution begins in the middle: the last restart, the parameters and the state of that
         moment."""
-        changes: dict[str, Any] = {}
         before = self._repetition.before
-        for record in before:
-            if record.kind == "param":
-                changes[record.detail["name"]] = record.detail["value"]
-            elif record.kind == "setup":
-                self.changed |= changes
-                changes = {}
-            elif (taken := taken_by(record)) is not None:
-                self.changed |= taken.at_setup
-                changes = dict(taken.since)
+        at_setup, changes = parameters_at(before)
+        self.changed |= at_setup
         again = [r for r in before if r.kind == "setup" or ((t := taken_by(r)) is not None and t.again)]
         if again:
             statics = self._make_anew(again[-1].incarnation)

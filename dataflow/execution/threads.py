@@ -69,8 +69,9 @@ def limit_threads_again() -> None:
 
 @contextmanager
 def limited_threads(threads: int) -> Iterator[None]:
-    """Limits those libraries while a graph runs in a process that has other work too, and lifts the limit again."""
+    """Limits those libraries while a graph runs in a process that has other work too, and takes the limit back."""
     global _limit
+    outer = _limit
     modules: dict[str, Any] = sys.modules
     loaded = {name: modules[name] for name in ("cv2", "torch") if name in modules}
     before = {
@@ -81,6 +82,6 @@ def limited_threads(threads: int) -> Iterator[None]:
     try:
         yield
     finally:
-        _limit = None
+        _limit = outer
         for name, library in loaded.items():
             (library.setNumThreads if name == "cv2" else library.set_num_threads)(before[name])

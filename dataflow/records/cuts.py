@@ -73,6 +73,22 @@ def taken_by(record: FiringRecord) -> Taken | None:
     return Taken(bool(detail["again"]), at_setup, since, detail.get("state"))
 
 
+def parameters_at(records: Iterable[FiringRecord]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns the changed parameters of an operator behind its records: before the last `setup()`, and since."""
+    at_setup: dict[str, Any] = {}
+    since: dict[str, Any] = {}
+    for record in records:
+        if record.kind == "param":
+            since[record.detail["name"]] = record.detail["value"]
+        elif record.kind == "setup":
+            at_setup |= since
+            since = {}
+        elif (taken := taken_by(record)) is not None:
+            at_setup |= taken.at_setup
+            since = dict(taken.since)
+    return at_setup, since
+
+
 def is_known(record: FiringRecord) -> bool:
     """Returns whether a record holds the operator's state."""
     return record.kind in ("snapshot", "cut") and "state" in record.detail

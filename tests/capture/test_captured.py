@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import seeded_bugs
 import vision_language
 from typer.testing import CliRunner
-from zoo import bugs
+from zoo import bugs, tuned
 
 import dataflow
-from dataflow.capture.capture import capture
-from dataflow.capture.captured import Captured
+from dataflow.capture.capture import capture, write_test
+from dataflow.capture.captured import Captured, Change
 from dataflow.cli.main import app
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.recording import Recording
@@ -25,6 +27,11 @@ CASES = {case.use.__name__: case for case in bugs.CASES}
 @pytest.fixture(scope="module")
 def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return seeded_bugs.recorded(CASES["LateBatch"], tmp_path_factory.mktemp("late") / "run.mcap")
+
+
+@pytest.fixture(scope="module")
+def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tuned.recorded(tmp_path_factory.mktemp("changed") / "run.mcap")
 
 
 def captured(path: Path, operator: str = "bug", number: int | None = None, predicate: str = "") -> Captured:
@@ -69,8 +76,102 @@ def test_answers_of_a_service_are_in_the_test(tmp_path: Path) -> None:
     assert re.search(r" at 0\.\d+", outcome.outputs["text"].text)  # type: ignore[attr-defined]
 
 
+def test_text_of_the_recording_is_no_code_of_the_test(late: Path, tmp_path: Path) -> None:
+    path = tmp_path / "test_late.py"
+    with Recording(late) as recording:
+        found = capture(recording, Debugger(recording, "bug"))
+    hostile = """x\"\"\"\nraise SystemExit \\N \udcff\r\u2028raise SystemExit"""
+
+    write_test(replace(found, wrong=hostile), path, hostile, hostile)
+
+    text = path.read_text()
+    kinds = [type(part).__name__ for part in ast.parse(text).body]
+    assert kinds == ["Expr", "ImportFrom", "ImportFrom", "FunctionDef"]
+    assert ast.get_docstring(ast.parse(text)) == "A captured call: fails until the operator is mended."
+    assert "\\udcff" in text
+
+
+def test_a_parameter_is_changed_where_it_was(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = captured(changed, "tuned")
+
+    changes = [(shot.firing.inputs["x"].value.vectors[0, 0], shot.changes) for shot in made.shots if shot.changes]  # type: ignore[union-attr]
+    assert [(k, change.name, change.value) for k, [change] in changes] == [(tuned.CHANGED, "factor", 3.0)]
+    read = Captured.from_bytes(made.to_bytes())
+    with pytest.raises(AssertionError, match=r"tuned: out\.vectors"):
+        read.check()
+    monkeypatch.setenv("ZOO_FIXED", "1")
+    read.check()
+
+
+def test_changes_of_calls_that_are_left_out_are_made(changed: Path) -> None:
+    made = captured(changed, "tuned", predicate=f"out.out.vectors[0, 0] == -1 and inp.x.vectors[0, 0] == {tuned.WRONG}")
+
+    assert [[change.value for change in shot.changes] for shot in made.shots] == [[3.0]]
+
+
+def test_a_reset_is_made_where_it_was(changed: Path) -> None:
+    made = captured(changed, "tuned")
+    *earlier, last = made.shots
+    reset = Change("reset", "x", None, (0, last.firing.stamp - 1))
+
+    again = replace(made, shots=(*earlier, last._replace(changes=(reset,))))
+
+    read = Captured.from_bytes(again.to_bytes())
+    assert read.shots[-1].changes == (reset,)
+    outcome = replace(read, shots=(*read.shots[:-1], read.shots[-1]._replace(firing=earlier[-1].firing))).play()
+    assert outcome.outputs["out"].vectors[0, 0] == 3.0 * (tuned.WRONG - 1)  # type: ignore[attr-defined]
+
+
+def test_calls_that_give_something_else_apart_are_no_test(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dataflow.capture.capture._changes", lambda *_: {})
+
+    with Recording(changed) as recording:
+        found = capture(recording, Debugger(recording, "tuned"))
+
+    assert found.begins.startswith("the state that it has here")
+
+
+def test_a_silent_output_is_none_for_an_expression(changed: Path) -> None:
+    made = captured(changed, "rare", predicate="out.out is None")
+
+    assert [shot.firing.inputs["x"].value.vectors[0, 0] for shot in made.shots] == [5.0]  # type: ignore[union-attr]
+    with pytest.raises(AssertionError, match=r"rare: out\.out is None"):
+        made.check()
+    replace(made, predicate="out.out.vectors[0, 0] > 3").check()  # raises: not true
+
+
+def test_an_expression_that_raises_for_every_call_is_reported(changed: Path) -> None:
+    with pytest.raises(DebugError, match=r"none for which out\.outt\.value > 3, which raises AttributeError: .*outt"):
+        captured(changed, "rare", predicate="out.outt.value > 3")
+    # raises for one call alone
+    with pytest.raises(DebugError, match=r"none for which out\.out\.vectors\[0, 0\] > 999$"):
+        captured(changed, "rare", predicate="out.out.vectors[0, 0] > 999")
+
+
+def test_inputs_in_memory_are_bounded_by_bytes(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dataflow.capture.capture.MOST_BYTES", 16)
+
+    with Recording(changed) as recording:
+        found = capture(recording, Debugger(recording, "tuned"))
+    assert found.begins.startswith("the state that it has here")
+    monkeypatch.setattr("dataflow.capture.capture.MOST_BYTES", 0)
+    with pytest.raises(DebugError, match="the inputs up to it are more than 0 bytes"):
+        captured(changed, "tuned")
+
+
+def test_an_interrupt_ends_the_calls(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(operator: tuned.Tuned, x: object) -> None:
+        raise KeyboardInterrupt
+
+    made = captured(changed, "tuned")
+    monkeypatch.setattr(tuned.Tuned, "process", interrupted)
+
+    with pytest.raises(KeyboardInterrupt):
+        made.play()
+
+
 def test_the_command_writes_a_test_and_its_data(late: Path, tmp_path: Path) -> None:
-    words = ["capture", str(late), "--op", "bug", "--to", str(tmp_path / "test_late.py")]
+    words = ["capture", str(late), "--op", "bug", "--to", str(tmp_path / "test_late.py"), "--path", str(tmp_path)]
 
     told = CliRunner().invoke(app, [*words, "--json"])
 
@@ -79,7 +180,7 @@ def test_the_command_writes_a_test_and_its_data(late: Path, tmp_path: Path) -> N
     assert (answer["calls"], answer["kept"], answer["wrong"]) == (401, 1, "differs in out")
     assert answer["bytes"] == (tmp_path / "test_late.capture").stat().st_size < 1_000_000
     text = (tmp_path / "test_late.py").read_text()
-    assert "dataflow capture run.mcap --op bug --firing" in text
+    assert re.search(rf"dataflow capture run.mcap --op bug --firing \d+ --path {re.escape(str(tmp_path))}`", text)
     assert "def test_bug_" in text
     again = CliRunner().invoke(app, words)
     assert again.exit_code == 2

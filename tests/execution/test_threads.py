@@ -29,3 +29,16 @@ def test_a_library_that_setup_loads_is_limited(monkeypatch: pytest.MonkeyPatch) 
     OperatorRunner(node(Echo, {"x": ["t/s/x"]}), Collector(), static=frozenset()).setup()
 
     assert limits == [3]
+
+
+def test_an_inner_limit_gives_the_outer_one_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "_limit", 3)
+    limits: list[int] = []
+    monkeypatch.setitem(sys.modules, "cv2", SimpleNamespace(setNumThreads=limits.append, getNumThreads=lambda: 3))
+    monkeypatch.delitem(sys.modules, "torch", raising=False)
+
+    with threads.limited_threads(1):
+        threads.limit_threads_again()
+    threads.limit_threads_again()
+
+    assert limits == [1, 1, 3, 3]

@@ -143,7 +143,10 @@ def capture(
         from dataflow.graph import load_graph
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-        _capture(recording, operator, loaded, firing, predicate, to, overwrite=overwrite, json=json)
+        words = [] if graph is None else ["--graph", str(graph)]
+        words += [word for setting in settings or () for word in ("--set", setting)]
+        words += [word for folder in path or () for word in ("--path", str(folder))]
+        _capture(recording, operator, loaded, firing, predicate, to, words, overwrite=overwrite, json=json)
 
 
 def _capture(
@@ -153,10 +156,12 @@ def _capture(
     firing: int | None,
     predicate: str,
     to: Path | None,
+    options: list[str],
     *,
     overwrite: bool,
     json: bool,
 ) -> None:
+    """`options`: further words of the command, for the test."""
     from dataflow.capture.capture import capture as captured
     from dataflow.capture.capture import write_test
     from dataflow.debugging.debugger import Debugger
@@ -173,10 +178,10 @@ def _capture(
             debugger.close()
     name = re.sub(r"\W", "_", found.captured.setting.name)
     path = output_file(to or Path(f"test_{name}_{found.number}.py"), ".py", overwrite=overwrite, option="--to")
-    words = ["dataflow capture", shlex.quote(recording.name), "--op", operator, "--firing", str(found.number)]
+    words = ["dataflow", "capture", recording.name, "--op", operator, "--firing", str(found.number), *options]
     if predicate:
-        words += ["--predicate", shlex.quote(predicate)]
-    nbytes = write_test(found, path, recording.name, " ".join(words))
+        words += ["--predicate", predicate]
+    nbytes = write_test(found, path, recording.name, shlex.join(words))
     if json:
         told = {"test": str(path), "call": found.number, "calls": found.calls, "kept": found.left, "bytes": nbytes}
         print_json(told | {"wrong": found.wrong, "begins": found.begins, "seconds": time.monotonic() - began})
