@@ -52,7 +52,7 @@ class Mailbox:
         self._waiting: queue.SimpleQueue[Arrival | TokenChange | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._messages = self._bytes = self._tokens = 0
-        """What waits."""
+        """Amounts that wait."""
 
     def sample(self, data: bytes, attachment: bytes) -> None:
         """Takes a message."""

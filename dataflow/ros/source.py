@@ -225,7 +225,7 @@ class Subscriber(Place, Source, abstract=True):
         return told | ({FINDING: "; ".join(findings)} if findings else {})
 
     def _lacking(self) -> str:
-        """Which publishers' messages were lost; empty for none."""
+        """Names the publishers whose messages were lost; empty for none."""
         known = list(self._mail.losses.publishers.items())
         lacking = [
             f"{publisher.lost:,} of {publisher.lost + publisher.received:,} messages of {self._publisher(gid)}"
@@ -237,7 +237,7 @@ class Subscriber(Place, Source, abstract=True):
         return f"{self._name}: lost are {', '.join(lacking)}" if lacking else ""
 
     def _late(self) -> str:
-        """How many messages did not fit in by their stamps, and what helps; empty for none."""
+        """Counts the messages that did not fit in by their stamps, and names what helps; empty for none."""
         order, found = self._order, []
         if order.late:
             helps = "a longer `reorder` keeps them" if order.behind <= BACK else "a publisher's clock is wrong"
