@@ -6,6 +6,7 @@ import ctypes
 import json
 import math
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -129,16 +130,16 @@ def _run(command: list[str], folder: Path, timeout: float, stop: Event | None) -
             start_new_session=True,
             preexec_fn=_end_with_parent,
         )
-        deadline = time.monotonic() + timeout
-        try:
-            while (left := deadline - time.monotonic()) > 0 and not (stop is not None and stop.is_set()):
-                with suppress(subprocess.TimeoutExpired):
-                    return process.wait(min(left, STEP))
-            return None
-        finally:
-            with suppress(ProcessLookupError):  # all of them have ended
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+    handle, ended, deadline = os.pidfd_open(process.pid), False, time.monotonic() + timeout
+    try:
+        while not ended and (left := deadline - time.monotonic()) > 0 and not (stop is not None and stop.is_set()):
+            ended = bool(select.select([handle], [], [], min(left, STEP))[0])
+    finally:
+        os.close(handle)
+        with suppress(ProcessLookupError):  # all of them have ended
+            os.killpg(process.pid, signal.SIGKILL)
+        code = process.wait()  # only now: until then no other process has its number
+    return code if ended else None
 
 
 def _end_with_parent() -> None:
