@@ -130,7 +130,7 @@ def _converted(convert: Convert, kind: RosType, data: Data, stamp: int, losses: 
         made = convert(seen, stamp)
         losses += seen.unread()
         return made
-    except (ValueError, TypeError, AttributeError, IndexError) as error:
+    except (ValueError, TypeError, AttributeError, IndexError, ArithmeticError) as error:
         if isinstance(error, MessageError):
             raise
         raise RecordingError(f"a {kind.name} whose fields contradict each other: {error}") from error

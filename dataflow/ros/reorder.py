@@ -6,9 +6,10 @@ import heapq
 from collections import deque
 from itertools import count
 
-from dataflow.interop.clocks import BACK
+from dataflow.interop.clocks import BACK, STAYS
 from dataflow.interop.transform_sets import joined
 from dataflow.messages import Message, Transforms
+from dataflow.ros.losses import remember
 
 Rank = tuple[int, int]
 """(how often a clock has gone back, stamp)"""
@@ -17,13 +18,17 @@ Rank = tuple[int, int]
 class Reorder:
     """Holds each message for `wait` seconds. Transforms of one stamp become one message.
 
-    A message whose stamp is not above that of the last one given is `late`, unless a clock was set: its publisher went
-    back itself, or is new and behind by more than 5 s. `behind`: how far (ns) a late one was behind at most.
+    A message whose stamp is below that of the last one given is `late`, unless a clock was set: its publisher went back
+    itself, or is new and behind by more than 5 s, or as far behind is the tenth late one in a row, in order: the last
+    one was of a wrong clock. `behind`: how far (ns) a late one was behind at most; `repeated`: counts messages of one
+    stamp that cannot be joined, after the first.
     """
 
     def __init__(self, wait: float) -> None:
         self._wait = wait
-        self.late = self.behind = 0
+        self.late = self.behind = self.repeated = 0
+        self._behind: list[int] = []
+        """Stamps of the late ones in a row."""
         self._held: list[tuple[Rank, int, Message]] = []
         self._due: deque[tuple[float, Rank]] = deque()
         self._numbers = count()
@@ -36,16 +41,29 @@ class Reorder:
         """Takes a message at a time (seconds, of a clock that never goes back)."""
         stamp = message.stamp
         before = self._stamps.get(publisher, self._last[1] - BACK)
-        self._stamps[publisher] = stamp
-        if stamp < before:
+        remember(self._stamps, publisher, stamp)
+        if stamp < before or self._stay_behind(stamp):
             self._jumps += 1
         rank = (self._jumps, stamp)
+        if rank == self._last and not isinstance(message, Transforms):
+            self.repeated += 1
+            return
         if rank <= self._last:
             self.late += 1
             self.behind = max(self.behind, self._last[1] - stamp)
             return
         heapq.heappush(self._held, (rank, next(self._numbers), message))
         self._due.append((now + self._wait, rank))
+
+    def _stay_behind(self, stamp: int) -> bool:
+        """Takes note of a stamp; True where so many in a row are late that the one before them was wrong."""
+        if stamp >= self._last[1] - BACK or self._jumps != self._last[0]:
+            self._behind.clear()
+            return False
+        if self._behind and stamp <= self._behind[-1]:
+            self._behind.clear()
+        self._behind.append(stamp)
+        return len(self._behind) >= STAYS
 
     def take(self, now: float) -> Message | None:
         """Returns the next message that has waited long enough."""
@@ -59,7 +77,7 @@ class Reorder:
             if isinstance(message, Transforms) and isinstance(other, Transforms):
                 message = joined(message, other)
             else:
-                self.late += 1
+                self.repeated += 1
         self._last = rank
         return message
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from dataflow.interop.clocks import BACK
 from dataflow.interop.conversions import convert
 from dataflow.interop.topics import TopicReader
 from dataflow.interop.transform_sets import joined, other_parents
@@ -16,17 +17,21 @@ from dataflow.messages import Message, MessageError, Number, Transforms
 from dataflow.operator import FINDING, Duration, Out, Param, Source, SourceError
 from dataflow.recording.errors import RecordingError
 from dataflow.ros.definitions import CLOCK, Distro, clock_time, distros_of, reader_for, type_hash
-from dataflow.ros.losses import Losses
+from dataflow.ros.losses import remember
 from dataflow.ros.mailbox import Arrival, Mailbox, TokenChange
 from dataflow.ros.message import RosMessage
 from dataflow.ros.place import Place
 from dataflow.ros.reorder import Reorder
-from dataflow.ros.wire import Attachment, End, Qos, WireError, gid_of
+from dataflow.ros.wire import End, Qos, WireError, gid_of
 
 SETTLED = 0.3
 """Seconds without a further latched message, after which those of all publishers count as taken."""
 OF_TRANSFORMS = 20_000_000
 """Wait for earlier ones (ns) of transforms, which several nodes publish on one topic."""
+LATEST = 1 << 62
+"""The latest time of publication (ns) that is taken as it is."""
+LOST_AGAIN = 20
+"""Messages after which the number of lost ones is given again, since flow control may have refused the step with it."""
 
 
 class Subscriber(Place, Source, abstract=True):
@@ -43,12 +48,13 @@ class Subscriber(Place, Source, abstract=True):
 
     def setup(self) -> None:
         """Connects and subscribes. Raises SourceError."""
-        self._mail, self._losses = Mailbox(), Losses()
+        self._mail = Mailbox()
         self._counts: Counter[str] = Counter()
         self._first_fault = ""
         self._ends: dict[bytes, End] = {}
-        self._warned: set[str] = set()
-        self._clock = self._lost = 0
+        self._warned: dict[str, None] = {}
+        self._lost = self._broken_clocks = 0
+        self._fallback = (0, 0)
         self._wanted = self.spec.outputs["message"].types[0]
         transforms = self._wanted is Transforms
         wait = self.reorder if self.reorder is not None else OF_TRANSFORMS if transforms else 0
@@ -56,6 +62,7 @@ class Subscriber(Place, Source, abstract=True):
         self._name, self._node = self.absolute(self.topic), self.join()
         type_, hash_, distro = self._agreed()
         self._reader = self._reader_of(type_, distro)
+        distros_of(type_, hash_)  # reads all definitions, which takes seconds, in which messages would be dropped
         qos = Qos(self.reliability == "reliable", self.durability == "transient_local", depth=self.depth)
         self._end = self._node.end("MS", self._name, type_, hash_, qos)
         if self.sim_time:
@@ -99,15 +106,21 @@ class Subscriber(Place, Source, abstract=True):
             raise SourceError(f"{self._name}: {error}") from error
 
     def _take_clock(self, data: bytes, attachment: bytes) -> None:
-        self._clock = max(0, clock_time(data))
+        try:
+            self._mail.clock = max(0, clock_time(data))
+        except RecordingError as error:
+            self._broken_clocks += 1
+            self._first_fault = self._first_fault or f"/clock: {error}"
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
+        given = since = 0
         while not self._mail.closed:
             for message in self._next():
                 step: dict[str, Message] = {"message": message}
-                if self._losses.lost != self._lost:
-                    self._lost = self._losses.lost
-                    step["lost"] = Number(stamp=message.stamp, value=float(self._lost), unit="")
+                since += 1
+                if self._lost != given or (self._lost and since >= LOST_AGAIN):
+                    given, since = self._lost, 0
+                    step["lost"] = Number(stamp=message.stamp, value=float(given), unit="")
                 yield step
 
     def _next(self) -> Iterator[Message]:
@@ -116,50 +129,52 @@ class Subscriber(Place, Source, abstract=True):
         if isinstance(came, TokenChange):
             self._look_at(came)
         elif came is not None:
-            gid = self._number(came)
-            for message in self._read(came, gid):
-                self._order.put(message, gid, time.monotonic())
+            for message in self._read(came):
+                self._order.put(message, came.gid, time.monotonic())
         while (ready := self._order.take(time.monotonic())) is not None:
             yield ready
 
-    def _number(self, came: Arrival) -> bytes:
-        """Takes note of a message's number; returns its publisher's gid."""
-        self._counts["received"] += 1
-        try:
-            seen = Attachment.decoded(came.attachment)
-        except WireError:
-            self._counts["unnumbered"] += 1
-            return b""
-        if missing := self._losses.take(seen):
-            who = self._publisher(seen.gid)
-            self._warn(f"{self._name}: {missing} messages of {who} were lost before number {seen.number}", who)
-        return seen.gid
-
-    def _read(self, came: Arrival, gid: bytes) -> list[Message]:
+    def _read(self, came: Arrival) -> list[Message]:
         """The messages in one of ROS; none where it cannot be read, which is counted."""
-        fallback = self._clock if self.sim_time else self._published(came)
-        if self.sim_time and not fallback:
+        self._count(came)
+        if self.sim_time and not came.clock:
             self._counts["before_clock"] += 1
             return []
-        if self._reader is None:
-            data = np.frombuffer(came.data, np.uint8)
-            return [RosMessage(stamp=fallback, type=self._end.type, hash=self._end.hash, data=data)]
         try:
-            stamps = [stamp if stamp > 0 else fallback for stamp in self._reader.stamps(came.data) or (0,)]
+            if self._reader is None:
+                data = np.frombuffer(came.data, np.uint8)
+                stamp = self._without_header(came)
+                return [RosMessage(stamp=stamp, type=self._end.type, hash=self._end.hash, data=data)]
+            stamps = list(self._reader.stamps(came.data) or (0,))
+            if min(stamps) <= 0:
+                stamp = self._without_header(came)
+                stamps = [each if each > 0 else stamp for each in stamps]
             read = (self._reader.read(came.data, part, stamp) for part, stamp in enumerate(stamps))
             return [convert(message, self._wanted) for message in read]
-        except (RecordingError, MessageError) as error:
+        except (RecordingError, MessageError, ArithmeticError) as error:
             self._counts["unreadable"] += 1
             self._first_fault = self._first_fault or str(error)
-            self._warn(f"{self._name}: a message of {self._publisher(gid)} cannot be read: {error}", "unreadable")
+            self._warn(f"{self._name}: a message of {self._publisher(came.gid)} cannot be read: {error}", "unreadable")
             return []
 
-    @staticmethod
-    def _published(came: Arrival) -> int:
-        try:
-            return max(Attachment.decoded(came.attachment).time, 1)
-        except WireError:
-            return came.time
+    def _count(self, came: Arrival) -> None:
+        self._counts["received"] += 1
+        self._lost = came.lost
+        if came.seen is None:
+            self._counts["unnumbered"] += 1
+        elif came.missing:
+            who = self._publisher(came.gid)
+            self._warn(
+                f"{self._name}: {came.missing} messages of {who} were lost before number {came.seen.number}", who
+            )
+
+    def _without_header(self, came: Arrival) -> int:
+        """The stamp of a message whose header gives none: the time of /clock, or of publication. Where that stands
+        still, each is 1 ns after the one before."""
+        time_ = came.clock if self.sim_time else came.time if came.seen is None else min(max(came.seen.time, 1), LATEST)
+        before, stamp = self._fallback
+        self._fallback = time_, time_ if time_ < before else max(time_, stamp + 1)
+        return self._fallback[1]
 
     def _publisher(self, gid: bytes) -> str:
         end = self._ends.get(gid)
@@ -174,7 +189,7 @@ class Subscriber(Place, Source, abstract=True):
         except WireError as error:
             self._warn(f"{self._name}: {error}", change.token)
             return
-        self._ends[gid_of(change.token)] = end
+        remember(self._ends, gid_of(change.token), end)
         who = f"{self._name}: {end.node.full_name}"
         if end.type != self._end.type:
             self._mismatch(f"{who} publishes {end.type}, and {self._end.type} is taken: its messages do not come")
@@ -194,29 +209,45 @@ class Subscriber(Place, Source, abstract=True):
 
     def _warn(self, text: str, once: str) -> None:
         if once not in self._warned:
-            self._warned.add(once)
+            remember(self._warned, once, None)
             self.log.warning("%s", text)
 
     def summary(self) -> Mapping[str, float | int | str]:
-        """Messages received, and lost on the side of ROS (`lost`), here (`overflow`), or by their stamps (`late`)."""
+        """Messages received, and lost on the side of ROS (`lost`), here (`overflow`), or by their stamps."""
         if not hasattr(self, "_mail"):
             return {}
-        found = {"lost": self._losses.lost, "overflow": self._mail.overflow, "late": self._order.late, **self._counts}
-        told: dict[str, float | int | str] = dict(found)
+        mail, order = self._mail, self._order
+        found = {"lost": mail.losses.lost, "overflow": mail.overflow, "late": order.late, **self._counts}
+        more = {"repeated": order.repeated, "unnamed": mail.unnamed}
+        more["unreadable"] = self._counts["unreadable"] + self._broken_clocks
+        findings = [text for text in (self._lacking(), self._late(), self._first_fault) if text]
+        told: dict[str, float | int | str] = {**found, **{name: n for name, n in more.items() if n}}
+        return told | ({FINDING: "; ".join(findings)} if findings else {})
+
+    def _lacking(self) -> str:
+        """Names the publishers whose messages were lost; empty for none."""
+        known = list(self._mail.losses.publishers.items())
         lacking = [
             f"{publisher.lost:,} of {publisher.lost + publisher.received:,} messages of {self._publisher(gid)}"
-            for gid, publisher in self._losses.publishers.items()
+            for gid, publisher in known
             if publisher.lost
         ]
-        findings = [f"{self._name}: lost are {', '.join(lacking)}"] if lacking else []
-        if self._order.late:
-            findings.append(
-                f"{self._name}: {self._order.late:,} messages came after later ones of other publishers, by up to "
-                f"{self._order.behind * 1e-6:.0f} ms; a longer `reorder` keeps them"
+        if (others := self._mail.losses.lost - sum(publisher.lost for _, publisher in known)) > 0:
+            lacking.append(f"{others:,} of former publishers")
+        return f"{self._name}: lost are {', '.join(lacking)}" if lacking else ""
+
+    def _late(self) -> str:
+        """Counts the messages that did not fit in by their stamps, and names what helps; empty for none."""
+        order, found = self._order, []
+        if order.late:
+            helps = "a longer `reorder` keeps them" if order.behind <= BACK else "a publisher's clock is wrong"
+            found.append(
+                f"{self._name}: {order.late:,} messages came after later ones of other publishers, by up to "
+                f"{order.behind * 1e-6:.0f} ms; {helps}"
             )
-        if self._first_fault:
-            findings.append(self._first_fault)
-        return told | ({FINDING: "; ".join(findings)} if findings else {})
+        if order.repeated:
+            found.append(f"{self._name}: {order.repeated:,} messages have the stamp of another, and were left out")
+        return "; ".join(found)
 
     def stop_reading(self) -> None:
         """Lets `stream()` return."""
@@ -258,7 +289,7 @@ class Latched(Subscriber, abstract=True):
         if isinstance(came, TokenChange):
             self._look_at(came)
         elif came is not None:
-            for message in self._read(came, self._number(came)):
+            for message in self._read(came):
                 self._held = self._with(message)
 
     def _with(self, message: Message) -> Message:
@@ -283,7 +314,9 @@ class Ros2Source(Subscriber):
     """Takes a topic of any type as it is: for types that have no counterpart here."""
 
     message: Out[RosMessage] = Out(doc="the messages, serialised")
-    lost: Out[Number] = Out(doc="messages lost so far on the side of ROS; with the first message after each gap")
+    lost: Out[Number] = Out(
+        doc="messages lost so far on the side of ROS; with the first message after each gap, and again"
+    )
 
 
 def source_of(message: type[Message]) -> type[Subscriber]:
@@ -293,7 +326,7 @@ def source_of(message: type[Message]) -> type[Subscriber]:
         "__doc__": f"{message.__name__} messages of a ROS 2 topic.",
         "__annotations__": {"message": Out[message], "lost": Out[Number]},  # type: ignore[valid-type]
         "message": Out(doc="the messages"),
-        "lost": Out(doc="messages lost so far on the side of ROS; with the first message after each gap"),
+        "lost": Out(doc="messages lost so far on the side of ROS; with the first message after each gap, and again"),
     }
     return type(message.__name__, (Subscriber,), made)
 

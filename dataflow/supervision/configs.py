@@ -52,7 +52,7 @@ def _sink(plan: RunPlan, process: ProcessPlan, common: Mapping[str, Any]) -> Con
         **common,
         "kind": process.sink,
         "streams": list(process.streams),
-        "firings": list(plan.graph.nodes) if process.sink == "record" else [],
+        "firings": list(process.firings),
         "options": dict(process.options),
     }
 

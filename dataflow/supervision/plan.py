@@ -93,7 +93,10 @@ class RunPlan:
 
 @dataclass(frozen=True, slots=True)
 class ProcessPlan:
-    """One process: which operators it runs, what it sends to and takes from the others, and whom it connects to."""
+    """One process: which operators it runs, what it sends to and takes from the others, and whom it connects to.
+
+    `firings`: of a recorder, the operators whose firing records it takes: those that run, or whose streams a log has.
+    """
 
     label: str
     nodes: tuple[str, ...]
@@ -102,6 +105,7 @@ class ProcessPlan:
     has_log: bool = False
     sink: str | None = None
     streams: tuple[str, ...] = ()
+    firings: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -139,23 +143,19 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
 
     storage = plan.storage.to_json()
     sinks: dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]] = {}
-    options: dict[str, Any]
+    recorded = tuple(s for s in graph.record.streams if s in streams)
+    options: dict[str, Any] = {
+        "metadata": {name: dict(values) for name, values in plan.metadata.items()},
+        "compression": plan.compression,
+        "storage": storage,
+    }
     if plan.record is not None:
-        recorded = tuple(s for s in graph.record.streams if s in streams)
-        options = {
-            "path": str(plan.record),
-            "metadata": {name: dict(values) for name, values in plan.metadata.items()},
-            "compression": plan.compression,
-            "overwrite": plan.overwrite,
-            "storage": storage,
-        }
+        options |= {"path": str(plan.record), "overwrite": plan.overwrite}
         sinks[RECORDER] = ("record", recorded, options)
     elif plan.flight is not None:
-        everything = tuple(s for s in graph.record.streams if s in streams)
-        metadata = {name: dict(values) for name, values in plan.metadata.items()}
-        options = {"flight": str(plan.flight), "metadata": metadata, "compression": plan.compression, "overwrite": True}
-        options |= {"label": f"{graph.name}-{os.getpid()}", "settle": FLIGHT_SETTLES, "storage": storage}
-        sinks[RECORDER] = ("record", everything, options)
+        options |= {"flight": str(plan.flight), "overwrite": True}
+        options |= {"label": f"{graph.name}-{os.getpid()}", "settle": FLIGHT_SETTLES}
+        sinks[RECORDER] = ("record", recorded, options)
     if plan.view_file is not None:
         hidden = {s for s in graph.view.hide if not set(graph.streams[s].types) & set(PLACE_FRAMES)}
         shown = tuple(sorted(streams - hidden))
@@ -165,12 +165,13 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
             taken_in[stream].add(label)
 
     plans: dict[str, ProcessPlan] = {}
+    firings = tuple(node.name for node in graph.nodes.values() if node.outputs or node.name not in replaced)
     for label, nodes in processes.items():
         publish = {
             s: len(taken_in[s] - {label}) for s in sorted(streams) if made_in[s] == label and taken_in[s] - {label}
         }
         if plan.keeps_records:
-            publish |= {firings_key(graph.namespace, node): 1 for node in nodes}
+            publish |= {firings_key(graph.namespace, node): 1 for node in nodes if node in firings}
         subscribe = tuple(s for s in sorted(streams) if label in taken_in[s] and made_in[s] != label)
         plans[label] = ProcessPlan(
             label,
@@ -180,7 +181,8 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
             has_log=bool(replaced & set(nodes)),
         )
     for label, (kind, taken, chosen) in sinks.items():
-        plans[label] = ProcessPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
+        process = ProcessPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
+        plans[label] = replace(process, firings=firings) if kind == "record" else process
     return plans
 
 
@@ -188,7 +190,4 @@ def taken_keys(graph: Graph, process: ProcessPlan) -> set[str]:
     """Returns the keys that a process takes: on each it must have seen a probe before sources are released."""
     if process.sink is None:
         return set(process.subscribe)
-    keys = set(process.streams)
-    if process.sink == "record":
-        keys |= {firings_key(graph.namespace, node) for node in graph.nodes}
-    return keys
+    return {*process.streams, *(firings_key(graph.namespace, node) for node in process.firings)}

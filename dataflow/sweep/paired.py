@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.sweep.plan import Task
 from dataflow.sweep.table import Store
 
 DRAWS = 10_000
 """Samples of the recordings, with replacement, from which an interval is taken."""
+BLOCK = 1 << 20
+"""Numbers drawn at a time."""
 LOWER_IS_BETTER = ("error", "rmse", "drift", "lost", "dropped")
+HIGHER_IS_BETTER = ("precision", "recall", "f1", "iou", "accuracy", "score")
+FloatArray = NDArray[np.float64]
 ALPHA = 0.05
 
 
@@ -23,8 +29,9 @@ class Paired:
 
     - `a`, `b`: means; `difference`: mean of B - A; `low`, `high`: its 95 % interval, by bootstrap over recordings.
     - `p`: of Wilcoxon's signed-rank test, two-sided; `adjusted`: by Holm's method, for all figures compared.
-    - `recordings`: (name, B - A), the worst for B first; the largest first where no word
-      of the figure's name gives a direction.
+    - `recordings`: (name, B - A), the worst for B first; the largest first where no word of the figure's name gives a
+      direction (`directed`).
+    - `left_out`: recordings where A or B has no such figure, or one that is not finite.
     """
 
     figure: str
@@ -36,6 +43,8 @@ class Paired:
     p: float
     adjusted: float
     recordings: tuple[tuple[str, float], ...]
+    directed: bool
+    left_out: tuple[str, ...] = ()
 
     @property
     def differs(self) -> bool:
@@ -56,11 +65,13 @@ class Difference:
 
 
 def compared(figures: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[Paired]:
-    """Compares every figure: name → recording → (by A, by B). Those with the least p come first.
+    """Compares every figure: name → recording → (by A, by B), NaN for one that is missing. The least p comes first.
 
     Source: Wilcoxon 1945; Holm 1979; Efron 1979 (percentile interval).
     """
-    found = [_paired(name, pairs) for name, pairs in figures.items() if pairs]
+    found = [
+        _paired(name, pairs) for name, pairs in figures.items() if np.isfinite([*pairs.values()]).all(axis=1).any()
+    ]
     found.sort(key=lambda one: (one.p, one.figure))
     least, adjusted = 0.0, []
     for rank, one in enumerate(found):
@@ -69,32 +80,40 @@ def compared(figures: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[P
     return adjusted
 
 
-def _paired(figure: str, pairs: Mapping[str, tuple[float, float]]) -> Paired:
+def _paired(figure: str, given: Mapping[str, tuple[float, float]]) -> Paired:
     from scipy.stats import wilcoxon
 
+    pairs = {name: pair for name, pair in given.items() if np.isfinite(pair).all()}
     values = np.array(list(pairs.values()), float)
     differences = values[:, 1] - values[:, 0]
-    drawn = np.random.default_rng(0).integers(len(differences), size=(DRAWS, len(differences)))
-    low, high = np.quantile(differences[drawn].mean(axis=1), (0.025, 0.975))
+    low, high = np.quantile(_means(differences), (0.025, 0.975))
     p = float(wilcoxon(differences).pvalue) if differences.any() else 1.0
     words = figure.replace(":", " ").split()
-    sign = -1.0 if any(word in words for word in LOWER_IS_BETTER) else 1.0
+    lower, higher = any(w in LOWER_IS_BETTER for w in words), any(w in HIGHER_IS_BETTER for w in words)
     named = list(zip(pairs, differences.tolist(), strict=True))
-    known = sign < 0 or any(word in words for word in ("precision", "recall", "f1", "iou", "accuracy", "score"))
-    named.sort(key=lambda pair: (sign * pair[1] if known else -abs(pair[1]), pair[0]))
+    named.sort(key=lambda pair: (-pair[1] if lower else pair[1] if higher else -abs(pair[1]), pair[0]))
     a, b = values.mean(axis=0).tolist()
-    return Paired(figure, a, b, float(differences.mean()), float(low), float(high), p, p, tuple(named))
+    left_out = tuple(name for name in given if name not in pairs)
+    mean = float(differences.mean())
+    return Paired(figure, a, b, mean, float(low), float(high), p, p, tuple(named), lower or higher, left_out)
+
+
+def _means(differences: FloatArray) -> FloatArray:
+    """Returns the means of samples with replacement, some at a time, so that many recordings take little memory."""
+    draw, count = np.random.default_rng(0), len(differences)
+    sizes = [min(step, DRAWS - begin) for step in [max(1, BLOCK // count)] for begin in range(0, DRAWS, step)]
+    return np.concatenate([differences[draw.integers(count, size=(size, count))].mean(axis=1) for size in sizes])
 
 
 def figures_of(
     first: Iterable[Task], second: Iterable[Task], store: Store
 ) -> dict[str, dict[str, tuple[float, float]]]:
-    """Returns the figures that both have of a recording: "operator: name" → recording → (by A, by B)."""
+    """Returns the figures of recordings that both ran: "operator: name" → recording → (by A, by B), NaN for none."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
     for task, other in zip(first, second, strict=True):
         a, b = _figures(store, task), _figures(store, other)
-        for name in a.keys() & b.keys():
-            found.setdefault(name, {})[task.source.name] = (a[name], b[name])
+        for name in a.keys() | b.keys():
+            found.setdefault(name, {})[task.source.name] = (a.get(name, math.nan), b.get(name, math.nan))
     return dict(sorted(found.items()))
 
 

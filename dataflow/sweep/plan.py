@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -16,12 +18,15 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.streams.facts import machine_facts
 from dataflow.reexecution.recorded_run import recorded_graph
+from dataflow.text import visible
 from dataflow.verification.gate import recordings_in
 
 What = Literal["replay", "verify", "evaluate"]
 Choice = tuple[tuple[str, str], ...]
 """Settings, as pairs of name and value."""
 SUFFIXES = (".mcap", ".bag", ".db3")
+BAG = "metadata.yaml"
+"""The file that makes a folder a bag of ROS 2."""
 CHUNK = 1 << 20
 _OPENS, _CLOSES, _QUOTES = "([{", ")]}", "\"'"
 
@@ -121,29 +126,39 @@ class Digests:
 
     def save(self) -> None:
         """Raises `OSError`."""
-        self._file.write_text(json.dumps(self._known), encoding="utf-8")
+        part = self._file.with_suffix(f".{os.getpid()}.part")
+        part.write_text(json.dumps(self._known), encoding="utf-8")
+        part.replace(self._file)
 
 
 def sources_in(targets: Sequence[str], digests: Digests) -> list[Source]:
-    """Returns the recordings that files, folders and URLs name.
+    """Returns the recordings and bags that files, folders and URLs name, each once.
 
     Raises `SweepError`, `OSError`, and `ReplayError` for a folder without recordings.
     """
-    found = []
+    found: dict[str, Source] = {}
     for target in targets:
-        if "://" in target:
-            found += _remote(target)
-        elif (path := Path(target)).is_file() or (path / "metadata.yaml").exists():
-            found.append(Source(path.name, target, digests.of(path)))
-        else:
-            found += [Source(name, str(file), digests.of(file)) for file, name in recordings_in([path])]
-    unique = {source.where: source for source in found}
-    names = [source.name for source in unique.values()]
-    return [s if names.count(s.name) == 1 else Source(s.where, s.where, s.digest) for s in unique.values()]
+        here = _remote(target) if "://" in target else _local(Path(target), digests)
+        found |= {source.where: source for source in here if source.where not in found}
+    names = Counter(source.name for source in found.values())
+    return [s if names[s.name] == 1 else replace(s, name=visible(s.where)) for s in found.values()]
 
 
-def _remote(url: str) -> list[Source]:
-    import fsspec  # of the extra `sweep`
+def _local(path: Path, digests: Digests) -> Iterator[Source]:
+    if path.is_file() or (path / BAG).exists():
+        files = [(path, path.name)]
+    else:
+        bags = [bag.parent for bag in sorted(path.rglob(BAG))]
+        bags += sorted(path.rglob("*.bag"))
+        files = [(bag, bag.relative_to(path).as_posix()) for bag in bags]
+        if not bags or any(path.rglob("*.mcap")):
+            files += [(file, name) for file, name in recordings_in([path]) if not set(file.parents) & set(bags)]
+    for file, name in files:
+        yield Source(visible(name), str(file.resolve()), digests.of(file))
+
+
+def _remote(url: str) -> Iterator[Source]:
+    import fsspec  # of the extra `ray`
 
     store, path = fsspec.core.url_to_fs(url)
     if not store.exists(path):
@@ -151,10 +166,10 @@ def _remote(url: str) -> list[Source]:
     files = [path] if store.isfile(path) else sorted(p for p in store.find(path) if p.endswith(SUFFIXES))
     if not files:
         raise SweepError(f"{url} holds no recording (no file that ends in {', '.join(SUFFIXES)}, at any depth)")
-    return [
-        Source(file.removeprefix(path).lstrip("/") or Path(file).name, store.unstrip_protocol(file), store.ukey(file))
-        for file in files
-    ]
+    for file in files:
+        name = file.removeprefix(path).lstrip("/") or Path(file).name
+        mark = {key: str(value) for key, value in store.info(file).items()}  # sizes, times, entity tags
+        yield Source(visible(name), store.unstrip_protocol(file), _digest((store.ukey(file), mark)))
 
 
 def tasks_of(
@@ -163,77 +178,82 @@ def tasks_of(
     graphs: Mapping[Choice, Graph | None],
     graph: str | None,
     words: Sequence[str],
+    folders: Sequence[Path],
     digests: Digests,
 ) -> list[Task]:
     """Returns a task for every recording and choice of settings.
 
     - `graphs`: the graph of each choice as it was loaded; None where each recording's own is taken.
     - `graph`: its file.
-    - `words`: further words of the command.
+    - `words`: further words of the command. `folders`: those in which it finds modules.
     """
-    code, made = Code(digests), []
+    code, made = Code(digests, folders), []
     verb = "verify" if what == "verify" else "replay"
     where = {"verify": ("--jobs", "1")}.get(verb, ("--one-process",))
     given = () if graph is None else ("--graph", graph)
     for settings, loaded in graphs.items():
         chosen = tuple(word for name, value in settings for word in ("--set", f"{name}={value}"))
+        line = (verb, None, *given, *chosen, *where, *words, "--json", "--quiet")
+        same = None if loaded is None else code.of(loaded)
         for source in sources:
-            line = (verb, None, *given, *chosen, *where, *words, "--json", "--quiet")
-            graph_digest = code.of(loaded) if loaded is not None else code.of_recorded(source)
+            graph_digest = code.of_recorded(source) if same is None else same
             made.append(Task(source, what, settings, line, _digest((source.digest, graph_digest, what, line[2:]))))
     return made
 
 
 class Code:
-    """Digests of what makes a graph's results: its nodes, their operators' code, files they are given, packages."""
+    """Digests of what makes a graph's results: its nodes, their operators' code, files they are given, packages.
 
-    def __init__(self, digests: Digests) -> None:
+    `folders`: in which modules are sought besides; all the code in them counts.
+    """
+
+    def __init__(self, digests: Digests, folders: Sequence[Path]) -> None:
         self._digests = digests
         self._packages: dict[str, str] = {}
-        self._graphs: dict[int, str] = {}
         facts = machine_facts()
-        self._base = [self._package("dataflow"), facts["packages"], facts["machine"]["python"]]
+        given = [self._code(sorted(folder.rglob("*.py"))) for folder in folders]
+        self._base = [self._package("dataflow"), facts["packages"], facts["machine"]["python"], given]
 
     def of(self, graph: Graph) -> str:
         """Raises `OSError` for a file that cannot be read."""
-        if id(graph) not in self._graphs:
-            described = graph.to_json()
-            parts = [described[part] for part in ("nodes", "streams", "seed", "threads", "namespace")]
-            used = sorted({node.use.partition(":")[0].partition(".")[0] for node in graph.nodes.values()})
-            files = sorted(set(_files_named([node.params for node in graph.nodes.values()])))
-            code = [self._package(name) for name in used]
-            self._graphs[id(graph)] = _digest((self._base, parts, code, [self._digests.of(file) for file in files]))
-        return self._graphs[id(graph)]
+        described = graph.to_json()
+        parts = [described[part] for part in ("nodes", "streams", "seed", "threads", "namespace")]
+        used = sorted({node.use.partition(":")[0].partition(".")[0] for node in graph.nodes.values()})
+        files = sorted(set(_files_named([node.params for node in graph.nodes.values()])))
+        code = [self._package(name) for name in used]
+        return _digest((self._base, parts, code, [self._digests.of(file) for file in files]))
 
     def of_recorded(self, source: Source) -> str:
         """Returns the digest for the graph inside a recording. A URL is not opened: all shipped operators count."""
         if "://" in source.where:
             return _digest((self._base, self._package("operators")))
         with Recording(Path(source.where)) as opened:
-            graph = recorded_graph(opened)
-        described = sorted({node.use.partition(":")[0].partition(".")[0] for node in graph.nodes.values()})
-        return _digest((self._base, [self._package(name) for name in described]))
+            return self.of(recorded_graph(opened))
 
     def _package(self, name: str) -> str:
         if name not in self._packages:
             found = find_spec(name)
             places = [] if found is None else [Path(p) for p in found.submodule_search_locations or ()]
-            alone = [] if found is None or places or found.origin is None else [Path(found.origin)]
             inside = sorted(file for place in places for file in place.rglob("*") if file.is_file())
-            files = alone + [file for file in inside if file.parent.name != "__pycache__"]
-            self._packages[name] = _digest(self._digests.of(file) for file in files)
+            if found is not None and not places and found.origin is not None:  # a file: it may import those beside it
+                inside = sorted(Path(found.origin).parent.glob("*.py"))
+            self._packages[name] = self._code(inside)
         return self._packages[name]
+
+    def _code(self, files: Sequence[Path]) -> str:
+        return _digest([f.name, self._digests.of(f)] for f in files if f.parent.name != "__pycache__")
 
 
 def _files_named(value: Any) -> Iterator[Path]:
     """Yields the files that strings anywhere in a value name."""
     if isinstance(value, str):
         try:
-            named = bool(value) and Path(value).is_file()
-        except (OSError, ValueError):  # too long, or with a zero: no file's name
+            file = Path(value).expanduser()
+            named = bool(value) and file.is_file()
+        except (OSError, ValueError, RuntimeError):  # too long, with a zero, of an unknown user: no file's name
             named = False
         if named:
-            yield Path(value)
+            yield file
     elif isinstance(value, Mapping):
         for part in value.values():
             yield from _files_named(part)

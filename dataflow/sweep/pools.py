@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from threading import Event
@@ -35,7 +35,9 @@ def local(tasks: Sequence[Task], jobs: int, timeout: float) -> Generator[tuple[T
         pool.shutdown(cancel_futures=True)
 
 
-def on_ray(tasks: Sequence[Task], address: str, jobs: int, timeout: float) -> Generator[tuple[Task, Result]]:
+def on_ray(
+    tasks: Sequence[Task], address: str, jobs: int, timeout: float, variables: Mapping[str, str]
+) -> Generator[tuple[Task, Result]]:
     """Yields tasks with their results as they end on a Ray cluster; "local" begins one of `jobs` processors here.
 
     Recordings must be where every machine of the cluster finds them: a shared folder, or a URL. Raises `SweepError`.
@@ -49,7 +51,7 @@ def on_ray(tasks: Sequence[Task], address: str, jobs: int, timeout: float) -> Ge
             address=address,
             log_to_driver=False,
             logging_level="ERROR",
-            runtime_env={"env_vars": {"PYTHONPATH": import_path()}},
+            runtime_env={"env_vars": {**variables, "PYTHONPATH": import_path()}},
             **where,
         )
     except Exception as error:  # Ray raises it bare where a node does not start

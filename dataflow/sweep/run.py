@@ -22,8 +22,9 @@ class Sweep:
 
     - `recordings`: files, folders, URLs.
     - `graph`: a graph file; None: of each recording the one that made it.
-    - `choices`: of settings, each as (name, value) pairs; `words`: further words of the command that runs a recording.
-    - `folder`: where results are kept. `again`: also run what has one.
+    - `choices`: of settings, each as (name, value) pairs. `maps`: of bags, topics to streams.
+    - `folders`: in which operators' modules are sought besides.
+    - `folder`: where results are kept, the table under `name`. `again`: also run what has one.
     - `jobs`: recordings at a time; 0: one for each core. `timeout`: seconds for one.
     - `ray`: address of a Ray cluster; "local" begins one.
 
@@ -34,12 +35,14 @@ class Sweep:
     what: What = "replay"
     graph: Path | None = None
     choices: Sequence[Choice] = ((),)
-    words: Sequence[str] = ()
+    maps: Sequence[str] = ()
+    folders: Sequence[Path] = ()
     folder: Path = Path("out/sweep")
     jobs: int = 0
     ray: str | None = None
     timeout: float = 3600.0
     again: bool = False
+    name: str = "sweep"
     graphs: dict[Choice, Graph | None] = field(init=False)
     tasks: list[Task] = field(init=False)
     left: list[Task] = field(init=False)
@@ -58,15 +61,17 @@ class Sweep:
         digests = Digests(self.folder / "digests.json")
         sources = sources_in(self.recordings, digests)
         named = None if self.graph is None else str(self.graph.resolve())
-        self.tasks = tasks_of(self.what, sources, self.graphs, named, self.words, digests)
+        folders = [folder.resolve() for folder in self.folders]
+        words = [word for value in self.maps for word in ("--map", value)]
+        words += [word for value in folders for word in ("--path", str(value))]
+        self.tasks = tasks_of(self.what, sources, self.graphs, named, words, folders, digests)
         digests.save()
-        kept = {} if self.again else {task.key: self.store.of(task.key) for task in self.tasks}
-        self.left = [task for task in self.tasks if (result := kept.get(task.key)) is None or not result.final]
+        self.left = [task for task in self.tasks if self.again or not self.store.has(task.key)]
 
     @property
     def table(self) -> Path:
         """The Parquet file."""
-        return self.folder / "sweep.parquet"
+        return self.folder / f"{self.name}.parquet"
 
     def run(self) -> Iterator[tuple[Task, Result]]:
         """Yields what is left to do, with its result once that is kept. Writes the table however it ends."""
@@ -74,7 +79,7 @@ class Sweep:
         where = (
             local(self.left, cores, self.timeout)
             if self.ray is None
-            else on_ray(self.left, self.ray, cores, self.timeout)
+            else on_ray(self.left, self.ray, cores, self.timeout, self._asked())
         )
         try:
             with closing(where) as working:
@@ -83,6 +88,12 @@ class Sweep:
                     yield task, result
         finally:
             write_table(self.table, self.tasks, self.store)
+
+    def _asked(self) -> dict[str, str]:
+        """Returns the variables of this process that the graphs ask for."""
+        loaded = [graph for graph in self.graphs.values() if graph is not None]
+        named = (graph.sources_bundle.environment.items() for graph in loaded)
+        return {name: value for pairs in named for name, value in pairs if value is not None}
 
     def summary(self) -> list[dict[str, Any]]:
         """Returns what came of each choice of settings (`dataflow.sweep.table.summed_up`)."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ class Store:
         else:
             self.log(result.key).unlink(missing_ok=True)
         file = self._file(result.key)
-        part = file.with_suffix(".part")
+        part = file.with_suffix(f".{os.getpid()}.part")
         part.write_text(json.dumps(asdict(result)), encoding="utf-8")
         part.replace(file)
 
@@ -45,6 +46,11 @@ class Store:
             return Result(**{**value, "rows": tuple(value["rows"])})
         except (OSError, ValueError, TypeError, KeyError):  # none yet, or of another version: the task is done again
             return None
+
+    def has(self, key: str) -> bool:
+        """Returns whether there is a result that another try would not change."""
+        result = self.of(key)
+        return result is not None and result.final
 
     def log(self, key: str) -> Path:
         """Returns the file of a failed task's output."""
@@ -81,7 +87,7 @@ def write_table(file: Path, tasks: Sequence[Task], store: Store) -> int:
     import pyarrow.parquet as parquet
 
     text, whole, real = pa.string(), pa.int64(), pa.float64()
-    settings = {f"set {name}": text for task in tasks[:1] for name, _ in task.settings}
+    settings = {f"set {name}": text for choice in dict.fromkeys(task.settings for task in tasks) for name, _ in choice}
     columns = {
         "recording": text,
         **settings,
@@ -93,7 +99,7 @@ def write_table(file: Path, tasks: Sequence[Task], store: Store) -> int:
         "log": text,
     }
     schema = pa.schema(list(columns.items()))
-    part, written, held = file.with_suffix(".part"), 0, list[dict[str, Any]]()
+    part, written, held = file.with_suffix(f".{os.getpid()}.part"), 0, list[dict[str, Any]]()
     with parquet.ParquetWriter(part, schema, compression="zstd") as writer:
         for task in tasks:
             if (result := store.of(task.key)) is not None:
@@ -130,11 +136,16 @@ def summed_up(tasks: Iterable[Task], store: Store) -> list[dict[str, Any]]:
                 _count(here["verdicts"], verdict)
                 if verdict in ("culprit", "changed"):
                     _count(here["culprits"], row["operator"])
-            for name, value in row.get("figures", {}).items():
+            for name, value in finite(row):
                 figures.setdefault(task.settings, {}).setdefault(f"{row['operator']}: {name}", _Moments()).add(value)
     for settings, summary in found.items():
         summary["figures"] = {name: moments.as_json() for name, moments in figures.get(settings, {}).items()}
     return list(found.values())
+
+
+def finite(row: Mapping[str, Any]) -> list[tuple[str, float]]:
+    """Returns the figures of a row that are numbers one can take a mean of."""
+    return [(name, value) for name, value in row.get("figures", {}).items() if math.isfinite(value)]
 
 
 @dataclass(slots=True)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import ctypes
 import json
+import math
 import os
+import select
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +29,11 @@ TRIES = 2
 """Times that a task is begun whose process was killed from outside."""
 LOG_BYTES = 1 << 16
 """Bytes kept of the end of a failed task's output."""
+PRINTED, LOG = "printed.json", "log.txt"
+FETCH = "import fsspec, sys; store, path = fsspec.core.url_to_fs(sys.argv[1]); store.get_file(path, sys.argv[2])"
+"""A program that fetches a file; fsspec is of the extra `ray`."""
+WORKER_KILLED = f"was killed by {signal.SIGKILL.name}"
+"""Of a worker of `dataflow verify`, as that reports it: for want of memory, as a rule."""
 STEP = 0.2
 """Seconds between two looks at whether to stop."""
 _PR_SET_PDEATHSIG = 1
@@ -69,51 +76,51 @@ def perform(task: Task, timeout: float, stop: Event | None = None) -> Result:
 
 def _once(task: Task, timeout: float, stop: Event | None) -> Result:
     began = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="dataflow_sweep_") as folder:
-        try:
-            recording = _here(task.source.where, Path(folder))
-        except Exception as unread:  # whatever a store raises, the other recordings go on
-            text = f"{task.source.where}: {type(unread).__name__}: {unread}"
-            return Result(task.key, "not fetched", -1, text, ({},), time.monotonic() - began, text)
+    with tempfile.TemporaryDirectory(prefix="dataflow_sweep_") as name:
+        folder = Path(name)
+        recording, fetched = _here(task.source.where, folder)
         words = [recording if word is None else word for word in task.words]
-        printed, log = Path(folder) / "printed.json", Path(folder) / "log.txt"
-        code = _run([sys.executable, "-m", "dataflow.cli.start", *words], printed, log, timeout, stop)
-        said = log.read_bytes()[-LOG_BYTES:].decode(errors="replace")
-        report = _read(printed)
-    wall = time.monotonic() - began
+        command = [sys.executable, "-m", "dataflow.cli.start", *words]
+        code = _run(fetched, folder, timeout, stop) if fetched else 0
+        if got := code == 0:
+            code = _run(command, folder, timeout - (time.monotonic() - began), stop)
+        said = (folder / LOG).read_bytes()[-LOG_BYTES:].decode(errors="replace")
+        report = _read(folder / PRINTED)
+    outcome: Outcome = (
+        "done" if report is not None and (code == 0 or (task.what == "verify" and code == 1)) else "failed"
+    )
+    last = next((line for line in reversed(said.splitlines()) if line.strip()), f"exit code {code}")
     if code is None:
-        error = f"not over within {timeout:g} s"
-        return Result(task.key, "timed out", -1, error, ({},), wall, f"{said}\n{error}".strip())
-    if code < 0:
-        error = f"killed by {signal.Signals(-code).name}"
-        return Result(task.key, "killed", code, error, ({},), wall, f"{said}\n{error}".strip())
-    done = report is not None and (code == 0 or (task.what == "verify" and code == 1))
+        outcome, last = "timed out", f"not over within {timeout:g} s"
+    elif code < 0:
+        outcome, last = "killed", f"killed by {signal.Signals(-code).name}"
+    elif not got:
+        outcome = "not fetched"
+    elif outcome == "failed" and WORKER_KILLED in said:
+        outcome = "killed"
     rows = () if report is None else verified(report) if task.what == "verify" else replayed(report)
     if task.what == "evaluate":
         rows = tuple(row for row in rows if row["figures"])
-    error = "" if done else next((line for line in reversed(said.splitlines()) if line.strip()), f"exit code {code}")
-    return Result(task.key, "done" if done else "failed", code, error, rows or ({},), wall, "" if done else said)
+    wall, failed = time.monotonic() - began, outcome != "done"
+    log = f"{said}\n{last}".strip() if failed else ""
+    return Result(task.key, outcome, -1 if code is None else code, last if failed else "", rows or ({},), wall, log)
 
 
-def _here(where: str, folder: Path) -> str:
-    """Returns the path of a recording, fetched into `folder` if it is elsewhere."""
+def _here(where: str, folder: Path) -> tuple[str, list[str]]:
+    """Returns the path of a recording, and the command that fetches it into `folder` if it is elsewhere."""
     if "://" not in where:
-        return where
-    import fsspec  # of the extra `sweep`
-
-    store, path = fsspec.core.url_to_fs(where)
-    file = folder / Path(path).name
-    store.get_file(path, str(file))
-    return str(file)
+        return where, []
+    file = str(folder / Path(where).name)
+    return file, [sys.executable, "-c", FETCH, where, file]
 
 
-def _run(command: list[str], printed: Path, log: Path, timeout: float, stop: Event | None) -> int | None:
+def _run(command: list[str], folder: Path, timeout: float, stop: Event | None) -> int | None:
     """Returns the exit code, negative for a signal; None after `timeout`, or where it was stopped.
 
-    Nothing that it started outlives this call.
+    What it prints is in the files `PRINTED` and `LOG` of `folder`. Nothing that it started outlives this call.
     """
     environment = {**os.environ, "PYTHONPATH": import_path(), "PYTHONUNBUFFERED": "1"}
-    with printed.open("wb") as out, log.open("wb") as err:
+    with (folder / PRINTED).open("wb") as out, (folder / LOG).open("wb") as err:
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -123,16 +130,16 @@ def _run(command: list[str], printed: Path, log: Path, timeout: float, stop: Eve
             start_new_session=True,
             preexec_fn=_end_with_parent,
         )
-        deadline = time.monotonic() + timeout
-        try:
-            while (left := deadline - time.monotonic()) > 0 and not (stop is not None and stop.is_set()):
-                with suppress(subprocess.TimeoutExpired):
-                    return process.wait(min(left, STEP))
-            return None
-        finally:
-            with suppress(ProcessLookupError):  # all of them have ended
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+    handle, ended, deadline = os.pidfd_open(process.pid), False, time.monotonic() + timeout
+    try:
+        while not ended and (left := deadline - time.monotonic()) > 0 and not (stop is not None and stop.is_set()):
+            ended = bool(select.select([handle], [], [], min(left, STEP))[0])
+    finally:
+        os.close(handle)
+        with suppress(ProcessLookupError):  # all of them have ended
+            os.killpg(process.pid, signal.SIGKILL)
+        code = process.wait()  # only now: until then no other process has its number
+    return code if ended else None
 
 
 def _end_with_parent() -> None:
@@ -152,11 +159,10 @@ def replayed(report: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
     digests: dict[str, list[str]] = {}
     for stream, facts in sorted(report["streams"].items()):
         digests.setdefault(stream.rpartition("/")[0], []).append(f"{stream}={facts['digest']}")
+    namespace = _namespace(digests, report["operators"])
     rows = []
     for name, counts in report["operators"].items():
-        own = [
-            digest for node, found in digests.items() if node.endswith(f"/{name}") or node == name for digest in found
-        ]
+        own = digests.get(f"{namespace}{name}", [])
         rows.append(
             {
                 "operator": name,
@@ -171,8 +177,19 @@ def replayed(report: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
     return tuple(rows)
 
 
+def _namespace(nodes: Collection[str], operators: Collection[str]) -> str:
+    """Returns what stands before the operators' names in the names of streams: that which fits the most."""
+    found = {node.removesuffix(name) for node in nodes for name in operators if node.endswith(name)}
+    fitting = {
+        given: sum(node.startswith(given) and node[len(given) :] in operators for node in nodes) for given in found
+    }
+    return max(sorted(fitting), key=lambda given: fitting[given], default="")
+
+
 def _numbers(summary: Mapping[str, Any]) -> dict[str, float]:
-    return {name: float(v) for name, v in summary.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+    named = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+    values = {name: named.get(v, v) if isinstance(v, str) else v for name, v in summary.items()}
+    return {name: float(v) for name, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)}
 
 
 def verified(report: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:

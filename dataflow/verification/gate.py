@@ -6,6 +6,7 @@ import json
 import os
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -210,8 +211,8 @@ class Baseline:
 
 
 def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
-    """Files, and folders of the parts of a recording, as they are, of others every .mcap in them, at any depth: (path,
-    name to show).
+    """Files and folders of the parts of a recording, as they are; of other folders all of these in them, at any depth:
+    (path, name to show).
 
     Raises `ReplayError` for what is not there, and for a folder that holds no recording.
     """
@@ -221,6 +222,8 @@ def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
             found.setdefault(target, target.name)
         elif target.is_dir():
             inside = sorted(p for p in target.rglob("*.mcap") if p.is_file())
+            folders = {folder for folder in {p.parent for p in inside} if parts_in(folder)}
+            inside = sorted({p.parent if p.parent in folders else p for p in inside})
             if not inside:
                 raise ReplayError(f"folder {target} holds no recording (no .mcap file, at any depth)")
             found |= {path: path.relative_to(target).as_posix() for path in inside if path not in found}
@@ -228,8 +231,8 @@ def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
             found.setdefault(target, target.name)
         else:
             raise ReplayError(f"no file or folder {target}")
-    names = list(found.values())
-    return [(path, name if names.count(name) == 1 else str(path)) for path, name in found.items()]
+    names = Counter(found.values())
+    return [(path, name if names[name] == 1 else str(path)) for path, name in found.items()]
 
 
 def check(

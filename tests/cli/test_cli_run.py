@@ -52,6 +52,32 @@ def test_a_replay_makes_the_same_digests_and_diff_agrees(dataflow, recorded, tmp
     assert "the same: 5 streams, bit for bit" in dataflow("diff", path, again).stdout
 
 
+ACTING = """\
+graph: acting
+namespace: test
+operators:
+  left: {use: "runtime_operators:Counter", params: {count: 30}}
+  smooth: {use: "runtime_operators:Smooth", inputs: {x: left/fast}}
+  act: {use: "runtime_operators:Act", inputs: {x: smooth/mean}, params: {seen: "%s"}}
+"""
+
+
+@pytest.mark.parametrize("placement", ["--one-process", "--process-each"])
+def test_a_replay_that_leaves_out_an_external_sink_is_recorded_and_verified(
+    dataflow, tmp_path: Path, placement: str
+) -> None:
+    graph, path, again = (tmp_path / name for name in ("acting.yaml", "run.mcap", "again.mcap"))
+    graph.write_text(ACTING % (tmp_path / "acted"))
+    dataflow("run", graph, "--record", path, "--one-process", "-q")
+    (tmp_path / "acted").unlink()
+
+    dataflow("replay", path, "--record", again, placement, "-q")
+
+    assert not (tmp_path / "acted").exists()
+    assert "the same" in dataflow("diff", path, again).stdout
+    dataflow("verify", again, "-q")
+
+
 def test_a_replay_of_a_part_takes_only_that_part(dataflow, recorded) -> None:
     path, _ = recorded
 

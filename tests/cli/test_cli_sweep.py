@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +13,9 @@ from typing import Any
 import pyarrow.parquet as parquet
 import pytest
 
+from dataflow.sweep.plan import Digests, sources_in
 from dataflow.sweep.table import TIMES
+from dataflow.sweep.work import replayed
 
 MODULE = """
 import os
@@ -66,6 +70,20 @@ operators:
   numbers: {use: "swept_operators:Numbers"}
   scaled: {use: "swept_operators:Scaled", inputs: {x: numbers/out}}
 """
+OWN = """
+from pathlib import Path
+
+from beside import BY
+from swept_operators import Scaled
+
+
+class Own(Scaled):
+    file: str = Param("", doc="factor")
+
+    def setup(self):
+        super().setup()
+        self.by = float(self.use_file(self.file).read_text()) * BY
+""".replace("from beside", "from dataflow.operator import Param\nfrom beside")
 Sweep = Callable[..., dict[str, Any]]
 
 
@@ -135,6 +153,58 @@ def test_a_second_sweep_runs_nothing_until_something_is_changed(sweep: Sweep, fo
     assert without_times(rows(tmp_path)) == without_times(first)
 
 
+def test_a_verdict_is_of_the_code_and_the_files_that_it_was_made_with(
+    dataflow, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "beside.py").write_text("BY = 2\n")
+    (tmp_path / "own_scaled.py").write_text(OWN)
+    (tmp_path / "weights.txt").write_text("2")
+    (tmp_path / "own.yaml").write_text(
+        GRAPH.replace("swept_operators:Scaled", "own_scaled:Own").replace(
+            "numbers/out}", "numbers/out}, params: {file: ~/weights.txt}"
+        )
+    )
+    run = tmp_path / "own.mcap"
+    dataflow("run", tmp_path / "own.yaml", "--record", run, "--path", folder, "--one-process", "-q")
+
+    def verified(code: int) -> tuple[int, dict[str, int]]:
+        given = ("--recordings", run, "--path", folder, "--out", tmp_path / "out", "--what", "verify", "-q", "--json")
+        told = json.loads(dataflow("sweep", *given, "--path", tmp_path, code=code).stdout)
+        return told["ran"], told["settings"][0]["verdicts"]
+
+    assert verified(0) == (1, {"identical": 2})
+    assert verified(0) == (0, {"identical": 2})
+    (tmp_path / "weights.txt").write_text("5")
+    assert verified(1) == (1, {"culprit": 1, "identical": 1})
+    (tmp_path / "weights.txt").write_text("2")
+    (tmp_path / "beside.py").write_text("BY = 3\n")
+    assert verified(1) == (1, {"culprit": 1, "identical": 1})
+
+
+def test_streams_are_those_of_the_operator_that_makes_them() -> None:
+    def report(digest: str) -> dict[str, Any]:
+        counts = {"firings": 1, "emitted": 1, "dropped": 0, "cpu_ms": 1.0, "wall_ms": 1.0}
+        streams = {"ns/detector/boxes": {"digest": "a"}, "ns/front/detector/boxes": {"digest": digest}}
+        operators = {"detector": counts, "front/detector": counts}
+        return {"operators": operators, "streams": streams, "restarts": {}, "summaries": {"detector": {"error": "NaN"}}}
+
+    one, other = replayed(report("b")), replayed(report("c"))
+    assert one[0]["digest"] == other[0]["digest"]
+    assert one[1]["digest"] != other[1]["digest"]
+    assert math.isnan(one[0]["figures"]["error"])
+
+
+def test_each_recording_counts_once_whatever_its_name_and_its_parts(folder: Path, tmp_path: Path) -> None:
+    run = folder / "runs" / "first.mcap"
+    (tmp_path / "parted").mkdir()
+    for name in ("parted/drive_000.mcap", "parted/drive_001.mcap", "alone.mcap"):
+        shutil.copy(run, tmp_path / name)
+    shutil.copy(run, os.fsencode(tmp_path) + b"/caf\xe9.mcap")
+    found = sources_in([str(tmp_path), str(tmp_path / "." / "alone.mcap")], Digests(tmp_path / "digests.json"))
+    assert sorted(source.name for source in found) == ["alone.mcap", "caf\\udce9.mcap", "parted"]
+
+
 def test_a_failure_is_kept_with_what_it_printed_and_the_others_go_on(sweep: Sweep, tmp_path: Path) -> None:
     told = sweep("--set", "scaled.fail_at=5,1e9", code=1)
 
@@ -167,6 +237,15 @@ def test_what_takes_too_long_is_ended_and_tried_again_by_the_next_sweep(sweep: S
 
     marker.unlink()
     assert sweep(*words)["settings"][0]["outcomes"] == {"done": 2}
+
+
+@pytest.mark.long
+def test_a_killed_worker_of_a_verification_is_begun_once_more(sweep: Sweep, tmp_path: Path) -> None:
+    marker = tmp_path / "kill"
+    marker.write_text("")
+    told = sweep("--what", "verify", "--set", f"scaled.kill={marker}", "--jobs", "1")
+    assert not marker.exists()
+    assert told["settings"][0]["outcomes"] == {"done": 2}
 
 
 @pytest.mark.long

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import struct
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,6 +19,8 @@ from dataflow.interop.ros.outward import OUTWARD
 from dataflow.messages import (
     CameraInfo,
     CompressedDepth,
+    Detections2D,
+    Diagnostics,
     Measurement,
     Message,
     MessageError,
@@ -197,6 +200,24 @@ def test_the_time_of_a_clock_is_read_in_both_byte_orders() -> None:
     assert clock_time(bytes.fromhex("0000000000000005" + "00000007")) == 5 * 10**9 + 7
     with pytest.raises(RecordingError, match="too short"):
         clock_time(b"\0\1\0\0")
+
+
+def test_numbers_that_overflow_are_refused_as_unreadable() -> None:
+    status = Diagnostics(
+        stamp=1, names=("abc",), messages=("",), keys=(), values=(), levels=np.array([1], np.uint8), owners=None
+    )
+    boxes = np.array([[0, 0, 61.5, 10]], np.float32)
+    found = Detections2D(
+        stamp=1, frame="c", width=64, height=64, class_names=("a",), boxes=boxes, scores=[1.0], class_ids=[0]
+    )
+    for message, there, hostile in (
+        (status, b"\1\0\0\0\4\0\0\0abc\0", b"\xff\0\0\0\4\0\0\0abc\0"),
+        (found, struct.pack("<d", 61.5), struct.pack("<d", np.inf)),
+    ):
+        kind, _, data = written(message, "", "jazzy")
+        assert data.count(there) == 1
+        with pytest.raises(RecordingError, match=f"a {kind} whose fields contradict each other"):
+            reader_for("/hostile", kind, "jazzy").read(data.replace(there, hostile), 0, 1)
 
 
 def test_types_without_a_counterpart_are_refused_by_typed_sources() -> None:

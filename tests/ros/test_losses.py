@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dataflow.ros import losses as module
 from dataflow.ros.losses import Losses
 from dataflow.ros.wire import Attachment
 
@@ -35,6 +37,33 @@ def test_a_publisher_that_begins_anew_under_its_old_gid_has_lost_nothing() -> No
     losses = Losses()
     losses.take(sent(50))
     assert [losses.take(sent(n, start=10**9)) for n in (1, 2, 4)] == [0, 0, 1]
+    assert losses.lost == 1
+
+
+def test_a_clock_that_is_set_back_or_stands_still_changes_no_count() -> None:
+    losses = Losses()
+    for number in range(1, 101):
+        losses.take(sent(number, start=10**9))
+    for number in range(101, 201):
+        losses.take(sent(number))
+    assert losses.take(Attachment(201, sent(200).time, GID)) == 0
+    assert losses.take(Attachment(204, sent(200).time, GID)) == 2
+    assert (losses.lost, losses.publishers[GID].received) == (2, 202)
+
+
+def test_publishers_are_forgotten_when_there_are_too_many_and_their_losses_stay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "MOST_KNOWN", 3)
+    losses = Losses()
+    for number in (1, 3):
+        losses.take(sent(number))
+    for other in range(5):
+        losses.take(sent(1, bytes([other]) * 16))
+        losses.take(sent(2 + other, OTHER))
+    assert len(losses.publishers) == 3
+    assert OTHER in losses.publishers
+    assert GID not in losses.publishers
     assert losses.lost == 1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataflow.interop.clocks import BACK
 from dataflow.messages import Message, Number, Transforms
 from dataflow.ros.reorder import Reorder
 
@@ -68,3 +69,37 @@ def test_a_clock_that_is_set_back_is_followed() -> None:
     order.put(number(5), B, 0.0)  # and was started anew
     assert stamps(order, 0.0) == [5]
     assert order.late == 0
+
+
+def test_a_stamp_of_a_wrong_clock_silences_the_others_for_ten_messages() -> None:
+    order = Reorder(0.0)
+    came = []
+    second = 10**9
+    for stamp, who in [(second, A), (2**31 * second, B), *((second * n, A) for n in range(2, 20))]:
+        order.put(number(stamp), who, 0.0)
+        came += stamps(order, 0.0)
+    assert came == [second, 2**31 * second, *(second * n for n in range(11, 20))]
+    assert order.late == 9
+    assert order.behind > BACK
+
+
+def test_late_ones_that_are_near_show_no_wrong_clock() -> None:
+    order = Reorder(0.0)
+    second = 10**9
+    order.put(number(100 * second), B, 0.0)
+    assert stamps(order, 0.0) == [100 * second]
+    for stamp in range(95 * second, 97 * second, second // 10):
+        order.put(number(stamp), A, 0.0)
+    assert (order.late, stamps(order, 0.0)) == (20, [])
+
+
+def test_a_second_message_of_a_stamp_is_repeated_and_not_late() -> None:
+    order = Reorder(0.0)
+    for who in (A, B):
+        order.put(number(10), who, 0.0)
+    order.put(number(20), A, 0.0)
+    assert stamps(order, 0.0) == [10, 20]
+    order.put(number(20), B, 0.0)
+    assert (order.late, order.repeated) == (0, 2)
+    order.put(transform(20, "lidar"), B, 0.0)  # a longer wait would have joined it
+    assert (order.late, order.repeated) == (1, 2)

@@ -19,6 +19,8 @@ from dataflow.graph import GraphError, load_text
 from dataflow.messages import CameraInfo, Image, Message, Text, Twist
 from dataflow.operator import FINDING, SourceError
 from dataflow.recording import Recording
+from dataflow.ros import source as source_module
+from dataflow.ros.node import Ros2Node
 from dataflow.ros.sink import Ros2Sink
 from dataflow.supervision.core.report import RunReport
 from dataflow.supervision.plan import LogPlan, RunPlan, process_plans
@@ -219,10 +221,17 @@ def test_messages_without_a_header_are_stamped_by_the_clock_of_ros(endpoint: str
         until(lambda: read.source.summary().get("before_clock") == 1)
         for second in (7, 8):
             clock.send(ros("rosgraph_msgs/msg/Clock", clock=ros("builtin_interfaces/msg/Time", sec=second, nanosec=1)))
-            until(lambda second=second: read.source._clock == second * 10**9 + 1)
-            talker.send(string("after"))
-        until(lambda: len(read.steps) == 2)
-    assert [step["message"].stamp for step in read.steps] == [7 * 10**9 + 1, 8 * 10**9 + 1]
+            until(lambda second=second: read.source._mail.clock == second * 10**9 + 1)
+            for _ in range(3):
+                talker.send(string("after"))
+            until(lambda second=second: len(read.steps) == 3 * (second - 6))
+        clock.send(b"\0\1")
+        until(lambda: read.source.summary().get("unreadable") == 1)
+    assert [step["message"].stamp for step in read.steps] == [
+        second * 10**9 + k for second in (7, 8) for k in (1, 2, 3)
+    ]
+    assert read.source.summary()["late"] == 0
+    assert str(read.source.summary()[FINDING]).startswith("/clock: a rosgraph_msgs/msg/Clock of 2 bytes is too short")
 
 
 def test_a_message_that_cannot_be_read_is_counted_with_its_reason(endpoint: str, peer: Peer) -> None:
@@ -231,6 +240,31 @@ def test_a_message_that_cannot_be_read_is_counted_with_its_reason(endpoint: str,
         talker.send(b"\0\1\0\0\1")
         until(lambda: read.source.summary().get("unreadable") == 1)
     assert "sensor_msgs/msg/Imu" in str(read.source.summary()[FINDING])
+
+
+def test_the_number_of_losses_comes_again_since_a_step_may_be_refused(endpoint: str, peer: Peer) -> None:
+    talker = peer.publisher("/chatter", "std_msgs/msg/String", STRING)
+    with Read("Text", peer, topic="/chatter", type="std_msgs/msg/String") as read:
+        talker.send(string("0"))
+        talker.number += 3
+        for text in range(1, 50):
+            talker.send(string(str(text)))
+        until(lambda: len(read.steps) == 50)
+    assert [(step["message"].text, step["lost"].value) for step in read.steps if "lost" in step] == [
+        ("1", 3),
+        ("21", 3),
+        ("41", 3),
+    ]
+
+
+def test_definitions_are_read_before_messages_come(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[tuple[str, str]] = []
+    monkeypatch.setattr(source_module, "distros_of", lambda *of: read.append(of))
+    monkeypatch.setattr(Ros2Node, "subscribe", lambda *_: read.append(("", "subscribed")))
+    source = topics.Text(topic="/chatter", type="std_msgs/msg/String", router=endpoint)
+    source.setup()
+    source.close()
+    assert read == [("std_msgs/msg/String", STRING), ("", "subscribed")]
 
 
 def test_errors_name_what_is_missing(endpoint: str, peer: Peer) -> None:

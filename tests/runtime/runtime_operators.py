@@ -176,6 +176,12 @@ class Sum(Operator):
         return {"count": self.count, "total": self.total}
 
 
+class Act(Sum):
+    """A sink that acts on the world."""
+
+    external = True
+
+
 class Broken(Operator):
     """Fails at one message, in one of several ways."""
 

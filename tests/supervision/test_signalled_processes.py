@@ -20,6 +20,7 @@ PACKAGE = Path(dataflow.__file__).parent
 BY_NUMBER = {"kill", "killpg"}
 NOT_WAITED_FOR_YET = {
     "supervision/nursery.py": 1,
+    "sweep/work.py": 1,
     "supervision/nursery_process.py": 3,
     "verification/workers/prestart.py": 1,
     "verification/workers/worker.py": 1,

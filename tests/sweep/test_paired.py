@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.stats import binom, mannwhitneyu, wilcoxon
@@ -62,3 +65,21 @@ def test_the_worst_recordings_for_b_come_first() -> None:
 def test_figures_that_are_equal_do_not_differ() -> None:
     (one,) = compared({"x: n": {"a": (1.0, 1.0), "b": (2.0, 2.0)}})
     assert (one.p, one.difference, one.low, one.high, one.differs) == (1.0, 0.0, 0.0, 0.0, False)
+
+
+def test_recordings_without_a_number_are_left_out_and_named() -> None:
+    pairs = worlds(np.random.default_rng(5), 1.0)
+    broken = {**pairs, "nan": (1.0, math.nan), "inf": (math.inf, 1.0)}
+    one, other = compared({"x: recall": broken, "x: iou": pairs})
+    assert {one.p, other.p} == {compared({"x: recall": pairs})[0].p}
+    assert {one.left_out, other.left_out} == {("nan", "inf"), ()}
+    assert compared({"x: recall": {"a": (1.0, math.nan)}}) == []
+
+
+def test_many_recordings_take_memory_for_a_few() -> None:
+    pairs = {f"w{k}": (0.0, float(k % 3)) for k in range(20_000)}
+    tracemalloc.start()
+    compared({"x: n": pairs})
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6  # 10,000 draws of all of them at once are 1.6 GB

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.sweep import Again, Folder, Jobs, Maps, Patience, Ray, Recordings, passed_on, work
+from dataflow.cli.commands.sweep import Again, Folder, Jobs, Maps, Patience, Ray, Recordings, work
 from dataflow.cli.support.arguments import Json, ModuleFolders, find_modules_in, graph_file
 from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
 from dataflow.cli.support.report import SCORES
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 MOST_NAMED = 5
 """Recordings listed."""
+LEAST = 6
+"""Pairs that Wilcoxon's test needs for a p below 5 %."""
 
 
 def compare(
@@ -74,9 +76,8 @@ def compare(
 
         try:
             file = graph_file(graph)
-            plan = Sweep(
-                recordings or (), "replay", file, choices, passed_on(maps, path), folder, jobs or 0, ray, timeout, again
-            )
+            given = (choices, maps or (), path or ())
+            plan = Sweep(recordings or (), "replay", file, *given, folder, jobs or 0, ray, timeout, again, "compare")
             work(plan, quiet=quiet)
         except SweepError as error:
             raise fail(str(error)) from None
@@ -142,9 +143,15 @@ def _print(figures: Sequence[Paired], different: Sequence[Difference], *, verbos
     out.print(made)
     real = [one for one in shown if one.differs]
     out.print(f"{len(real)} of {len(shown)} figures differ at 5 %" if shown else "no figures to compare")
+    if shown and len(shown[0].recordings) < LEAST:
+        out.print(f"p stays above 5 % with fewer than {LEAST} recordings", soft_wrap=True)
     for one in (real or shown)[:1]:
         worst = ", ".join(f"{name} {value:+.3g}" for name, value in one.recordings[:MOST_NAMED])
-        out.print(Text(f"{one.figure}, worst for B: {worst}"), soft_wrap=True)
+        out.print(Text(f"{one.figure}, {'worst for B' if one.directed else 'the most'}: {worst}"), soft_wrap=True)
+    for one in shown:
+        if one.left_out:
+            names = ", ".join(one.left_out[:MOST_NAMED])
+            out.print(Text(f"{one.figure}: left out, without a number: {len(one.left_out)} ({names})", style="yellow"))
     if different:
         listed = ", ".join(
             f"{d.operator} in {d.recordings}" + (f" (first in {d.first})" if d.first else "") for d in different

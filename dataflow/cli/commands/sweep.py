@@ -129,8 +129,8 @@ def sweep(
 
         try:
             file = None if graph is None else graph_file(graph)
-            choices, words = grid(settings or ()), passed_on(maps, path)
-            plan = Sweep(recordings or (), task, file, choices, words, folder, jobs or 0, ray, timeout, again)
+            given = (grid(settings or ()), maps or (), path or ())
+            plan = Sweep(recordings or (), task, file, *given, folder, jobs or 0, ray, timeout, again)
             spent = work(plan, quiet=quiet)
         except SweepError as error:
             raise fail(str(error)) from None
@@ -145,12 +145,6 @@ def _checked(what: str, jobs: int | None, maps: Sequence[str] | None) -> What:
     if maps and what == "verify":
         raise fail("--map is for bags, and these hold no firing records to verify")
     return cast("What", what)
-
-
-def passed_on(maps: Sequence[str] | None, folders: Sequence[Path] | None) -> list[str]:
-    """Returns the options that the command of each recording gets as well."""
-    words = [word for value in maps or () for word in ("--map", value)]
-    return words + [word for folder in folders or () for word in ("--path", str(folder.resolve()))]
 
 
 def work(plan: Sweep, *, quiet: bool) -> float:
