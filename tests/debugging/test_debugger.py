@@ -200,7 +200,9 @@ def test_the_way_to_a_call_does_not_depend_on_the_length_of_the_recording(
             assert further is not None
             assert further.same
             debugger.close()
-    assert costs[1] <= costs[0] + 2 * 64  # records of a batch
+    assert (
+        costs[1] < 2 * costs[0]
+    )  # all of them would be four times as many; batches end where the recorder's clock has it
 
 
 def test_edited_source_is_taken_over_and_compared_from_the_same_state(added: Recording, tmp_path: Path) -> None:
