@@ -64,7 +64,7 @@ def packages_of(module: str) -> set[str]:
 
 
 def test_every_import_is_a_declared_dependency(tool: ModuleType, imported: frozenset[tuple[str, Path]]) -> None:
-    requirements = [text for part in tool.PARTS for text in tool.declared(part)]
+    requirements = [text for part in (*tool.PARTS, *tool.UNLISTED) for text in tool.declared(part)]
     declared = {re.split(r"[^a-z0-9-]", tool.canonical(re.match(r"[\w.-]+", text)[0]))[0] for text in requirements}
     for module, file in sorted(imported):
         found = packages_of(module)

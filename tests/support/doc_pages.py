@@ -293,6 +293,7 @@ class PageRun:
 
     def _command(self, words: list[str]) -> None:
         from dataflow.graph import load_graph
+        from dataflow.sweep.plan import grid
 
         command = parsed(words)
         here = True
@@ -304,7 +305,9 @@ class PageRun:
         self.made.update(command.files(written=True))
         settings, graph = command.values.get("settings"), command.values.get("graph")
         if settings and graph and Path(str(graph)).exists():
-            load_graph(str(graph), settings=settings)
+            choices = grid(settings) if words[0] == "sweep" else [[setting.partition("=")[::2] for setting in settings]]
+            for choice in choices:
+                load_graph(str(graph), settings=[f"{name}={value}" for name, value in choice])
         if words[0] in QUICK and here and not any(file.endswith(".svg") for file in command.files(written=True)):
             _executed(words)
 

@@ -65,7 +65,7 @@ def compare(
     Examples:
 
       dataflow compare perception --recordings runs --set b:detector=yolox_nano
-      dataflow compare graphs/cloud.yaml --recordings runs --set b:cloud.stride=8 --json
+      dataflow compare cloud --recordings runs --set b:cloud.stride=8 --json
     """
     choices = _choices(settings or ())
     with friendly_errors():
