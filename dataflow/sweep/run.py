@@ -15,6 +15,8 @@ from dataflow.sweep.pools import local, on_ray
 from dataflow.sweep.table import Store, summed_up, write_table
 from dataflow.sweep.work import Result
 
+MOST_JOBS = 256
+
 
 @dataclass(slots=True)
 class Sweep:
@@ -25,7 +27,7 @@ class Sweep:
     - `choices`: of settings, each as (name, value) pairs. `maps`: of bags, topics to streams.
     - `folders`: in which operators' modules are sought besides.
     - `folder`: where results are kept, the table under `name`. `again`: also run what has one.
-    - `jobs`: recordings at a time; 0: one for each core. `timeout`: seconds for one.
+    - `jobs`: recordings at a time; None: one for each core. `timeout`: seconds for one.
     - `ray`: address of a Ray cluster; "local" begins one.
 
     Raises `SweepError`, `GraphError`, `ReplayError`, `RecordingError`, `OSError` for what cannot be begun.
@@ -38,7 +40,7 @@ class Sweep:
     maps: Sequence[str] = ()
     folders: Sequence[Path] = ()
     folder: Path = Path("out/sweep")
-    jobs: int = 0
+    jobs: int | None = None
     ray: str | None = None
     timeout: float = 3600.0
     again: bool = False
@@ -51,6 +53,8 @@ class Sweep:
     def __post_init__(self) -> None:
         if self.graph is None and any(self.choices):
             raise SweepError("--set changes a graph file: name one")
+        if self.jobs is not None and not 1 <= self.jobs <= MOST_JOBS:
+            raise SweepError(f"--jobs {self.jobs}: expected 1 to {MOST_JOBS}")
         if not self.recordings:
             raise SweepError("no recordings: name files, folders or URLs with --recordings")
         self.graphs = {

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dataflow.graph.model import Graph
-from dataflow.recording import Recording
+from dataflow.recording import Recording, RecordingError
 from dataflow.recording.streams.part_folder import parts_in
 from dataflow.records.comparison import Verification
 from dataflow.reexecution.recorded_run import ReplayError
@@ -222,7 +222,7 @@ def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
             found.setdefault(target, target.name)
         elif target.is_dir():
             inside = sorted(p for p in target.rglob("*.mcap") if p.is_file())
-            folders = {folder for folder in {p.parent for p in inside} if parts_in(folder)}
+            folders = {folder for folder in {p.parent for p in inside} if _holds_parts(folder)}
             inside = sorted({p.parent if p.parent in folders else p for p in inside})
             if not inside:
                 raise ReplayError(f"folder {target} holds no recording (no .mcap file, at any depth)")
@@ -233,6 +233,13 @@ def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
             raise ReplayError(f"no file or folder {target}")
     names = Counter(found.values())
     return [(path, name if names[name] == 1 else str(path)) for path, name in found.items()]
+
+
+def _holds_parts(folder: Path) -> bool:
+    try:
+        return bool(parts_in(folder))
+    except RecordingError:  # one is missing: opening it gives the error, and keeps no other recording from its verdict
+        return True
 
 
 def check(

@@ -201,8 +201,11 @@ def test_each_recording_counts_once_whatever_its_name_and_its_parts(folder: Path
     for name in ("parted/drive_000.mcap", "parted/drive_001.mcap", "alone.mcap"):
         shutil.copy(run, tmp_path / name)
     shutil.copy(run, os.fsencode(tmp_path) + b"/caf\xe9.mcap")
+    (tmp_path / "gap").mkdir()
+    for name in ("gap/drive_000.mcap", "gap/drive_002.mcap"):  # one is missing: an error of that recording alone
+        shutil.copy(run, tmp_path / name)
     found = sources_in([str(tmp_path), str(tmp_path / "." / "alone.mcap")], Digests(tmp_path / "digests.json"))
-    assert sorted(source.name for source in found) == ["alone.mcap", "caf\\udce9.mcap", "parted"]
+    assert sorted(source.name for source in found) == ["alone.mcap", "caf\\udce9.mcap", "gap", "parted"]
 
 
 def test_a_failure_is_kept_with_what_it_printed_and_the_others_go_on(sweep: Sweep, tmp_path: Path) -> None:

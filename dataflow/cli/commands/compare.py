@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.sweep import Again, Folder, Jobs, Maps, Patience, Ray, Recordings, work
-from dataflow.cli.support.arguments import Json, ModuleFolders, find_modules_in, graph_file
+from dataflow.cli.commands.sweep import Again, Folder, Jobs, Patience, Ray, Recordings, work
+from dataflow.cli.support.arguments import Json, Map, ModuleFolders, find_modules_in, graph_file
 from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
-from dataflow.cli.support.report import SCORES
+from dataflow.cli.support.report import is_score
 from dataflow.cli.support.run_options import Quiet, Verbose
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def compare(
             help="A graph parameter, or OPERATOR.PARAM: of A, of B, or of both. May be repeated.",
         ),
     ] = None,
-    maps: Maps = None,
+    maps: Map = None,
     path: ModuleFolders = None,
     folder: Folder = Path("out/sweep"),
     jobs: Jobs = None,
@@ -77,7 +77,7 @@ def compare(
         try:
             file = graph_file(graph)
             given = (choices, maps or (), path or ())
-            plan = Sweep(recordings or (), "replay", file, *given, folder, jobs or 0, ray, timeout, again, "compare")
+            plan = Sweep(recordings or (), "replay", file, *given, folder, jobs, ray, timeout, again, "compare")
             work(plan, quiet=quiet)
         except SweepError as error:
             raise fail(str(error)) from None
@@ -126,7 +126,7 @@ def _report(
 
 
 def _print(figures: Sequence[Paired], different: Sequence[Difference], *, verbose: bool) -> None:
-    scores = [one for one in figures if any(part in one.figure.replace(":", " ").split() for part in SCORES)]
+    scores = [one for one in figures if is_score(one.figure)]
     shown = list(figures) if verbose or not scores else scores
     columns = ("A", "B", "B - A", "95 % interval", "p", "recordings")
     made = table("figure", *columns, right=columns)

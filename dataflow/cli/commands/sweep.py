@@ -11,7 +11,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from dataflow.cli.support.arguments import FLAG, Json, ModuleFolders, find_modules_in, graph_file, number
+from dataflow.cli.support.arguments import FLAG, Json, Map, ModuleFolders, find_modules_in, graph_file, number
 from dataflow.cli.support.output import (
     DIFFERENT,
     count,
@@ -25,14 +25,12 @@ from dataflow.cli.support.output import (
     seconds,
     table,
 )
-from dataflow.cli.support.report import SCORES
+from dataflow.cli.support.report import is_score
 from dataflow.cli.support.run_options import Quiet, Verbose
 
 if TYPE_CHECKING:
     from dataflow.sweep.plan import What
     from dataflow.sweep.run import Sweep
-
-MOST_JOBS = 256
 
 Graph = Annotated[
     Path | None,
@@ -53,12 +51,6 @@ Values = Annotated[
     ),
 ]
 Done = Annotated[str, typer.Option("--what", metavar="replay|verify|evaluate", help="The work on each recording.")]
-Maps = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--map", metavar="TOPIC=STREAM", help="Of bags: the topic that stands in for a stream. May be repeated."
-    ),
-]
 Folder = Annotated[
     Path, typer.Option("--out", metavar="FOLDER", help="Where the table, the results and the logs are kept.")
 ]
@@ -87,7 +79,7 @@ def sweep(
     recordings: Recordings = None,
     settings: Values = None,
     what: Done = "replay",
-    maps: Maps = None,
+    maps: Map = None,
     path: ModuleFolders = None,
     folder: Folder = Path("out/sweep"),
     jobs: Jobs = None,
@@ -121,7 +113,7 @@ def sweep(
       dataflow sweep perception --recordings runs --what evaluate --json
       dataflow sweep perception --recordings s3://bucket/runs --ray auto
     """
-    task = _checked(what, jobs, maps)
+    task = _checked(what, maps)
     with friendly_errors():
         find_modules_in(path)
         from dataflow.sweep.plan import SweepError, grid
@@ -130,18 +122,16 @@ def sweep(
         try:
             file = None if graph is None else graph_file(graph)
             given = (grid(settings or ()), maps or (), path or ())
-            plan = Sweep(recordings or (), task, file, *given, folder, jobs or 0, ray, timeout, again)
+            plan = Sweep(recordings or (), task, file, *given, folder, jobs, ray, timeout, again)
             spent = work(plan, quiet=quiet)
         except SweepError as error:
             raise fail(str(error)) from None
     _report(plan, spent, json=json, verbose=verbose)
 
 
-def _checked(what: str, jobs: int | None, maps: Sequence[str] | None) -> What:
+def _checked(what: str, maps: Sequence[str] | None) -> What:
     if what not in ("replay", "verify", "evaluate"):
         raise fail(f"--what {what!r}: expected replay, verify or evaluate")
-    if jobs is not None and not 1 <= jobs <= MOST_JOBS:
-        raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}")
     if maps and what == "verify":
         raise fail("--map is for bags, and these hold no firing records to verify")
     return cast("What", what)
@@ -193,7 +183,7 @@ def _print(summary: Sequence[Mapping[str, Any]], *, verbose: bool) -> None:
         made.add_row(Text(_named(choice) or "as the graph is"), *done, *(verdicts if verified else costs))
     out.print(made)
     names = dict.fromkeys(name for choice in summary for name in choice["figures"])
-    shown = [name for name in names if verbose or any(part in name.replace(":", " ").split() for part in SCORES)]
+    shown = [name for name in names if verbose or is_score(name)]
     if shown:
         choices = [_named(choice) or "mean" for choice in summary]
         figures = table("figure", *choices, right=tuple(choices))

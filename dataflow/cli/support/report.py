@@ -69,14 +69,17 @@ def _print_tables(console: Console, report: RunReport) -> None:
         console.print(_losses(report))
 
 
+def is_score(name: str) -> bool:
+    """Returns whether a figure, alone or after its operator ("operator: name"), measures how good something is."""
+    return any(part in name.replace(":", " ").split() for part in SCORES)
+
+
 def _scores(report: RunReport) -> Text | None:
     """The first scores of each operator that sums some up; None where none does."""
     found = []
     for operator, summary in report.summaries.items():
         numbers = {name: value for name, value in summary.items() if isinstance(value, int | float)}
-        scores = [
-            f"{name} {text}" for name, text in figures(numbers).items() if any(part in name.split() for part in SCORES)
-        ]
+        scores = [f"{name} {text}" for name, text in figures(numbers).items() if is_score(name)]
         if scores:
             found.append((operator, scores))
     most = max(1, min(MOST_SCORES, SCORES_IN_ALL // max(1, len(found))))
