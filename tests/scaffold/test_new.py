@@ -48,7 +48,7 @@ def test_a_project_passes_its_own_tests(tmp_path: Path) -> None:
         call("new", "operator", f"Another{kind}", "--kind", kind, "--to", project / "my_robot")
     call("new", "graph", "second", "--to", project / "graphs")
     assert (project / "tests" / "test_anothersource.py").is_file()
-    assert "11 passed" in run_tests(project, tmp_path)
+    assert "12 passed" in run_tests(project, tmp_path)
 
 
 def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> None:
@@ -58,7 +58,10 @@ def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> N
         *(f"my_{kind}.py" for kind in KINDS),
         *(f"test_my_{kind}.py" for kind in KINDS),
     }
-    assert "5 passed" in run_tests(tmp_path, tmp_path)
+    call("new", "operator", "Second", "--kind", "program", "--to", tmp_path)
+    assert "7 passed" in run_tests(tmp_path, tmp_path)
+    (tmp_path / "dataflow.hpp").write_text("mine")
+    assert "is there already" in call("new", "operator", "x", "--kind", "program", "--to", tmp_path, code=2).stderr
 
 
 def test_what_is_written_is_in_the_projects_own_format(tmp_path: Path) -> None:
@@ -98,7 +101,7 @@ def test_a_name_that_python_has_already_is_refused(name: str, words: str) -> Non
     with pytest.raises(NameFault, match=words):
         snake(name)
     assert words in call("new", "operator", name, code=2).stderr
-    assert "expected one of operator, timer, source" in call("new", "operator", "x", "--kind", "y", code=2).stderr
+    assert "expected one of operator, timer, source, program" in call("new", "operator", "x", "--kind", "y", code=2).stderr
 
 
 @pytest.mark.parametrize(
