@@ -21,10 +21,11 @@ from typing import Any, ClassVar
 
 from dataflow.declare import takes_every_input
 from dataflow.messages.base import Message
-from dataflow.operator import Context, Operator, OperatorDefinitionError, OutputError, Outputs, StateError
+from dataflow.operator import Context, Operator, OperatorDefinitionError, OutputError, Outputs
 from dataflow.program.child import Bytes, CallKind, Child, ProgramError
-from dataflow.transport.codec import DecodeError, decode, encode_parts
-from dataflow.transport.envelope import Envelope, Kind
+from dataflow.state import StateError
+from dataflow.transport.codec import decode, encode_parts
+from dataflow.transport.envelope import DecodeError, Envelope, Kind
 
 __all__ = ["Program", "ProgramError"]
 

@@ -67,7 +67,8 @@ class Child:
             )
         except OSError as error:
             raise ProgramError(f"{command[0]} cannot be started: {error.strerror}") from error
-        assert self._process.stdin is not None and self._process.stdout is not None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
         self._to, self._from = self._process.stdin.fileno(), self._process.stdout.fileno()
         for pipe in (self._to, self._from):
             os.set_blocking(pipe, False)

@@ -15,8 +15,9 @@ from program_operators import Faulty, Relay, faulty
 import dataflow
 from dataflow.messages import Image, Number
 from dataflow.messages.base import Message, message_types
-from dataflow.operator import Batch, Context, In, Out, OperatorDefinitionError, OutputError, StateError
+from dataflow.operator import Batch, Context, In, OperatorDefinitionError, Out, OutputError
 from dataflow.program import Program, ProgramError
+from dataflow.state import StateError
 from dataflow.testing import play
 
 HERE = Path(__file__).parent

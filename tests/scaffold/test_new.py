@@ -101,7 +101,9 @@ def test_a_name_that_python_has_already_is_refused(name: str, words: str) -> Non
     with pytest.raises(NameFault, match=words):
         snake(name)
     assert words in call("new", "operator", name, code=2).stderr
-    assert "expected one of operator, timer, source, program" in call("new", "operator", "x", "--kind", "y", code=2).stderr
+    assert (
+        "expected one of operator, timer, source, program" in call("new", "operator", "x", "--kind", "y", code=2).stderr
+    )
 
 
 @pytest.mark.parametrize(
