@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import indent
 
 import pytest
 from typer.testing import CliRunner
 
 from dataflow.cli.main import app
 from dataflow.graph import load_graph
-from dataflow.scaffold.files import KINDS, NameFault, camel, snake
+from dataflow.scaffold.files import KINDS, NameFault, camel, operator_files, snake
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -117,3 +119,13 @@ def test_a_name_that_python_has_already_is_refused(name: str, words: str) -> Non
 )
 def test_names_of_modules_and_classes(name: str, module: str, kind: str) -> None:
     assert (snake(name), camel(name)) == (module, kind)
+
+
+def test_the_page_shows_what_is_written() -> None:
+    page = (REPOSITORY / "docs" / "other-languages.md").read_text(encoding="utf-8")
+    files = operator_files("Brightness", "program")
+    shown = re.search(r"```cpp\n(.*?)```", page, re.DOTALL)
+    assert shown is not None
+    assert indent(shown[1], "    ") in files[Path("brightness.cpp")]
+    declared = files[Path("brightness.py")].split("    stateless = True\n")[1]
+    assert declared.strip() in page
