@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from source_trees import nodes_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 OURS = ("dataflow", "operators")
@@ -39,7 +40,7 @@ def imported() -> frozenset[tuple[str, Path]]:
 def imports() -> Iterator[tuple[str, Path]]:
     for package in OURS:
         for file in sorted((REPOSITORY / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            for node in nodes_of(file):
                 names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
                 names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
                 names += dynamic(node)
