@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
 LIVE = KEPT / "live.mcap"
 
@@ -39,6 +41,7 @@ def test_a_call_is_shown_with_what_was_given_made_and_changed() -> None:
     assert "  vectors" in told
 
 
+@pytest.mark.long
 def test_the_hashes_and_threads_are_those_of_a_run() -> None:
     told = debug("busy", "--do", "goto 0", "--do", "print __import__('os').environ['PYTHONHASHSEED']")
 
@@ -63,6 +66,7 @@ def test_pdb_stops_at_the_first_line_of_process() -> None:
     assert told.count("as recorded") == 2
 
 
+@pytest.mark.long
 def test_pdb_that_is_left_leaves_the_call_as_it_was() -> None:
     told = debug("smooth", lines="step\nq\nquit\n")
 
@@ -84,6 +88,7 @@ def test_what_cannot_begin_is_named() -> None:
     assert "expected the number of a call, or @SECONDS" in debug("busy@x", code=2)
 
 
+@pytest.mark.long
 def test_verify_prints_the_command_that_goes_to_the_difference(
     dataflow: Any, small: Path, recorded: tuple[Path, Any], tmp_path: Path
 ) -> None:

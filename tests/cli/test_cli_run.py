@@ -62,7 +62,7 @@ operators:
 """
 
 
-@pytest.mark.parametrize("placement", ["--one-process", "--process-each"])
+@pytest.mark.parametrize("placement", [pytest.param("--one-process", marks=pytest.mark.long), "--process-each"])
 def test_a_replay_that_leaves_out_an_external_sink_is_recorded_and_verified(
     dataflow, tmp_path: Path, placement: str
 ) -> None:
@@ -196,6 +196,7 @@ def damaged(recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("asked", ["0", "1"])
 def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_asked_for(
     damaged: Path, monkeypatch: pytest.MonkeyPatch, asked: str

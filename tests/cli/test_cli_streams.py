@@ -82,6 +82,7 @@ def test_a_closed_output_is_refused(small: Path, tmp_path: Path) -> None:
     assert not recording.exists()
 
 
+@pytest.mark.long
 def test_a_closed_error_output_does_not_keep_a_command_from_its_work(small: Path) -> None:
     told = shell('exec "$@" 2>&- <&-', "check", small)
 

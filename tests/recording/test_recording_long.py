@@ -89,6 +89,7 @@ def test_a_long_recording_reads_as_a_short_one(path: Path, step: int, monkeypatc
     assert content(path) == expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [1, 300, 2000])
 def test_so_does_one_of_many_messages_however_few_of_them_are_looked_up_together(
     path: Path, size: int, monkeypatch: pytest.MonkeyPatch

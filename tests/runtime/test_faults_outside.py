@@ -181,6 +181,7 @@ operators:
 """
 
 
+@pytest.mark.long
 def test_a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted(
     tmp_path: Path,
 ) -> None:

@@ -104,6 +104,7 @@ def test_the_terminal_is_shown_the_lines_with_levels_from_warnings_on(recorded) 
     assert not any("\x1e" in line or "{" in line for line in texts)
 
 
+@pytest.mark.long
 def test_a_replay_of_a_run_that_talks_is_the_same(recorded, tmp_path: Path) -> None:
     path, again = recorded[0], tmp_path / "again.mcap"
     replay(path, graph=graph(), record=again, placement="process_each")

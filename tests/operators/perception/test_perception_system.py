@@ -142,10 +142,15 @@ def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
 @pytest.mark.parametrize(
     ("sensors", "there", "gone"),
     [
-        (("image",), {"detections", "segmentation", "tracks"}, {"lifter", "objects", "scene", "fusion", "base"}),
+        pytest.param(
+            ("image",),
+            {"detections", "segmentation", "tracks"},
+            {"lifter", "objects", "scene", "fusion", "base"},
+            marks=pytest.mark.long,
+        ),
         (("image", "points"), {"detections", "cloud", "pose"}, {"odometry", "fusion", "wheeled"}),
         (("imu", "wheels"), set(), {"detector", "lifter", "scene", "wheeled"}),
-        (("wheels", "command"), set(), {"fusion", "scene"}),
+        pytest.param(("wheels", "command"), set(), {"fusion", "scene"}, marks=pytest.mark.long),
     ],
     ids=["camera", "camera_and_lidar", "inertial_and_wheels", "wheels_and_commands"],
 )

@@ -15,25 +15,13 @@ from dataflow.cli.main import app
 from dataflow.messages import Image
 from operators.detection.custom.folder import read_detection_data
 from operators.segmentation import Segmenter
-from operators.segmentation.dataset import read_segmentation_data
 from operators.weights import NetworkFileError, open_network, read_facts
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     pytest.importorskip("torch", reason="training needs the extra [train]")
-    from operators.learning.loop import Settings, train
-    from operators.training.pair import PairTask
     from operators.training.quantization import quantize_network
 
 SIZE = (160, 128)
-
-
-@pytest.fixture(scope="module")
-def trained(worlds: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with detector.onnx and segmenter.onnx."""
-    folder = tmp_path_factory.mktemp("networks")
-    task = PairTask(read_detection_data(worlds), read_segmentation_data(worlds), SIZE, width=0.25)
-    train(task, Settings(epochs=2, batch=4, threads=1), folder / "pair.onnx")
-    return folder
 
 
 def views(worlds: Path) -> list[NDArray[np.uint8]]:

@@ -103,7 +103,9 @@ def test_the_position_at_which_metres_are_found_counts_from_where_the_map_began(
     assert "gives the scale" in said(played)[found]
 
 
-@pytest.mark.parametrize("between", [0.0, 0.4], ids=["of an image's stamp", "between two images"])
+@pytest.mark.parametrize(
+    "between", [pytest.param(0.0, marks=pytest.mark.long), 0.4], ids=["of an image's stamp", "between two images"]
+)
 def test_a_depth_camera_of_another_place_size_and_rate_gives_the_same_metres(between: float) -> None:
     given = streams({})
     frames = [k + between for k in range(0, COUNT - 1, 6)]
@@ -150,6 +152,7 @@ def test_depth_that_shows_nothing_is_counted_and_changes_no_pose(make: Any, use:
     assert operator.summary()[f"depth {use}"] == 10
 
 
+@pytest.mark.long
 def test_a_depth_image_that_comes_again_counts_once() -> None:
     operator, once = MonoVisualOdometry(), measured(20)
     alone, again = run(streams({20: once})), run(streams(dict.fromkeys(range(20, 30), once)), operator)
@@ -183,6 +186,7 @@ def test_a_scale_that_was_wrong_is_found_anew_without_a_jump_and_the_way_so_far_
     assert spread[at - 1] < 0.2 * np.linalg.norm(estimate[at - 1])
 
 
+@pytest.mark.long
 def test_an_input_without_messages_changes_nothing() -> None:
     silent = streams({}) | {"depth": [], "depth_info": []}
     assert play(MonoVisualOdometry(), silent, static=STATIC[:2]).digests() == run(streams({})).digests()

@@ -83,7 +83,7 @@ def test_a_goal_is_known_before_it_is_reached(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_the_hand_takes_what_it_reaches_for(name: str, seed: int) -> None:
     here = world(name, seed)
     for person in choosers(here):

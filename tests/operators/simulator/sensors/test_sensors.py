@@ -475,6 +475,7 @@ def test_geodetic_coordinates_return_to_the_same_place(
     np.testing.assert_allclose([offset @ east, offset @ np.cross(up, east), offset @ up], enu, atol=1e-5)
 
 
+@pytest.mark.long
 def test_satellite_fixes_scatter_about_the_antenna() -> None:
     fixes: list[Any] = stream(robot(duration="20s", hold=30, gnss={"rate": 20, "noise": 0.5, "drift": 0}), "fix")
     north = np.array([fix.latitude for fix in fixes])

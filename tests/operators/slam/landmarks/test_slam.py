@@ -112,6 +112,7 @@ def test_pose_and_map_are_near_the_truth_and_the_covariance_is_honest() -> None:
     assert np.sqrt(np.mean(np.square(off))) < 0.12
 
 
+@pytest.mark.long
 def test_covariances_of_landmarks_cover_their_errors() -> None:
     distances = []
     for seed in range(12):
