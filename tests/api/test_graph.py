@@ -53,6 +53,7 @@ def test_what_runs_here_is_what_runs_in_processes(tmp_path: Path) -> None:
     assert here.summaries == there.summaries
 
 
+@pytest.mark.long
 def test_a_recording_made_here_replays_and_verifies_in_processes(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     run = watch().run(record=path)

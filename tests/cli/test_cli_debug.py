@@ -74,6 +74,7 @@ def test_pdb_that_is_left_leaves_the_call_as_it_was() -> None:
     assert "BdbQuit" not in told
 
 
+@pytest.mark.long
 def test_calls_are_json() -> None:
     told = debug("tally", "--do", "next", "--do", "next", "--do", "diff", "--json")
 
@@ -83,6 +84,7 @@ def test_calls_are_json() -> None:
     assert last == "122 calls: all give what was recorded"
 
 
+@pytest.mark.long
 def test_what_cannot_begin_is_named() -> None:
     assert "there are: busy, look, smooth, tally" in debug("none", code=2)
     assert "expected the number of a call, or @SECONDS" in debug("busy@x", code=2)

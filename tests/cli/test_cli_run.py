@@ -62,7 +62,8 @@ operators:
 """
 
 
-@pytest.mark.parametrize("placement", [pytest.param("--one-process", marks=pytest.mark.long), "--process-each"])
+@pytest.mark.long
+@pytest.mark.parametrize("placement", ["--one-process", "--process-each"])
 def test_a_replay_that_leaves_out_an_external_sink_is_recorded_and_verified(
     dataflow, tmp_path: Path, placement: str
 ) -> None:
@@ -78,6 +79,7 @@ def test_a_replay_that_leaves_out_an_external_sink_is_recorded_and_verified(
     dataflow("verify", again, "-q")
 
 
+@pytest.mark.long
 def test_a_replay_of_a_part_takes_only_that_part(dataflow, recorded) -> None:
     path, _ = recorded
 

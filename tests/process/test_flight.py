@@ -162,6 +162,7 @@ def test_the_ring_keeps_less_time_where_it_may_take_less_of_the_disk(
     assert not verify(Path(one["path"])).culprits
 
 
+@pytest.mark.long
 def test_no_more_is_kept_than_the_graph_allows(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     sink, _ = flown(recorded, graph, tmp_path, asks=[4.0, 12.0, 20.0, 25.0], files=2)
     facts = sink.close("complete")

@@ -51,7 +51,7 @@ def test_an_operator_that_raises_is_named_with_its_traceback(placement: str) -> 
     ("how", "words"),
     [
         ("stamp", "bad.y emitted stamp 1199999999; it must lie at or after the firing's 1200000000"),
-        ("type", "Broken returned a str; return a message, a mapping or None"),
+        pytest.param("type", "Broken returned a str; return a message, a mapping or None", marks=pytest.mark.long),
         ("mutate", "bad changed the memory of its input 'x' (FeatureVector at stamp 1200000000)"),
     ],
 )

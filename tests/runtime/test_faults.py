@@ -132,6 +132,7 @@ def test_a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is(p
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_an_operator_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
     ran = Ran(robot(SMOOTH), path, {"kind": "raise", "operator": "smooth", "at": "300ms"})
 

@@ -126,6 +126,7 @@ def test_the_command_chooses_lines_of_a_recording(recorded) -> None:
     assert "about a running graph" in call("logs", path, "--follow", code=2).stderr
 
 
+@pytest.mark.long
 def test_lines_of_a_recording_are_drawn_with_the_rest(recorded, tmp_path: Path) -> None:
     saved = tmp_path / "talk.rrd"
     assert "could not" not in call("view", recorded[0], "--to", saved).stdout

@@ -255,6 +255,7 @@ def test_wheels_of_a_wrong_scale_are_named_with_it() -> None:
     assert run.alarms["robot/wheels"][0][0] < run.alarms.get("robot/fix", [(12.0, "")])[0][0]
 
 
+@pytest.mark.long
 def test_an_offset_or_a_scale_that_is_estimated_is_not_warned_of() -> None:
     drive = Drive(12.0)
     settings = {

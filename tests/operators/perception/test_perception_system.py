@@ -110,6 +110,7 @@ def test_several_samples_of_one_step_are_taken_at_their_own_stamps(room: Room) -
     assert digests(singly)["graph"] == digests(together)["graph"]
 
 
+@pytest.mark.long
 def test_without_fusion_the_camera_gives_the_pose_and_arrays_will_do(room: Room) -> None:
     with room.system() as system:
         assert system.sensors == ("image", "depth")
@@ -121,6 +122,7 @@ def test_without_fusion_the_camera_gives_the_pose_and_arrays_will_do(room: Room)
     assert {"cloud", "detections", "tracks", "boxes", "objects", "graph"} <= result.made().keys()
 
 
+@pytest.mark.long
 def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
     with room.system(("image", "depth", "imu", "wheels")) as system:
         for stamp, step in room.given("image", "depth", "imu", "wheels"):

@@ -27,8 +27,8 @@ def classifier(shapes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from operators.training.commands import train
 
     out = tmp_path_factory.mktemp("trained") / "shapes.onnx"
-    words = ["classifier", str(shapes), "--out", str(out), "--size", "64x64", "--epochs", "14", "--variation", "0.3"]
-    done = CliRunner().invoke(train, [*words, "--threads", "1", "--workers", "1", "--evaluate-every", "7"])
+    words = ["classifier", str(shapes), "--out", str(out), "--size", "64x64", "--epochs", "6", "--variation", "0.3"]
+    done = CliRunner().invoke(train, [*words, "--threads", "1", "--workers", "1", "--evaluate-every", "3"])
     assert done.exit_code == 0, done.output
     assert "operators.recognition:ImageClassifier" in done.output
     return out

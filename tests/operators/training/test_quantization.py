@@ -86,7 +86,9 @@ def test_what_cannot_be_done_is_said_and_leaves_no_file(trained: Path, worlds: P
     assert list(tmp_path.iterdir()) == [small]
 
 
-@pytest.mark.parametrize(("kind", "score"), [("detector", "ap50"), ("segmenter", "miou")])
+@pytest.mark.parametrize(
+    ("kind", "score"), [("detector", "ap50"), pytest.param("segmenter", "miou", marks=pytest.mark.long)]
+)
 def test_the_command_scores_both_files(trained: Path, worlds: Path, tmp_path: Path, kind: str, score: str) -> None:
     arguments = ["train", "quantize", str(trained / f"{kind}.onnx"), str(worlds), "--out", str(tmp_path / "small.onnx")]
     result = CliRunner().invoke(app, [*arguments, "--images", "2", "--json"])

@@ -373,6 +373,7 @@ def test_thinning_keeps_the_first_point_of_a_cube() -> None:
     assert thinned(points, 0.5).tolist() == [0, 2, 4]
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_the_end_of_a_drive_is_that_of_direct_registration(data_dir: Path) -> None:
     import small_gicp

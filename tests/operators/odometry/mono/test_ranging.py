@@ -91,6 +91,7 @@ def test_a_depth_image_now_and_then_gives_metres() -> None:
     assert np.linalg.norm(poses[-1].linear) == pytest.approx(0.03 * RATE, rel=0.3)
 
 
+@pytest.mark.long
 def test_the_position_at_which_metres_are_found_counts_from_where_the_map_began() -> None:
     found = 30
     played = run(streams({found: measured(found)}))
@@ -161,6 +162,7 @@ def test_a_depth_image_that_comes_again_counts_once() -> None:
     assert "depth repeats the last one" in said(again)[21]
 
 
+@pytest.mark.long
 def test_depth_that_contradicts_a_known_scale_is_left_out() -> None:
     good = {k: measured(k) for k in range(14, 24)}
     wrong = {k: (1.4 * measured(k)).astype(np.float32) for k in range(24, 24 + PERSISTENT - 1)}

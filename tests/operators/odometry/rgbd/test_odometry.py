@@ -253,6 +253,7 @@ def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() 
             assert np.linalg.eigvalsh(result.covariance - carried)[0] > 0
 
 
+@pytest.mark.long
 def test_first_frames_of_a_camera_that_tracks_well_count_as_those_after_them() -> None:
     """Nothing is known of the noise then; the doubt would stay in every later pose."""
     odometry, added = RgbdOdometry(camera()), []

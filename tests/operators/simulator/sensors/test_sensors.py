@@ -267,6 +267,7 @@ def test_wheels_without_error_follow_the_path_and_with_it_drift() -> None:
     assert error < 5 * math.sqrt(np.trace(real.pose_covariance[:2, :2]))  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_radar_sees_the_still_world_come_nearer_as_the_robot_drives() -> None:
     source = robot(
         movers=False, duration="3s",

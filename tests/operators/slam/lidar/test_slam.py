@@ -154,6 +154,7 @@ def mapped(poses: Sequence[Matrix], said: Sequence[Matrix], slam: LidarMapper) -
     ]
 
 
+@pytest.mark.long
 def test_a_loop_takes_drift_away() -> None:
     poses = on_round(ROUND + 5)
     said = drifting(poses)
