@@ -103,6 +103,7 @@ def test_a_parameter_is_changed_where_it_was(changed: Path, monkeypatch: pytest.
     read.check()
 
 
+@pytest.mark.long
 def test_changes_of_calls_that_are_left_out_are_made(changed: Path) -> None:
     made = captured(changed, "tuned", predicate=f"out.out.vectors[0, 0] == -1 and inp.x.vectors[0, 0] == {tuned.WRONG}")
 

@@ -58,6 +58,7 @@ def test_lines_of_standard_input_are_done_and_one_that_cannot_be_is_an_error() -
     assert "until ): no Python expression" in told
 
 
+@pytest.mark.long
 def test_pdb_stops_at_the_first_line_of_process() -> None:
     told = debug("smooth", lines="step\np type(x).__name__\nc\nquit\n")
 

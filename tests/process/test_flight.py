@@ -280,6 +280,7 @@ def test_a_flight_recorder_that_cannot_be_is_refused_where_it_stands(tmp_path: P
         load_graph(tmp_path / "a.yaml")
 
 
+@pytest.mark.long
 def test_a_full_disk_is_outlived_and_what_comes_after_is_kept(
     recorded: Path, graph: Graph, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:

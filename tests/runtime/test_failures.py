@@ -222,6 +222,7 @@ def test_after_a_failure_every_recorded_message_is_explained(live: bool, how: st
     assert not any(lost.values()), lost
 
 
+@pytest.mark.long
 def test_what_operators_print_reaches_the_user() -> None:
     said: list[tuple[str, str]] = []
 

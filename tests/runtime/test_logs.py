@@ -147,6 +147,7 @@ def test_a_running_graph_shows_its_log_and_leaves_none_behind(tmp_path: Path, mo
     assert not [file.name for file in registry_folder().iterdir() if ".log" in file.name]
 
 
+@pytest.mark.long
 def test_the_least_level_is_chosen_with_the_run(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("DATAFLOW_LOG_LEVEL", "error")  # restored afterwards: the option sets it
     file, path = tmp_path / "talk.yaml", tmp_path / "talk.mcap"

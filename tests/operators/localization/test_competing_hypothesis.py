@@ -72,6 +72,7 @@ def test_what_makes_the_ends_differ_decides(seed: int) -> None:
     assert max(off(drive, played)) < 0.15
 
 
+@pytest.mark.long
 def test_a_known_start_or_a_position_decides() -> None:
     drive = HallDrive(4.0)
     known, _ = localized(drive, {"scan": drive.scans()}, start=tuple(drive.pose(0.05).tolist()))

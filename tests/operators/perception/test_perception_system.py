@@ -150,7 +150,12 @@ def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
             {"lifter", "objects", "scene", "fusion", "base"},
             marks=pytest.mark.long,
         ),
-        (("image", "points"), {"detections", "cloud", "pose"}, {"odometry", "fusion", "wheeled"}),
+        pytest.param(
+            ("image", "points"),
+            {"detections", "cloud", "pose"},
+            {"odometry", "fusion", "wheeled"},
+            marks=pytest.mark.long,
+        ),
         (("imu", "wheels"), set(), {"detector", "lifter", "scene", "wheeled"}),
         pytest.param(("wheels", "command"), set(), {"fusion", "scene"}, marks=pytest.mark.long),
     ],

@@ -235,6 +235,7 @@ def carried_blind(world: list[Any]) -> list[str]:
     return texts(play(LidarOdometry(give_up=2.0), {"cloud": clouds}))[15:]
 
 
+@pytest.mark.long
 def test_a_lidar_is_not_found_again_in_a_bare_corridor() -> None:
     assert all(text.startswith("lost: nothing constrains motion along (1.00, 0.00") for text in carried_blind(CORRIDOR))
 

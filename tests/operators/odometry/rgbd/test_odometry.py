@@ -537,6 +537,7 @@ def test_bare_wall_keeps_its_distance_and_admits_the_rest() -> None:
     assert sigma[0] > 0.05
 
 
+@pytest.mark.long
 def test_a_start_in_the_dark_costs_no_more_than_the_dark() -> None:
     frames, poses = sequence(40)
     results = follow([black(without_depth(f)) if i < 5 else f for i, f in enumerate(frames)])
