@@ -17,6 +17,7 @@ A comment above a block says that it is otherwise: `<!-- not run: REASON -->`, o
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
 import multiprocessing
@@ -365,8 +366,20 @@ def main(folder: Path, pages: list[str]) -> None:
     import dataflow
     import dataflow.cli.main
     import dataflow.testing
-    import operators.cloud
-    import operators.sources  # noqa: F401  (imported once, before the pages' processes are forked)
+    from dataflow.graph import load_graph
+
+    for name in (
+        "operators.cloud",
+        "operators.sources",
+        "pandas",
+        "scipy.ndimage",
+        "scipy.optimize",
+        "scipy.spatial",
+        "scipy.stats",
+        "rich.console",
+    ):
+        importlib.import_module(name)  # once, before the pages' processes are forked
+    load_graph(REPOSITORY / "graphs" / "perception.yaml")  # and its operators
 
     hypothesis.settings.register_profile(
         "pages", derandomize=True, deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck)
