@@ -38,7 +38,8 @@ class ProcessStatus:
     `counts`: per operator firings, messages emitted, messages dropped, CPU time (ns), last stamp, wall time (ns).
     `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
     (input, "timeout" or "late"). `behind`: per source the seconds by which its last message was behind the clock when
-    it was read, and when it was sent. `firings`: batches of firing records, where they were asked for.
+    it was read, and when it was sent. `firings`: batches of firing records, where they were asked for. `found`: what
+    operators found wrong with what they were given.
     """
 
     process: str
@@ -48,6 +49,7 @@ class ProcessStatus:
     waits: Mapping[str, Mapping[tuple[str, str], int]] = field(default_factory=dict)
     behind: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     firings: Sequence[bytes] = ()
+    found: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +148,7 @@ def _status(answer: bytes) -> ProcessStatus:
         {name: {(i, what): n for i, what, n in found} for name, found in said["waits"].items()},
         {name: (read, sent) for name, (read, sent) in said["behind"].items()},
         said.get("firings", ()),
+        said["found"],
     )
 
 
