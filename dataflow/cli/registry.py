@@ -111,6 +111,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("following.top:top", FOLLOW),
     Command("following.logs:logs", FOLLOW),
     Command("following.pub:pub", FOLLOW),
+    Command("following.reload:reload", FOLLOW),
     Command("following.recording:record", FOLLOW),
     Command("playback:playback", FOLLOW),
     Command("following.recording:trigger", FOLLOW),

@@ -102,14 +102,24 @@ class Processes:
 
     def set_parameter(self, operator: str, name: str, value: Any, timeout: float) -> Any:
         """Changes a parameter; the value as the operator took it. Raises `Refused`, `NoAnswer`."""
-        for said in self._until(operator, {"name": name, "value": value}, timeout):
+        return self._answered(operator, {"name": name, "value": value}, timeout, "the change is made")
+
+    def _answered(self, operator: str, request: Mapping[str, Any], timeout: float, then: str) -> Any:
+        for said in self._until(operator, request, timeout):
             if not said["ok"]:
                 raise Refused(said["error"])
             return said["value"]
         raise NoAnswer(
             f"no answer for {operator!r} within {timeout:g} s: it is being started again, hangs, or works on one "
-            "firing for longer than that; the change is made when it comes to it"
+            f"firing for longer than that; {then} when it comes to it"
         )
+
+    def reload(self, operator: str, timeout: float) -> dict[str, Any]:
+        """Has an operator go on with its code as it is in its files now; what its process answers (`Runner.reload`).
+
+        Raises `Refused`, `NoAnswer`.
+        """
+        return dict(self._answered(operator, {"reload": True}, timeout, "it is reloaded"))
 
     def takers(self, timeout: float) -> dict[str, Taker]:
         """The sources that take messages from outside, by name."""
