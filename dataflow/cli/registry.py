@@ -84,6 +84,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("verification:verify", MAKE),
     Command("debug:debug", MAKE),
     Command("debug:capture", MAKE),
+    Command("blame:blame", MAKE),
     Command("sweep:sweep", MAKE),
     Command("compare:compare", MAKE),
     Command("inspection:check", LOOK),
