@@ -80,6 +80,7 @@ class Family:
 BUILT_IN: tuple[Command | Family, ...] = (
     Command("demo:demo", MAKE),
     Command("run:run", MAKE),
+    Command("machines:join", MAKE),
     Command("replay:replay", MAKE),
     Command("verification:verify", MAKE),
     Command("debug:debug", MAKE),
@@ -126,6 +127,20 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow new graph obstacle_watch
         """,
         (Command("new:operator"), Command("new:graph"), Command("new:project")),
+    ),
+    Family(
+        "keys",
+        MAKE,
+        """Make the keys by which machines and tools know each other.
+
+        Examples:
+
+          dataflow keys new authority
+          dataflow keys add laptop --authority authority --serves 192.168.1.2
+          dataflow keys add robot --authority authority
+          dataflow keys add my_tools --authority authority --tools
+        """,
+        (Command("machines:new"), Command("machines:add")),
     ),
     Family(
         "param",

@@ -27,12 +27,15 @@ from dataflow.supervision.core.compose import core_of
 from dataflow.supervision.core.report import RunFailed, RunReport, Status
 from dataflow.supervision.early_nursery import EarlyNursery
 from dataflow.supervision.nursery import Nursery, adopting
-from dataflow.supervision.plan import RunPlan, process_plans
-from dataflow.supervision.rings import Rings, pairs_of
+from dataflow.supervision.plan import LINK, RunPlan, process_plans
+from dataflow.supervision.remote import Remote
+from dataflow.supervision.rings import Pairs, Rings, pairs_of
 from dataflow.transport import registry, reserve_endpoints
 from dataflow.transport.log_file import LogFile
 
 TICK = 0.05
+PART_WITHIN = 4.0
+"""Seconds for which other machines are told that the run is over."""
 PAUSE = 1.0
 """Seconds for which the supervisor did not run, at once, that are worth saying."""
 
@@ -50,13 +53,15 @@ class Supervisor:
         self.plan = plan
         self._early = early
         self._processes = process_plans(plan)
-        self._reserved = reserve_endpoints(len(self._processes))
-        self._endpoints = dict(zip(self._processes, self._reserved.endpoints, strict=True))
+        labels = [*self._processes, *([LINK] if any(p.machine for p in self._processes.values()) else ())]
+        self._reserved = reserve_endpoints(len(labels))
+        self._endpoints = dict(zip(labels, self._reserved.endpoints, strict=True))
         self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
         self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))
         self._announced = contextlib.ExitStack()
         self._over: commands.Over | None = None
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._remote: Remote | None = None
         self._stops = 0
         self._asked: deque[events.PlaybackAsked | events.TriggerAsked] = deque()
 
@@ -93,7 +98,9 @@ class Supervisor:
             stack.callback(self._close_pipe)
             stack.callback(self._reserved.close)
             stack.enter_context(self._announced)
-            rings = self._make_rings()
+            pairs = pairs_of(self.plan.graph, self._processes)
+            here = [label for label in self._endpoints if label == LINK or self._processes[label].machine is None]
+            rings = self._make_rings(here, pairs)
             stack.callback(rings.close)
             self._log_file = stack.enter_context(contextlib.closing(LogFile()))
             self._words = Console(self._on_output)
@@ -102,18 +109,22 @@ class Supervisor:
             self._clock = AwakeClock()
             boxes = Boxes(self.plan.graph, self._processes, live=self.plan.live)
             self._here = Children(
-                self._start_nursery(), self._selector, rings, boxes, self._clock, self._feed, self._heard
+                self._start_nursery(), self._selector, rings, boxes, self._clock, self._feed_here, self._heard
             )
             stack.callback(self._here.bury)
+            self._selector.register(self._woken, selectors.EVENT_READ, None)
+            if LINK in self._endpoints:
+                self._meet(pairs)
+                stack.callback(self._part)
             over = self._loop()
         if over.failure is not None:
             raise over.failure
         assert over.report is not None
         return over.report
 
-    def _make_rings(self) -> Rings:
+    def _make_rings(self, here: list[str], pairs: Pairs) -> Rings:
         try:
-            return Rings(list(self._processes), pairs_of(self.plan.graph, self._processes))
+            return Rings(here, {pair: keys for pair, keys in pairs.items() if set(pair) <= set(here)})
         except OSError as error:
             raise RunFailed(f"cannot link the processes: {error}; raise the limit of open files (ulimit -n)") from error
 
@@ -126,8 +137,47 @@ class Supervisor:
         except OSError as error:
             raise RunFailed(f"cannot start a process: {error}") from error
 
+    def _meet(self, pairs: Pairs) -> None:
+        """Waits (bounded) until the other machines of the graph are there and have what they need."""
+        meeting = self.plan.machines
+        assert meeting is not None
+        self._remote = Remote(
+            self.plan,
+            meeting,
+            self._processes,
+            pairs,
+            self._endpoints,
+            self._here,
+            self._feed,
+            self._heard,
+            self.core.run.note,
+        )
+        self.core.run.note(f"waits for {', '.join(self._remote.waits_for)}; on each: {self._remote.advice()}")
+        deadline = self._clock() + self.plan.start_timeout
+        while self._remote.waits_for:
+            self.status.waiting = self._remote.waits_for
+            self._wait(TICK)
+            self._here.flush()
+            if self._stops:
+                raise RunFailed("stopped while other machines were awaited", interrupted=True)
+            if self._clock() > deadline:
+                raise self._remote.not_ready(self.plan.start_timeout)
+
+    def _part(self) -> None:
+        """Lets the other machines go (bounded)."""
+        if self._remote is None:
+            return
+        self._remote.close()
+        deadline = self._clock() + PART_WITHIN
+        while not self._remote.ended and self._clock() < deadline:
+            self._here.flush()
+            self._wait(TICK)
+
+    def _hand(self, label: str) -> Children | Remote:
+        """Returns what starts, reaches and ends a process."""
+        return self._remote if self._remote is not None and label in self._remote.machine_of else self._here
+
     def _loop(self) -> commands.Over:
-        self._selector.register(self._woken, selectors.EVENT_READ, None)
         interrupted: BaseException | None = None
         seen_stops = 0
         self._feed(events.Begin())
@@ -159,6 +209,18 @@ class Supervisor:
         for command in self.core.handle(event, events.Moment(self._clock(), time.time())):
             self._do(command)
 
+    def _feed_here(self, event: events.Event) -> None:
+        """Feeds an event of this machine's processes; the link's are about others."""
+        if self._remote is None or getattr(event, "label", "") != LINK:
+            self._feed(event)
+            return
+        try:
+            self._remote.take(event)
+        except RunFailed as failure:
+            if self.core.run.release is None and self._remote.waits_for:
+                raise
+            self._feed(events.Aborted(str(failure)))
+
     def _wait(self, timeout: float) -> None:
         """Waits for the next events and feeds them, at most one look at each process."""
         for key, mask in self._selector.select(timeout):
@@ -169,6 +231,9 @@ class Supervisor:
                 self._here.look(key, mask)
 
     def _heard(self, label: str, line: str) -> None:
+        if label == LINK:
+            self._words.put(label, line)
+            return
         said = heard(line, label, self._processes[label].nodes)
         self._log_file.add(said)
         first, *more = shown(said)
@@ -189,14 +254,15 @@ class Supervisor:
     def _do(self, command: commands.Command) -> None:
         match command:
             case commands.Send(label, kind, fields, replaces):
-                self._here.send(label, kind, dict(fields), replaces=replaces)
+                self._hand(label).send(label, kind, dict(fields), replaces=replaces)
             case commands.Spawn(label):
-                self._here.spawn(label)
+                self._hand(label).spawn(label)
             case commands.Signal(label, number):
-                self._here.signal(label, number)
+                self._hand(label).signal(label, number)
             case commands.Announce(labels):
                 graph = self.plan.graph
-                endpoints = [self._endpoints[label] for label in labels]
+                reached = [LINK] if self._remote is not None else labels
+                endpoints = [self._endpoints[label] for label in reached]
                 self._announced.enter_context(
                     registry.register(graph.name, graph.namespace, endpoints, graph=graph.to_json())
                 )

@@ -20,6 +20,7 @@ from dataflow.supervision.core.events import (
     Event,
     HungUp,
     LeftBehind,
+    LinkChanged,
     Moment,
     NotReading,
     Paused,
@@ -110,6 +111,8 @@ class Core:
             case Remained(label, remains):
                 for part in self._parts:
                     part.remained(self.run.processes[label], remains)
+            case LinkChanged(machine, labels, up):
+                self.run.link_changed(machine, labels, up=up)
             case Died(label, code):
                 self._died(self.run.processes[label], code)
 

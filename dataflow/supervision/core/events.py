@@ -127,6 +127,15 @@ class Died:
     code: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class LinkChanged:
+    """The link to another machine, on which these processes run, went down or came up again."""
+
+    machine: str
+    labels: tuple[str, ...]
+    up: bool
+
+
 Event = (
     Begin
     | Tick
@@ -142,4 +151,5 @@ Event = (
     | LeftBehind
     | Remained
     | Died
+    | LinkChanged
 )

@@ -48,6 +48,8 @@ class RunState:
         self.status = Status()
         self.now = Moment(0.0, 0.0)
         self.release: Release | None = None
+        self.unreachable: set[str] = set()
+        """The processes on machines of which nothing is heard."""
         self._phase = Phase.STARTING
         self._commands: list[Command] = []
         for label, process in self.processes.items():
@@ -149,6 +151,15 @@ class RunState:
     def note(self, text: str) -> None:
         """Shows a message to the user, at once and in the report."""
         self.status.notes.append(text)
+
+    def link_changed(self, machine: str, labels: Collection[str], *, up: bool) -> None:
+        """Notes that processes on another machine are out of reach, or no longer: none of them need have ended."""
+        if up:
+            self.unreachable -= set(labels)
+        else:
+            self.unreachable |= set(labels)
+        what = "is back" if up else "is down: nothing of that machine is heard, and its operators go on"
+        self.event("link", f"the link to machine {machine!r} {what}", machine=machine, up=up)
 
     def tell_recorder(self, kind: str, /, **fields: Any) -> None:
         for process in self.processes.values():
