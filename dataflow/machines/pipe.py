@@ -120,6 +120,7 @@ class Pipe:
         deadline = time.monotonic() + within
         with self._changed:
             self._changed.wait_for(lambda: not (self._waiting or self._sent), max(0.0, deadline - time.monotonic()))
+            self._beat()  # what was taken last
             self._closed = True
             self._changed.notify_all()
         for each in self._subscribers:
