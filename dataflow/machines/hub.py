@@ -16,11 +16,12 @@ import msgpack
 import zenoh
 
 from dataflow.machines.gate import Gate, Routes, Word
-from dataflow.machines.keys import KEYS, access, settings
+from dataflow.machines.keys import GRAPH_KEY, KEYS, access, settings
 from dataflow.machines.pipe import AWAY_AFTER, Pipe
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.streams.inbox import Inbox
 from dataflow.transport import Bus, Fanout, NetworkConfig, Outgoing
+from dataflow.transport.keys import runtime_key
 
 LOOK_EVERY = 0.05
 REPORT_EVERY = 1.0
@@ -109,8 +110,10 @@ class Hub:
             )
             for name in config.machines
         ]
-        described = msgpack.packb(dict(config.graph), use_bin_type=True)
-        self._bus.serve(f"{KEYS}/graph", lambda query: query.reply(f"{KEYS}/graph", described))
+        described = msgpack.packb({"graph": dict(config.graph), "started": time.time()}, use_bin_type=True)
+        self._bus.serve(GRAPH_KEY, lambda query: query.reply(GRAPH_KEY, described))
+        key = runtime_key(config.namespace, "machines")
+        self._bus.serve(key, lambda query: query.reply(key, msgpack.packb(self._states())))
         self._channel.send("joined")
 
     def _greeted(self, name: str) -> Any:
@@ -163,6 +166,15 @@ class Hub:
             self._gate.add_extra(label, fields)
         self._channel.send("from", machine=machine, label=label, kind=kind, fields=fields)
 
+    def _states(self) -> dict[str, dict[str, Any]]:
+        """Returns for each machine whether its link is up, its clock's offset and that measurement's delay (ns), and
+        the messages that its link dropped."""
+        states = {}
+        for name, pipe in self._pipes.items():
+            delay, offset = pipe.clocks.best or (0, 0)
+            states[name] = {"up": self._up[name], "offset": offset, "delay": delay, "dropped": pipe.dropped}
+        return states
+
     def _look(self) -> None:
         """Reports links that went down or came up, and now and then the clocks."""
         for name, pipe in self._pipes.items():
@@ -174,10 +186,9 @@ class Hub:
         if now - self._reported < REPORT_EVERY:
             return
         self._reported = now
-        for name, pipe in self._pipes.items():
-            if (best := pipe.clocks.best) is not None:
-                delay, offset = best
-                self._channel.send("clock", machine=name, delay=delay, offset=offset, dropped=pipe.dropped)
+        for name, state in self._states().items():
+            if state["delay"]:
+                self._channel.send("clock", machine=name, **state)
 
     def hand_over(self) -> None:
         """Holds no firing records."""

@@ -19,6 +19,8 @@ from dataflow.transport import NetworkError
 TOOLS = "dataflow tools"
 KEYS = "dataflow-machines"
 """The first chunk of the keys of agents and their runs."""
+GRAPH_KEY = f"{KEYS}/graph"
+"""Answers tools on other machines which graph runs."""
 DAYS = 3650
 _AUTHORITY, _CERTIFICATE, _KEY = "authority.pem", "certificate.pem", "key.pem"
 _AUTHORITY_KEY = "authority.key"
@@ -114,7 +116,7 @@ def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
     every = ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"]
     every += ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
     both = {"permission": "allow", "flows": ["ingress", "egress"], "messages": every}
-    open_to_all = [f"{namespace}/**", *_runtime_keys(namespace), f"{KEYS}/graph"]
+    open_to_all = [f"{namespace}/**", *_runtime_keys(namespace), GRAPH_KEY]
     rules = [{"id": "graph", **both, "key_exprs": open_to_all}, {"id": "all", **both, "key_exprs": ["**"]}]
     subjects = [
         {"id": "tools", "cert_common_names": [TOOLS]},

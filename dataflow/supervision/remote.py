@@ -53,8 +53,6 @@ class Remote:
         self._ending = False
         self.ended = False
         """The link's process has ended."""
-        self.clocks: dict[str, tuple[int, int]] = {}
-        """By machine, by how many nanoseconds its clock is ahead of this one's, and the delay of that measurement."""
         here.spawn(LINK)
         here.send(LINK, "link", self._link_config(endpoints))
 
@@ -184,7 +182,7 @@ class Remote:
             case "link":
                 self._link(machine, up=fields["up"])
             case "clock":
-                self.clocks[machine] = fields["offset"], fields["delay"]
+                self._feed(events.ClockMeasured(machine, fields["offset"], fields["delay"]))
             case "busy":
                 self._note(f"machine {machine!r} still has another run, and is waited for")
             case "another":

@@ -47,6 +47,7 @@ class Scale(Operator):
 
     x: In[FeatureVector]
     y: Out[FeatureVector]
+    gain: float = Param(1.0, doc="another factor", tunable=True)
     weights: str = Param("", doc="a file with a number")
 
     def setup(self) -> None:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from conftest import end, join
+from conftest import HERE, end, join
 from relay import Relay
 
 from dataflow.graph import load_text
@@ -18,6 +23,7 @@ from dataflow.machines.keys import TOOLS, KeysError, issue, new_authority, setti
 from dataflow.supervision.core.report import RunFailed, Status
 from dataflow.supervision.plan import Meeting
 from dataflow.supervision.run import run
+from dataflow.supervision.supervisor import Supervisor
 from dataflow.transport import NetworkError
 from dataflow.verification.verify import verify
 
@@ -26,7 +32,8 @@ graph: two
 namespace: test
 operators:
   sensor: {use: "machine_operators:Sensor", params: {steps: 400, size: 2000}, machine: robot}
-  here: {use: "machine_operators:Scale", inputs: {x: sensor/count}, live: {restart: {max: 1, backoff: 10ms}}}
+  here: {use: "machine_operators:Scale", inputs: {x: sensor/count},
+    live: {queue: block, restart: {max: 1, backoff: 10ms}}}
   there: {use: "machine_operators:Scale", inputs: {x: sensor/count}, machine: robot, process: own,
     live: {restart: {max: 1, backoff: 10ms}}}
 """
@@ -129,3 +136,48 @@ def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:
         issue(keys / "authority", keys / "robot", "robot")
     with pytest.raises(KeysError, match="has an authority already"):
         new_authority(keys / "authority")
+
+
+def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(keys: Path, tmp_path: Path) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    robot = join("robot", endpoint, tmp_path / "files", "--keys", str(keys / "robot"))
+    found: dict[str, Any] = {}
+
+    def tool(*words: str, held: str = "tools") -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "dataflow.cli.main", *words, "--connect", endpoint, "--keys", str(keys / held)]
+        env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": str(HERE)}
+        return subprocess.run(command, capture_output=True, text=True, timeout=60, env=env, check=False)
+
+    def follow(supervisor: Supervisor) -> None:
+        try:
+            while supervisor.status.phase == "starting":
+                time.sleep(0.05)
+            found["echo"] = tool("echo", "there/y", "-n", "3", "--json")
+            found["top"] = tool("top", "--json")
+            found["set"] = tool("param", "set", "there.gain", "7")
+            found["record"] = tool("record", "there/y", "-o", str(tmp_path / "part.mcap"), "--seconds", "0.5")
+            found["stranger"] = tool("echo", "there/y", "-n", "1", held="stranger")
+        finally:
+            supervisor.stop()
+
+    @contextlib.contextmanager
+    def controls(supervisor: Supervisor) -> Iterator[None]:
+        following = threading.Thread(target=follow, args=(supervisor,))
+        following.start()
+        yield
+        following.join()
+
+    meeting = Meeting(endpoint, keys / "laptop")
+    run(load_text(GRAPH.replace("steps: 400", "steps: 1000000")), machines=meeting, live=True, controls=controls)
+
+    end(robot)
+    assert len(found["echo"].stdout.splitlines()) == 3, found["echo"]
+    top = json.loads(found["top"].stdout)
+    assert {row["operator"]: row["state"] for row in top["operators"]}["there"] == "running"
+    robot_state = top["machines"]["robot"]
+    assert robot_state["up"]
+    assert abs(robot_state["offset"]) <= robot_state["delay"]  # it is this machine's clock
+    assert found["set"].returncode == 0, found["set"]
+    assert found["record"].returncode == 0, found["record"]
+    assert found["stranger"].returncode != 0
+    assert "these keys are not let in" in found["stranger"].stderr

@@ -58,7 +58,7 @@ def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
     monkeypatch.chdir(tmp_path)
     Path("models").mkdir()
     Path("models/factor.txt").write_text("3.5")
-    text = GRAPH.replace("inputs: {x: here/y}", "inputs: {x: here/y}, params: {weights: models/factor.txt}")
+    text = GRAPH.replace("  there: {", "  there: {params: {weights: models/factor.txt}, ")
 
     report = two(robot, text)
 

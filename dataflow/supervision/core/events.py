@@ -136,6 +136,15 @@ class LinkChanged:
     up: bool
 
 
+@dataclass(frozen=True, slots=True)
+class ClockMeasured:
+    """The clock of another machine is ahead of this one's by `offset` ns, which is at most half of `delay` ns wrong."""
+
+    machine: str
+    offset: int
+    delay: int
+
+
 Event = (
     Begin
     | Tick
@@ -152,4 +161,5 @@ Event = (
     | Remained
     | Died
     | LinkChanged
+    | ClockMeasured
 )
