@@ -147,10 +147,14 @@ class Hub:
 
     def _meet(self, name: str, said: bytes) -> None:
         """Offers the run to an agent that has none; a second agent of that name is named, and gets nothing."""
-        hello = msgpack.unpackb(said, raw=False)
-        agent, run = hello["agent"], hello["run"]
+        try:
+            hello = msgpack.unpackb(said, raw=False)
+            agent, run = hello["agent"], hello["run"]
+        except (ValueError, TypeError, KeyError):
+            return  # no agent of ours
         if self._agents.setdefault(name, agent) != agent:
-            self._channel.send("another", machine=name)
+            gone = self._pipes[name].heard and self._pipes[name].silence > AWAY_AFTER
+            self._channel.send("anew" if gone else "another", machine=name)
         elif run == "":
             self._offers[name].put(msgpack.packb({"run": self.config.run}))
         elif run != self.config.run:

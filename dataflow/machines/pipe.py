@@ -61,7 +61,8 @@ class Pipe:
         `MOST_WAITING` bytes."""
         self.clocks = Clocks()
         self.dropped = 0
-        self._take, self._bounded = take, bounded
+        self.bounded = bounded
+        self._take = take
         self._changed = threading.Condition()
         self._waiting: deque[tuple[bytes, bool]] = deque()
         self._waiting_bytes = 0
@@ -95,7 +96,7 @@ class Pipe:
         with self._changed:
             self._waiting.append((frame, droppable))
             self._waiting_bytes += len(frame)
-            if self._bounded and self._waiting_bytes > MOST_WAITING:
+            if self.bounded and self._waiting_bytes > MOST_WAITING:
                 self._drop_oldest()
             self._changed.notify_all()
 

@@ -1,12 +1,13 @@
 """The agent of a machine: the hand of a supervisor that runs elsewhere. It starts, watches and ends processes here.
 
 It waits for a run, takes part in it, and waits for the next one. What it starts ends with it, and with the run: when
-the supervisor was not heard for `PATIENCE` seconds, too.
+the supervisor was not heard for too long, too.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import queue
 import secrets
@@ -43,9 +44,9 @@ from dataflow.transport import Bus, Fanout, reserve_endpoints
 
 HELLO_EVERY = 0.25
 LEAVE_WITHIN = 2.0
+END_WITHIN = 20.0
+"""Seconds that a run gets to end when the agent is stopped."""
 TICK = 0.05
-PATIENCE = 30.0
-"""Seconds for which operators go on without the supervisor being heard."""
 SUPERVISOR = ""
 """Its machine, as gates call it."""
 
@@ -54,11 +55,21 @@ class Agent:
     """One machine's agent. `stop()` may be called from a signal handler."""
 
     def __init__(
-        self, name: str, endpoint: str, keys: Path | None, folder: Path, notice: Callable[[str], None]
+        self,
+        name: str,
+        endpoint: str,
+        keys: Path | None,
+        folder: Path,
+        notice: Callable[[str], None],
+        *,
+        patience: float,
     ) -> None:
+        """`patience`: the seconds for which operators go on without the supervisor being heard."""
+        self.patience = patience
         self.name, self._endpoint, self._keys, self._folder, self._notice = name, endpoint, keys, folder, notice
         self._id = secrets.token_bytes(8)
         self._offered = ""
+        self._over: set[str] = set()
         self._stopped = False
         self._run = ""
 
@@ -88,6 +99,7 @@ class Agent:
                     continue
                 self._run, self._offered = self._offered, ""
                 Stay(self, bus, self._run, reserved.endpoints[0]).last()
+                self._over.add(self._run)
                 self._run = ""
                 if once:
                     break
@@ -96,7 +108,7 @@ class Agent:
 
     def _started(self, sample: Any) -> None:
         run = msgpack.unpackb(sample.payload.to_bytes(), raw=False)["run"]
-        if run != self._run:
+        if run != self._run and run not in self._over:
             self._offered = run
 
     def _greet(self, bus: Bus) -> None:
@@ -138,7 +150,7 @@ class Stay:
         self._wanted: Mapping[str, Any] = {}
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._pipe = Pipe(
-            bus, machine_key(agent.name, run, "up"), machine_key(agent.name, run, "down"), self._came, bounded=True
+            bus, machine_key(agent.name, run, "up"), machine_key(agent.name, run, "down"), self._came, bounded=False
         )
         self._gate = self._gate_of(Inbox(), Fanout([]), Routes([], {}, frozenset(), frozenset()))
 
@@ -158,10 +170,17 @@ class Stay:
             carrying.start()
             stack.callback(carrying.join, LEAVE_WITHIN)
             began = time.monotonic()
-            while not self._over and not self._agent.stopped:
+            stopped_at = math.inf
+            while not self._over:
                 self._turn()
-                silence = self._pipe.silence if self._pipe.heard else time.monotonic() - began
-                if silence > PATIENCE or (self._agent.wanted_elsewhere and silence > AWAY_AFTER):
+                now = time.monotonic()
+                if self._agent.stopped and stopped_at == math.inf:
+                    stopped_at = now
+                    self._say("", "failed", why="its agent was stopped")
+                silence = self._pipe.silence if self._pipe.heard else now - began
+                if now - stopped_at > END_WITHIN:
+                    break
+                if silence > self._agent.patience or (self._agent.wanted_elsewhere and silence > AWAY_AFTER):
                     self._agent.notice(f"the supervisor was not heard for {silence:.0f} s: its operators are ended")
                     break
             self._over = True
@@ -256,6 +275,7 @@ class Stay:
         graph = Graph.from_json(wanted["graph"])
         processes = {fields["label"]: ProcessPlan(**fields) for fields in wanted["processes"]}
         gate = wanted["gate"]["label"]
+        self._pipe.bounded = wanted["live"]
         rings = Rings([*processes, gate], {(maker, taker): tuple(keys) for maker, taker, keys in wanted["pairs"]})
         stack.callback(rings.close)
         given = take_descriptors(rings.handed(gate), wanted["gate"])

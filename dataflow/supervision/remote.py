@@ -50,6 +50,7 @@ class Remote:
         self._machines = sorted(set(self.machine_of.values()))
         self._missing: dict[str, str] = dict.fromkeys(self._machines, "did not join")
         """By machine, why the run cannot begin yet."""
+        self._noted: set[str] = set()
         self._ending = False
         self.ended = False
         """The link's process has ended."""
@@ -184,9 +185,16 @@ class Remote:
             case "clock":
                 self._feed(events.ClockMeasured(machine, fields["offset"], fields["delay"]))
             case "busy":
-                self._note(f"machine {machine!r} still has another run, and is waited for")
+                self._note_once(f"machine {machine!r} still has another run, and is waited for")
             case "another":
-                self._note(f"another machine joins as {machine!r}; it gets nothing while the first is there")
+                self._note_once(f"another machine joins as {machine!r}; it gets nothing while the first is there")
+            case "anew":
+                raise RunFailed(f"machine {machine!r} was started anew: its operators are gone")
+
+    def _note_once(self, text: str) -> None:
+        if text not in self._noted:
+            self._noted.add(text)
+            self._note(text)
 
     def _link(self, machine: str, *, up: bool) -> None:
         if self._missing.get(machine) == "did not join":

@@ -107,6 +107,11 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         seeding.FACT: str(seeding.VERSION),
         "threads": str(plan.graph.threads),
         **{f"process of {node}": label for node, label in placed.items()},
+        **{
+            f"machine of {node.name}": node.machine
+            for node in plan.graph.nodes.values()
+            if plan.machines and node.machine
+        },
     }
     facts = machine_facts(environment(plan.graph.threads))
     return {**plan.metadata, **graph_metadata(plan.graph), "dataflow:run": run_facts, **facts}

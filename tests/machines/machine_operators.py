@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dataflow.messages import FeatureVector, Message
-from dataflow.operator import In, Operator, Out, Param, Source
+from dataflow.operator import In, Operator, Out, Param, Sampled, Source
 
 
 def numbers(stamp: int, value: float, size: int = 1) -> FeatureVector:
@@ -60,6 +60,28 @@ class Scale(Operator):
 
     def summary(self) -> Mapping[str, float | int | str]:
         return {"taken": self.taken, "factor": self.factor}
+
+
+class Calibrated(Operator):
+    """Adds a static message; dies at its fiftieth message in its first life."""
+
+    x: In[FeatureVector]
+    constant: Sampled[FeatureVector]
+    y: Out[FeatureVector]
+    dies: str = Param("", doc="a file that is made where it kills its process")
+
+    def setup(self) -> None:
+        self.taken = 0
+
+    def process(self, x: FeatureVector, constant: FeatureVector) -> FeatureVector:
+        self.taken += 1
+        if self.dies and self.taken == 50 and not Path(self.dies).exists():
+            Path(self.dies).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return numbers(x.stamp, float(x.vectors[0, 0] + constant.vectors[0, 0]))
+
+    def summary(self) -> Mapping[str, float | int | str]:
+        return {"taken": self.taken}
 
 
 class Witness(Operator):

@@ -111,7 +111,7 @@ def test_a_link_that_stalls_and_resets_loses_nothing_and_nothing_is_started_agai
     assert verify(tmp_path / "link.mcap", jobs=1).identical
 
 
-@pytest.mark.parametrize("who", ["stranger", "tools"])
+@pytest.mark.parametrize("who", ["stranger", pytest.param("tools", marks=pytest.mark.long)])
 def test_a_certificate_of_another_authority_or_of_a_tool_joins_nothing(keys: Path, tmp_path: Path, who: str) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"
     stranger = join("robot", endpoint, tmp_path / "files", "--keys", str(keys / who))
@@ -138,6 +138,7 @@ def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:
         new_authority(keys / "authority")
 
 
+@pytest.mark.long
 def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(keys: Path, tmp_path: Path) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"
     robot = join("robot", endpoint, tmp_path / "files", "--keys", str(keys / "robot"))

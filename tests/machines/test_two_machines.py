@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
-from conftest import Robot
+from conftest import HERE, Robot, end, join
 
 from dataflow.graph import load_text
 from dataflow.supervision.core.report import RunFailed, RunReport
@@ -37,7 +42,7 @@ def taken(report: RunReport) -> Mapping[str, Any]:
     return {name: summary["taken"] for name, summary in report.summaries.items() if "taken" in summary}
 
 
-@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize("live", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_run_over_two_machines_loses_nothing_and_its_recording_verifies_on_one(
     robot: Robot, live: bool, tmp_path: Path
 ) -> None:
@@ -72,6 +77,7 @@ def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
     theirs.write_text(before)
 
 
+@pytest.mark.long
 def test_a_process_of_another_machine_that_dies_is_started_again_there_or_ends_the_run(
     robot: Robot, tmp_path: Path
 ) -> None:
@@ -81,9 +87,14 @@ def test_a_process_of_another_machine_that_dies_is_started_again_there_or_ends_t
         two(robot, dying, live=True)
     (tmp_path / "died").unlink()
     policy = "live: {restart: {max: 2, backoff: 10ms}}"
-    report = two(robot, dying.replace("MORE", policy), live=True, record=tmp_path / "died.mcap")
+    calibrated = (
+        f"  calibrated: {{use: 'machine_operators:Calibrated', inputs: {{x: sensor/count, constant: sensor/constant}}, "
+        f"params: {{dies: '{tmp_path / 'taker died'}'}}, {policy}}}\n"
+    )
+    report = two(robot, dying.replace("MORE", policy) + calibrated, live=True, record=tmp_path / "died.mcap")
 
-    assert report.restarts == {"sensor": 1}
+    assert report.restarts == {"sensor": 1, "calibrated": 1}
+    assert report.summaries["calibrated"]["taken"] > 20
     assert report.summaries["there"]["taken"] > 60
     assert verify(tmp_path / "died.mcap", jobs=1).identical
 
@@ -99,3 +110,31 @@ def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:
     with pytest.raises(RunFailed, match=r"machine robot: say where machines join .* or run all of it here"):
         run(graph)
     assert run(graph, machines=None).summaries["there"]["taken"] == 120
+
+
+@pytest.mark.long
+def test_a_supervisor_that_is_killed_leaves_no_operators_and_the_machine_takes_the_next_run(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
+    agent = join("robot", endpoint, tmp_path / "files", "--patience", "2")
+    graph = tmp_path / "two.yaml"
+    graph.write_text(GRAPH.replace("SIZE", "1").replace(", MORE", "").replace("steps: 120", "steps: 1000000"))
+    command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--live", "--listen", endpoint, "--quiet"]
+    supervisor = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(HERE)})
+    there = psutil.Process(agent.pid)
+    await_(lambda: any(child.name() == "sensor" for child in there.children(recursive=True)))
+
+    supervisor.kill()
+
+    supervisor.wait(timeout=20)
+    await_(lambda: not there.children(recursive=True))
+    short = load_text(GRAPH.replace("SIZE", "1").replace(", MORE", ""))
+    assert run(short, machines=Meeting(endpoint)).summaries["there"]["taken"] == 120
+    assert "was not heard for 2 s" in end(agent)
+
+
+def await_(condition: Callable[[], bool], within: float = 60.0) -> None:
+    """Waits (bounded) until a condition holds."""
+    deadline = time.monotonic() + within
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
