@@ -10,8 +10,9 @@ from typing import Any
 
 import msgpack
 
+from dataflow.client.attach import network_of
 from dataflow.messages import Message
-from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
+from dataflow.transport import Bus, Envelope, Kind
 from dataflow.transport.bounded import within
 from dataflow.transport.codec import encode
 from dataflow.transport.keys import runtime_key
@@ -53,6 +54,17 @@ class ProcessStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class MachineStatus:
+    """Another machine: whether its link is up, by how much its clock is ahead (`offset`, ns, at most half of `delay`
+    wrong), and the messages that were dropped since its link took too little."""
+
+    up: bool
+    offset: int
+    delay: int
+    dropped: int
+
+
+@dataclass(frozen=True, slots=True)
 class Parameter:
     """The value that a parameter has now, and whether it can change while the graph runs."""
 
@@ -88,6 +100,11 @@ class Processes:
         asked = msgpack.packb({"firings": True}) if firings else b""
         answers = self._bus.ask(runtime_key(self._namespace, "status", "**"), asked, timeout=timeout)
         return sorted(map(_status, answers), key=lambda status: status.process)
+
+    def machines(self, timeout: float) -> dict[str, MachineStatus]:
+        """By name, the other machines of the graph."""
+        answers = self._bus.ask(runtime_key(self._namespace, "machines"), timeout=timeout)
+        return {n: MachineStatus(**s) for a in answers for n, s in msgpack.unpackb(a, raw=False).items()}
 
     def parameters(self, operators: Iterable[str], timeout: float) -> dict[str, dict[str, Parameter]]:
         """By operator, of those whose processes answer: between two firings."""
@@ -165,7 +182,7 @@ def _status(answer: bytes) -> ProcessStatus:
 @contextlib.contextmanager
 def processes_of(found: RunningGraph) -> Iterator[Processes]:
     """A connection to the processes of a running graph, which are reached one after the other from now on."""
-    bus = Bus(NetworkConfig(connect=found.endpoints))
+    bus = Bus(network_of(found))
     try:
         yield Processes(bus, found.namespace)
     finally:

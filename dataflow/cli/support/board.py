@@ -19,7 +19,7 @@ from dataflow.supervision.core.watchers.lateness import LATE, held_up_by
 from dataflow.sync import FOREVER, NEVER
 
 if TYPE_CHECKING:
-    from dataflow.client.processes import ProcessStatus
+    from dataflow.client.processes import MachineStatus, ProcessStatus
     from dataflow.transport.registry import RunningGraph
 
 PATHS = 10
@@ -64,12 +64,13 @@ class Row:
 @dataclass(frozen=True, slots=True)
 class Sample:
     """The graph at one moment: its operators, the sources behind the clock with who holds each up, the notes of
-    operators, the latencies of its paths."""
+    operators, the latencies of its paths, the other machines."""
 
     rows: Sequence[Row]
     behind: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
     paths: Sequence[PathLatency] = ()
+    machines: Mapping[str, MachineStatus] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -155,6 +156,7 @@ def as_json(sample: Sample) -> dict[str, Any]:
         "operators": [asdict(row) for row in sample.rows],
         "notes": [*sample.behind.values(), *sample.notes],
         "latencies": [path.as_json() for path in sample.paths],
+        "machines": {name: asdict(state) for name, state in sample.machines.items()},
     }
 
 
@@ -165,9 +167,17 @@ def shown(sample: Sample, found: RunningGraph) -> RenderableType:
     """The operators, the notes, and the slowest paths."""
     parts: list[RenderableType] = [operators_table(sample.rows, title(found.name, found.started))]
     parts += [Text(note, style="yellow") for note in (*sample.behind.values(), *sample.notes)]
+    parts += [Text(machine_line(name, state)) for name, state in sample.machines.items()]
     if sample.paths:
         parts += [Text(), paths_table(sample.paths)]
     return Group(*parts)
+
+
+def machine_line(name: str, state: MachineStatus) -> str:
+    """Returns such as "machine robot: link up, clock +1.250 ms ± 0.300 ms"."""
+    dropped = f", {state.dropped} messages dropped" if state.dropped else ""
+    clock = f"clock {state.offset / 1e6:+.3f} ms ± {state.delay / 2e6:.3f} ms"
+    return f"machine {name}: link {'up' if state.up else 'down'}, {clock}{dropped}"
 
 
 def title(name: str, started: float) -> Text:
