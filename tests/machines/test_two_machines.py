@@ -25,11 +25,12 @@ graph: two
 namespace: test
 operators:
   sensor: {use: "machine_operators:Sensor", params: {steps: 120, size: SIZE}, machine: robot, MORE}
-  here: {use: "machine_operators:Scale", inputs: {x: sensor/count}}
-  there: {use: "machine_operators:Scale", inputs: {x: here/y}, machine: robot, process: own}
-  beside: {use: "machine_operators:Scale", inputs: {x: sensor/count}, machine: robot, process: own}
+  here: {use: "machine_operators:Scale", inputs: {x: sensor/count}, live: {queue: block}}
+  there: {use: "machine_operators:Scale", inputs: {x: here/y}, machine: robot, process: own, live: {queue: block}}
+  beside: {use: "machine_operators:Scale", inputs: {x: sensor/count}, machine: robot, process: own,
+    live: {queue: block}}
   witness: {use: "machine_operators:Witness", inputs: {x: here/y}, machine: robot, process: own}
-  last: {use: "machine_operators:Scale", inputs: {x: there/y}}
+  last: {use: "machine_operators:Scale", inputs: {x: there/y}, live: {queue: block}}
 """
 
 
