@@ -14,7 +14,7 @@ Authority = Annotated[Path, typer.Option("--authority", metavar="FOLDER", help="
 
 
 def join(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name: what `machine:` says in graphs.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name in graphs (`machine:`).")],
     connect: Annotated[
         str, typer.Option("--connect", metavar="ENDPOINT", help="Where the run listens (`dataflow run --listen`).")
     ],
@@ -54,7 +54,7 @@ def join(
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder to make.")],
 ) -> None:
-    """Make an authority, which issues keys. Its folder stays where it is: whoever has it can issue keys.
+    """Make an authority, which issues keys. Its folder stays where it is: who has it can issue keys.
 
     Examples:
 

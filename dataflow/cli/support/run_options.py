@@ -100,7 +100,7 @@ Keys = Annotated[
 Here = Annotated[
     bool,
     typer.Option(
-        "--here", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run everything here, whatever `machine:` says."
+        "--here", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run everything here, without regard to `machine:`."
     ),
 ]
 Timeout = Annotated[
@@ -150,7 +150,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No pro
 
 
 def machines_of(listen: str | None, keys: Path | None, *, here: bool) -> dict[str, Any]:
-    """Returns the field of a `RunPlan` that says where other machines join; nothing where no option does."""
+    """Returns the field of a `RunPlan` for other machines, if an option is about them."""
     from dataflow.supervision.plan import Meeting
 
     if here and listen is not None:
