@@ -10,6 +10,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import hypothesis
@@ -76,6 +77,7 @@ def pytest_collection(session: pytest.Session) -> Iterator[None]:
         session.config.stash[SLOW] = {"open3d", "pandas", "rerun", "torch"} & sys.modules.keys()
 
 
+@cache
 def marker_of(path: Path) -> str:
     """Returns the marker of the tests in a file or folder, by the room that it lies in."""
     inside = path.relative_to(TESTS)

@@ -99,7 +99,8 @@ class Board:
         lags = _lags(counts)
         rows = [_row(health, told.get(health.operator), lags, health.operator in answered) for health in healths]
         paths = batch_latencies(self.graph, (batch for status in statuses for batch in status.firings))
-        return Sample(rows, _late_sources(rows, told), _notes(rows), paths)
+        found = {name: text for status in told.values() for name, text in status.found.items()}
+        return Sample(rows, _late_sources(rows, told), _notes(rows, found), paths)
 
 
 def _row(health: Health, status: ProcessStatus | None, lags: Mapping[str, float | None], answered: bool) -> Row:
@@ -145,8 +146,9 @@ def _late_sources(rows: Sequence[Row], told: Mapping[str, ProcessStatus]) -> dic
     return said
 
 
-def _notes(rows: Sequence[Row]) -> list[str]:
-    return [f"{row.operator}: {row.note}" for row in rows if row.note]
+def _notes(rows: Sequence[Row], found: Mapping[str, str]) -> list[str]:
+    notes = [f"{row.operator}: {row.note}" for row in rows if row.note]
+    return notes + [f"{row.operator}: {found[row.operator]}" for row in rows if row.operator in found]
 
 
 def as_json(sample: Sample) -> dict[str, Any]:
