@@ -1,8 +1,8 @@
 """The gate of one machine, through which its processes send to those of other machines, and get from them.
 
 To its own machine's processes a gate is one more process, linked to them by rings. A stream passes to each other
-machine once, however many processes take it there. Control messages pass through the same pipe, behind what was sent before them: so,
-as on one machine, what a process had sent when it reported something has arrived where that is heard.
+machine once, however many processes take it there. Control messages pass through the same pipe, behind what was sent
+before them: so, as on one machine, what a process had sent when it reported something has arrived where that is heard.
 """
 
 from __future__ import annotations
