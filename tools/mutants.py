@@ -1,6 +1,6 @@
 """Counts how many of some random faults in a package its tests find.
 
-usage: python tools/mutants.py PACKAGE [--tests FOLDER] [--count N] [--seed N] [--quick]      (PACKAGE: such as dataflow/sync)
+usage: python tools/mutants.py PACKAGE [--tests FOLDER] [--count N] [--seed N] [--quick]   (PACKAGE: dataflow/sync)
 
 A mutant differs from the package in one place: a comparison, an operator of arithmetic or logic, a number, a returned
 value or a dropped statement. Equal seeds draw equal mutants of equal sources, so that the tests of two commits can be

@@ -63,7 +63,7 @@ def errors(drive: Drive, poses: list[Any], since: float = 1.0) -> tuple[float, f
     return float(far), float(turned), len(off)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_a_scan_finds_the_robot_anywhere_in_the_map(seed: int) -> None:
     drive = Drive(5.0, seed)
     played, _ = localized(drive, {"scan": drive.scans()})

@@ -478,6 +478,7 @@ def mover_sequence(count: int) -> Sequence:
     return moved, poses
 
 
+@pytest.mark.long
 def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
     frames, poses = mover_sequence(25)
     results = follow(frames, rate=10.0)
@@ -699,6 +700,7 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
     assert pack_state(one.snapshot()) == pack_state(other.snapshot())
 
 
+@pytest.mark.long
 def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
     frames, _ = sequence(40)
     stamps = [k * 33_000_000 for k in range(8)]
