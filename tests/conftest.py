@@ -29,7 +29,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 TESTS = REPOSITORY / "tests"
 ROOMS = {
     "docs": ("docs", "scaffold"),
-    "network": ("client", "foxglove", "transport"),
+    "network": ("client", "foxglove", "machines", "transport"),
     "process": (
         "analysis", "api", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
         "capture", "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",

@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-LANGUAGES = ("python", "yaml", "sh", "json", "toml", "text", "ini", "dockerfile")
+LANGUAGES = ("python", "yaml", "sh", "json", "toml", "text", "ini", "dockerfile", "cpp")
 OUTPUTS = ("output", "record", "view", "to", "complete", "out", "junit", "svg", "baseline", "write_contract")
 """Parameters of commands that name a file which the command may write."""
 QUICK = ("check", "show", "info", "operators", "graphs", "diff", "latency", "lint", "logs")
@@ -44,7 +44,21 @@ READERS_OWN = {
     *("tuned.yaml",),
 }
 """Names that stand for files of the reader."""
-PROGRAMS = ("python", "python3", "pip", "pytest", "rerun", "git", "cd", "mkdir", "export", "mkdocs", "bash", "ls")
+PROGRAMS = (
+    "python",
+    "python3",
+    "pip",
+    "pytest",
+    "rerun",
+    "git",
+    "cd",
+    "mkdir",
+    "export",
+    "mkdocs",
+    "c++",
+    "bash",
+    "ls",
+)
 """What else a line of a `sh` block may begin with."""
 MARK = re.compile(r"<!-- (not run: \S.*|run by (tests/\S+\.py)) -->$")
 FENCE = re.compile(r"```(\w*)")

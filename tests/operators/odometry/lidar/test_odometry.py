@@ -18,8 +18,8 @@ from operators.geometry import se3
 from operators.odometry import LidarOdometry
 from operators.odometry.lidar import tracker
 from operators.odometry.lidar.map import PlaneMap, thinned
+from operators.odometry.lidar.odometry import Sweep
 from operators.odometry.lidar.search import around
-from operators.odometry.lidar.sweep import Sweep
 
 Array = NDArray[np.float64]
 STEP = 100_000_000  # ns
