@@ -140,6 +140,7 @@ def test_a_lidar_that_degrades_loses_its_say_and_the_pose_stays_right(wrong: dic
     assert count > 130
 
 
+@pytest.mark.long
 def test_landmarks_that_degrade_lose_their_say_to_the_lidar() -> None:
     drive = Drive(7.0)
     sensors = {"scan": drive.scans(), "seen": drive.sightings(off=0.5, after=3.0)}
