@@ -109,6 +109,8 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("following.live:echo", FOLLOW),
     Command("following.live:hz", FOLLOW),
     Command("following.top:top", FOLLOW),
+    Command("following.health:health", FOLLOW),
+    Command("following.health:metrics", FOLLOW),
     Command("following.logs:logs", FOLLOW),
     Command("following.pub:pub", FOLLOW),
     Command("following.reload:reload", FOLLOW),
@@ -126,7 +128,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow new operator NearestObstacle
           dataflow new graph obstacle_watch
         """,
-        (Command("new:operator"), Command("new:graph"), Command("new:project")),
+        (Command("new:operator"), Command("new:graph"), Command("new:project"), Command("new:service")),
     ),
     Family(
         "param",
