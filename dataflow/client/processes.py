@@ -10,8 +10,9 @@ from typing import Any
 
 import msgpack
 
+from dataflow.client.attach import network_of
 from dataflow.messages import Message
-from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
+from dataflow.transport import Bus, Envelope, Kind
 from dataflow.transport.bounded import within
 from dataflow.transport.codec import encode
 from dataflow.transport.keys import runtime_key
@@ -38,7 +39,8 @@ class ProcessStatus:
     `counts`: per operator firings, messages emitted, messages dropped, CPU time (ns), last stamp, wall time (ns).
     `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
     (input, "timeout" or "late"). `behind`: per source the seconds by which its last message was behind the clock when
-    it was read, and when it was sent. `firings`: batches of firing records, where they were asked for.
+    it was read, and when it was sent. `firings`: batches of firing records, where they were asked for. `found`: what
+    operators found wrong with what they were given.
     """
 
     process: str
@@ -48,6 +50,18 @@ class ProcessStatus:
     waits: Mapping[str, Mapping[tuple[str, str], int]] = field(default_factory=dict)
     behind: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     firings: Sequence[bytes] = ()
+    found: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class MachineStatus:
+    """Another machine: whether its link is up, by how much its clock is ahead (`offset`, ns, at most half of `delay`
+    wrong), and the messages that were dropped since its link took too little."""
+
+    up: bool
+    offset: int
+    delay: int
+    dropped: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +100,11 @@ class Processes:
         asked = msgpack.packb({"firings": True}) if firings else b""
         answers = self._bus.ask(runtime_key(self._namespace, "status", "**"), asked, timeout=timeout)
         return sorted(map(_status, answers), key=lambda status: status.process)
+
+    def machines(self, timeout: float) -> dict[str, MachineStatus]:
+        """By name, the other machines of the graph."""
+        answers = self._bus.ask(runtime_key(self._namespace, "machines"), timeout=timeout)
+        return {n: MachineStatus(**s) for a in answers for n, s in msgpack.unpackb(a, raw=False).items()}
 
     def parameters(self, operators: Iterable[str], timeout: float) -> dict[str, dict[str, Parameter]]:
         """By operator, of those whose processes answer: between two firings."""
@@ -156,13 +175,14 @@ def _status(answer: bytes) -> ProcessStatus:
         {name: {(i, what): n for i, what, n in found} for name, found in said["waits"].items()},
         {name: (read, sent) for name, (read, sent) in said["behind"].items()},
         said.get("firings", ()),
+        said["found"],
     )
 
 
 @contextlib.contextmanager
 def processes_of(found: RunningGraph) -> Iterator[Processes]:
     """A connection to the processes of a running graph, which are reached one after the other from now on."""
-    bus = Bus(NetworkConfig(connect=found.endpoints))
+    bus = Bus(network_of(found))
     try:
         yield Processes(bus, found.namespace)
     finally:

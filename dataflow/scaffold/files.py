@@ -11,12 +11,14 @@ from typing import Literal
 
 from dataflow.scaffold import templates
 
-Kind = Literal["operator", "timer", "source"]
-KINDS: tuple[Kind, ...] = ("operator", "timer", "source")
+Kind = Literal["operator", "timer", "source", "program"]
+KINDS: tuple[Kind, ...] = ("operator", "timer", "source", "program")
+_HEADER = Path(__file__).parents[1] / "program" / "dataflow.hpp"
 _OPERATORS = {
     "operator": (templates.OPERATOR, templates.OPERATOR_TEST),
     "timer": (templates.TIMER, templates.TIMER_TEST),
     "source": (templates.SOURCE, templates.SOURCE_TEST),
+    "program": (templates.PROGRAM, templates.PROGRAM_TEST),
 }
 
 
@@ -41,15 +43,21 @@ def camel(name: str) -> str:
 
 
 def operator_files(name: str, kind: Kind = "operator", package: str = "") -> Mapping[Path, str]:
-    """An operator's module and its test. `package`: the package that the module is put into."""
+    """An operator's module and its test, with the source of a program. `package`: the package that the module is put
+    into."""
     module = snake(name)
     code, test = _OPERATORS[kind]
     words = {
         "Class": camel(name),
         "Title": camel(name),
         "module": f"{package}.{module}" if package else module,
+        "stem": module,
     }
-    return {Path(f"{module}.py"): code.substitute(words), Path(f"test_{module}.py"): test.substitute(words)}
+    files = {Path(f"{module}.py"): code.substitute(words), Path(f"test_{module}.py"): test.substitute(words)}
+    if kind == "program":
+        files[Path(f"{module}.cpp")] = templates.PROGRAM_SOURCE.substitute(words)
+        files[Path("dataflow.hpp")] = _HEADER.read_text(encoding="utf-8")
+    return files
 
 
 def graph_files(name: str) -> Mapping[Path, str]:

@@ -31,6 +31,7 @@ TRIED: tuple[str, ...] = (
     "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json --live-effects",
     "capture RECORDING --op sum --firing 3 --predicate stamp --graph GRAPH --set count=30 --path HERE --to OUT.py"
     " --overwrite --json",
+    "blame RECORDING --field mean@0 --budget 60 --tolerance 0.1 --graph GRAPH --set count=30 --path HERE --json",
     "check GRAPH --path HERE --set count=4 --json",
     "show GRAPH --path HERE --set count=4 --json",
     "show GRAPH --mermaid",

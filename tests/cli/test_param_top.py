@@ -282,6 +282,7 @@ def test_a_process_that_does_not_answer_is_shown_so_until_it_goes_on(dataflow, a
     assert dataflow("param", "set", "tuned.factor", "7", "--timeout", "30").stdout == "tuned.factor = 7.0\n"
 
 
+@pytest.mark.long
 def test_the_changes_stand_in_the_recording_and_top_ends_with_the_graph(dataflow, alone: Background) -> None:
     for value in ("2.5", "3"):
         dataflow("param", "set", "tuned.factor", value)

@@ -169,6 +169,7 @@ record: {{snapshots: 2s}}
 """
 
 
+@pytest.mark.long
 def test_the_way_to_a_call_does_not_depend_on_the_length_of_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

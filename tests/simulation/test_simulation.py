@@ -166,7 +166,7 @@ RESTARTED = "restart: {max: 5, backoff: 10ms}"
 
 @pytest.mark.parametrize("policy", ["", RESTARTED, f"deadline: 200ms, {RESTARTED}"])
 @pytest.mark.parametrize("target", ["*", "", "relay", "@recorder"])
-@pytest.mark.parametrize("span", [6.0, 40.0])
+@pytest.mark.parametrize("span", [pytest.param(6.0, marks=pytest.mark.long), 40.0])
 def test_a_pause_of_the_supervisor_and_others_kills_and_blames_nobody(
     target: str, span: float, policy: str, memory: Path
 ) -> None:

@@ -81,7 +81,7 @@ def debug(
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
         find_modules_in(path)
-        _take_environment(recording)
+        take_environment(recording)
         from dataflow.graph import load_graph
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
@@ -139,7 +139,7 @@ def capture(
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
         find_modules_in(path)
-        _take_environment(recording)
+        take_environment(recording)
         from dataflow.graph import load_graph
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
@@ -233,7 +233,7 @@ def _converse(shell: Shell, lines: list[str], *, interactive: bool) -> None:
         raise typer.Exit(DIFFERENT)
 
 
-def _take_environment(recording: Path) -> None:
+def take_environment(recording: Path) -> None:
     """Begins anew with the environment of operators where this process has another one: libraries read the number of
     their threads, and Python the salt of hashes, when they begin."""
     from dataflow.cli import start

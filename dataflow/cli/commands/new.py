@@ -26,7 +26,8 @@ def operator(
         typer.Option(
             "--kind",
             metavar="KIND",
-            help="operator: fires for each message; timer: at each tick of event time; source: reads a device.",
+            help="operator: fires for each message; timer: at each tick of event time; source: reads a device; "
+            "program: is written in C++.",
         ),
     ] = "operator",
     to: To = HERE,
@@ -41,6 +42,7 @@ def operator(
       dataflow new operator NearestObstacle
       dataflow new operator Thermometer --kind source
       dataflow new operator Watchdog --kind timer --to my_robot
+      dataflow new operator Edges --kind program
     """
     from dataflow.scaffold.files import KINDS, operator_files, snake
 
@@ -165,8 +167,8 @@ def _package(folder: Path) -> str:
 
 
 def _write(files: Mapping[Path, str], hints: tuple[str, ...], *, json: bool) -> None:
-    """Writes all files or none: one that is there already is never replaced."""
-    present = [file for file in files if file.exists()]
+    """Writes all files or none: one that is there already with another content is never replaced."""
+    present = [file for file, text in files.items() if file.exists() and file.read_bytes() != text.encode()]
     if present:
         raise fail(f"{present[0]} is there already; choose another name or folder")
     for file, text in files.items():

@@ -11,6 +11,7 @@ import typer
 
 from dataflow.cli.commands.playback import keys
 from dataflow.cli.support.arguments import (
+    FLAG,
     GraphFile,
     ModuleFolders,
     Settings,
@@ -48,6 +49,16 @@ def run(
     graph: GraphFile,
     settings: Settings = None,
     path: ModuleFolders = None,
+    listen: Annotated[
+        str | None,
+        typer.Option("--listen", metavar="ENDPOINT", help="Where other machines join: tls/ADDRESS:PORT, with --keys."),
+    ] = None,
+    keys_folder: Annotated[
+        Path | None, typer.Option("--keys", metavar="FOLDER", help="This machine's keys (`dataflow keys`).")
+    ] = None,
+    here: Annotated[
+        bool, typer.Option("--here", metavar=FLAG, help="Run everything here, whatever `machine:` says.")
+    ] = False,
     rate: Rate = None,
     step: Step = False,
     timeout: Timeout = 120.0,
@@ -115,6 +126,7 @@ def run(
     with early_nursery() as early, friendly_errors():
         from dataflow.graph import load_graph
         from dataflow.process.log_pipe import LEVEL_VARIABLE
+        from dataflow.supervision.plan import Meeting
         from dataflow.supervision.run import run as run_graph
 
         if log_level is not None:
@@ -129,6 +141,10 @@ def run(
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         controls = keys(quiet or json, live=live, flight=flight)
         options |= {"live": live, "paused": step, "controls": controls}
+        if here and listen is not None:
+            raise fail("--here runs everything on this machine; --listen is for others")
+        if listen is not None or here:
+            options["machines"] = None if listen is None else Meeting(listen, keys_folder)
         if compression is not None:
             if record is None and not flight:
                 raise fail("--compression is of a recording: name one with --record")

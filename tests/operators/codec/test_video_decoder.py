@@ -34,7 +34,9 @@ WITHIN = 1_000_000_000 + 12 * PERIOD
 """The stamp of the packet in the middle of a group."""
 
 
-@pytest.fixture(params=[("h264", []), ("h265", [10, 11])], ids=["h264", "h265, packets lost"])
+@pytest.fixture(
+    params=[pytest.param(("h264", []), marks=pytest.mark.long), ("h265", [10, 11])], ids=["h264", "h265, packets lost"]
+)
 def recorded(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     graph = tmp_path / "graph.yaml"
     graph.write_text(GRAPH.format(format=request.param[0], lost=request.param[1]))

@@ -40,14 +40,6 @@ def scene(folder: Path, size: tuple[int, int]) -> np.ndarray:
     return warp(pixels, fitted((pixels.shape[1], pixels.shape[0]), size), size)
 
 
-@pytest.fixture(scope="module")
-def trained(worlds: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with detector.onnx and segmenter.onnx."""
-    folder = tmp_path_factory.mktemp("networks")
-    train(pair(worlds, seed=1), Settings(epochs=1, batch=4, threads=1), folder / "pair.onnx")
-    return folder
-
-
 @pytest.mark.long
 def test_a_training_begins_with_what_the_file_answers(trained: Path, worlds: Path) -> None:
     task = pair(worlds)

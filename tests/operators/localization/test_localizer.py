@@ -73,7 +73,7 @@ def test_a_scan_finds_the_robot_anywhere_in_the_map(seed: int) -> None:
     assert count >= 79
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_a_robot_that_was_carried_away_is_found_again(seed: int) -> None:
     drive = Drive(6.0, seed, carried=(3.0, 0.45))
     played, operator = localized(drive, {"scan": drive.scans()})
@@ -85,6 +85,7 @@ def test_a_robot_that_was_carried_away_is_found_again(seed: int) -> None:
     assert operator.summary()["particles injected"] > 0
 
 
+@pytest.mark.long
 def test_landmarks_without_identity_and_positions_localize_too() -> None:
     drive = Drive(5.0)
     sensors = {"seen": drive.sightings(known=False), "place": drive.positions()}
@@ -157,6 +158,7 @@ def test_a_modality_that_contradicts_the_fused_estimate_is_named() -> None:
     assert dict(zip(last.names, last.messages, strict=True))["lidar alone"] == "contradicts the fused estimate"
 
 
+@pytest.mark.long
 def test_a_gyroscope_makes_up_for_wheels_that_slip() -> None:
     drive = Drive(8.0)
     slipping = drive.odometry(slip=0.5)

@@ -160,7 +160,7 @@ def test_a_gyroscope_of_another_scale_is_named() -> None:
     ("sensor", "axis", "name"),
     [
         ("lidar", "z", "motions/lidar"),
-        ("camera", "y", "motions/camera"),
+        pytest.param("camera", "y", "motions/camera", marks=pytest.mark.long),
         ("camera", "x", "motions/camera"),
         ("imu", "y", "gyroscope of imu"),
     ],

@@ -173,9 +173,9 @@ def without_depth(frame: Frame) -> Frame:
 @pytest.mark.parametrize(
     ("count", "speed", "rate", "offset", "refine", "metres", "radians"),
     [
-        (40, 1.0, 30.0, 0.0, True, 0.012, 0.006),  # slow
-        (40, 1.0, 30.0, 0.0, False, 0.03, 0.015),  # slow, features only
-        (25, 3.0, 10.0, 0.0, True, 0.015, 0.008),  # 10 Hz: 2.3 degrees a frame
+        pytest.param(40, 1.0, 30.0, 0.0, True, 0.012, 0.006, marks=pytest.mark.long),  # slow
+        pytest.param(40, 1.0, 30.0, 0.0, False, 0.03, 0.015, marks=pytest.mark.long),  # slow, features only
+        pytest.param(25, 3.0, 10.0, 0.0, True, 0.015, 0.008, marks=pytest.mark.long),  # 10 Hz: 2.3 degrees a frame
         (25, 3.0, 10.0, 0.05, True, 0.015, 0.008),  # two cameras 5 cm apart
         (25, 3.0, 10.0, 0.05, False, 0.04, 0.02),  # the same, features only
     ],
@@ -253,6 +253,7 @@ def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() 
             assert np.linalg.eigvalsh(result.covariance - carried)[0] > 0
 
 
+@pytest.mark.long
 def test_first_frames_of_a_camera_that_tracks_well_count_as_those_after_them() -> None:
     """Nothing is known of the noise then; the doubt would stay in every later pose."""
     odometry, added = RgbdOdometry(camera()), []
@@ -327,7 +328,7 @@ def test_lost_depth_is_bridged_by_the_depth_of_the_map() -> None:
     assert errors(results, poses)[0] < 0.04
 
 
-@pytest.mark.parametrize("share", [0.5, 0.9])
+@pytest.mark.parametrize("share", [pytest.param(0.5, marks=pytest.mark.long), 0.9])
 def test_sparse_depth_is_depth(share: float) -> None:
     frames, poses = sequence(25, 3.0)
     rng = np.random.default_rng(3)
@@ -337,6 +338,7 @@ def test_sparse_depth_is_depth(share: float) -> None:
     assert errors(results, poses)[0] < 0.03
 
 
+@pytest.mark.long
 def test_keyframes_are_renewed_where_depth_reaches_less_far() -> None:
     """Most of what comes into view is beyond the reach of the depth camera: poorer keyframes are all that there is."""
     frames, poses = sequence(60, 1.5)
@@ -535,6 +537,7 @@ def test_bare_wall_keeps_its_distance_and_admits_the_rest() -> None:
     assert sigma[0] > 0.05
 
 
+@pytest.mark.long
 def test_a_start_in_the_dark_costs_no_more_than_the_dark() -> None:
     frames, poses = sequence(40)
     results = follow([black(without_depth(f)) if i < 5 else f for i, f in enumerate(frames)])
@@ -665,6 +668,7 @@ def test_operator_gives_the_core_poses_in_named_frames() -> None:
     assert out.pose_covariance is not None
 
 
+@pytest.mark.long
 def test_operator_goes_on_alike_from_a_recorded_state() -> None:
     frames, _ = sequence(40)
 
