@@ -23,6 +23,7 @@ from dataflow.execution.protocol import Faults
 from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.model import Node
+from dataflow.graph.sections import Snapshots
 from dataflow.operator import Operator
 from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
 from dataflow.sync.single import make_aligner
@@ -50,7 +51,7 @@ class LiveRunner(OperatorRunner):
         seed: int = 0,
         paranoid: bool = False,
         operator: Operator | None = None,
-        snapshots: int | None = None,
+        snapshots: Snapshots | None = None,
         clock: Clock | None = None,
         event_clock: EventClock = time.time_ns,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
