@@ -3,34 +3,42 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from dataflow.drops.losses import Loss
-from dataflow.drops.player import PlayedCalls, Player
+from dataflow.drops.player import MOST_BYTES, PlayedCalls, Player
 from dataflow.execution.admission import Arrival, Promise
 from dataflow.execution.driver import Driver, HandOver
 from dataflow.execution.feeds.log import LogFeed
 from dataflow.execution.runner import OperatorRunner
 from dataflow.graph.model import Graph
-from dataflow.recording import Recording
+from dataflow.recording import Recorded, Recording
 from dataflow.records.firing import FiringRecord
 from dataflow.reexecution.engine import Feeding
 from dataflow.reexecution.recorded_run import ReplayError, final_stamps
 from dataflow.sync import FOREVER, NEVER, TICK, Entry
 
+EACH = 1000
+"""Bytes that a message takes in memory besides its arrays."""
 Figures = Mapping[str, Mapping[str, Any]]
 """By operator, what it summed up."""
 
 
 class Branch:
-    """The operators of a feeding, fed from a recording. `held`: the losses of each operator."""
+    """The operators of a feeding, fed from a recording, with what they lost."""
 
     def __init__(
-        self, path: Path, graph: Graph, feeding: Feeding, players: Mapping[str, Player], losses: Collection[Loss]
+        self,
+        recording: Recording,
+        graph: Graph,
+        feeding: Feeding,
+        players: Mapping[str, Player],
+        losses: Collection[Loss],
     ) -> None:
-        self._path, self._graph, self._feeding, self._players, self._losses = path, graph, feeding, players, losses
+        self._graph, self._feeding, self._players = graph, feeding, players
+        self._losses, self._finals = losses, final_stamps(recording, feeding.streams)
+        self._read = _Read(recording)
         self.records: dict[str, list[FiringRecord]] = {}
         """The firing records of the last replay, by operator."""
 
@@ -45,14 +53,13 @@ class Branch:
         for name in self._feeding.operators:
             held = [loss for loss in left if loss.operator == name]
             driver.add(HeldRunner(graph, self._players[name], emitter, held))
-        recording = Recording(self._path)
         makers = {stream: graph.streams[stream].node for stream in self._feeding.streams}
         feed = LogFeed(
-            recording,
+            self._read,
             makers,
             emitter,
             ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
-            finals=final_stamps(recording, makers),
+            finals=self._finals,
         )
         driver.feeding.play_back(feed)
         try:
@@ -65,6 +72,45 @@ class Branch:
         if waiting := [runner for runner in driver.operators if not runner.ended]:
             raise ReplayError(f"{waiting[0].node.name} waits for {waiting[0].waiting()} after all was given")
         return {name: found[-1].detail.get("summary", {}) for name, found in self.records.items()}
+
+
+class _Read:
+    """A recording that stays open, always asked for the same messages, which are kept where they are not too many."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self.path, self.streams, self.metadata = recording.path, recording.streams, recording.metadata
+        self.torn = recording.torn
+        self._held: list[Recorded] | None = None
+        self._keeps = True
+
+    def messages(
+        self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None
+    ) -> Iterator[Recorded]:
+        """The messages of streams."""
+        if self._held is not None:
+            yield from self._held
+            return
+        read: list[Recorded] = []
+        nbytes = 0
+        for item in self._recording.messages(streams, start, end):
+            nbytes += item.message.nbytes() + EACH
+            self._keeps = self._keeps and nbytes <= MOST_BYTES
+            if self._keeps:
+                read.append(item)
+            yield item
+        self._held = read if self._keeps else None
+
+    def stamps(self, stream: str, start: int | None = None, end: int | None = None) -> Iterator[int]:
+        """The stamps of a stream's messages."""
+        return self._recording.stamps(stream, start, end)
+
+    def opening(self) -> Mapping[str, Any] | None:
+        """What another process opens it by."""
+        return self._recording.opening()
+
+    def close(self) -> None:
+        """Leaves it open."""
 
 
 class _Keeping(HandOver):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.capture.reduce import smallest
+from dataflow.capture.reduce import needed, smallest
 from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, losses_of, sent_by
 from dataflow.drops.player import Player
@@ -185,7 +185,7 @@ class Drops:
             name: Player(self.graph.nodes[name], self.graph.seed, version, self._records.get(name, ()))
             for name in feeding.operators
         }
-        return Branch(self._recording.path, self.graph, feeding, self._players, losses)
+        return Branch(self._recording, self.graph, feeding, self._players, losses)
 
     def _search(self, branch: Branch, feeding: Feeding, losses: Sequence[Loss], began: float) -> Cost:
         before = self._replay(branch, ())
@@ -207,7 +207,9 @@ class Drops:
             except OperatorFailure:  # an operator cannot cope with what comes then: that heals nothing
                 return False
 
-        named = smallest(losses, heals)
+        named = needed(losses, heals)
+        if in_time:
+            named = smallest(named, heals)
         undone = self._replay(branch, named)
         again = self._branch(feeding, losses)
         if self.worse.values(self._replay(again, named)) != self.worse.values(undone):
@@ -238,6 +240,8 @@ class Drops:
             if node.source or name not in self._players:
                 continue
             there, here = _firings(self._records[name]), _firings(records)
+            while len(there) > len(here) and there[-1][1]:  # beats behind the end of all streams, by the clock
+                there.pop()
             if there != here:
                 k = next(
                     (k for k, (a, b) in enumerate(zip(there, here, strict=False)) if a != b), min(len(there), len(here))

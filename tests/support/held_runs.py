@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,14 +12,16 @@ from typing import Any
 import numpy as np
 
 from dataflow.api.local import Emitting, Recorder
+from dataflow.api.runs import metadata_of
 from dataflow.execution.driver import Driver
 from dataflow.execution.live import LiveRunner
 from dataflow.execution.log import FiringLog
 from dataflow.graph import Graph, load_text
+from dataflow.graph.model import Node
 from dataflow.messages import FeatureVector, Message
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
+from dataflow.recording import Recording
 from dataflow.records.firing import Emission
-from dataflow.api.runs import metadata_of
 from dataflow.sync import NEVER, Entry
 
 STAMP, MS = 10**18, 1_000_000
@@ -107,6 +111,35 @@ class Score(Operator):
         return {"end_error_m": self._errors[-1], "worst_error_m": max(self._errors), "turns": self._turns}
 
 
+class Beat(Operator, every="100ms"):
+    """Counts the estimates that its beats see."""
+
+    at: Sampled[FeatureVector]
+
+    def setup(self) -> None:
+        self._beats = 0
+
+    def process(self, at: FeatureVector) -> None:
+        self._beats += 1
+
+    def summary(self) -> Mapping[str, int]:
+        return {"beats": self._beats}
+
+
+class HalfSmooth(Smooth):
+    """Another version, which gives something else."""
+
+    def process(self, at: FeatureVector) -> FeatureVector:
+        return vector(at.stamp, float(at.vectors[0, 0]) / 2.0)
+
+
+class Chancy(Score):
+    """Its figure is another each time."""
+
+    def summary(self) -> Mapping[str, float]:
+        return {**super().summary(), "end_error_m": 10.0 + time.perf_counter()}
+
+
 TEXT = """
 graph: held
 record: {{snapshots: 2s}}
@@ -118,15 +151,16 @@ operators:
     live: {{queue: newest, size: 4, wait: 10ms}}
   smooth: {{use: 'held_runs:Smooth', inputs: {{at: odometry/at}}, live: {{queue: newest, size: 4}}}}
   aside: {{use: 'held_runs:Smooth', inputs: {{at: drive/step}}, live: {{queue: newest, size: 4}}}}
+  beat: {{use: 'held_runs:Beat', inputs: {{at: drive/step}}, live: {{queue: newest, size: 2, wait: 100ms}}}}
   score:
-    use: held_runs:Score
+    use: held_runs:{score}
     inputs: {{truth: drive/truth, at: smooth/out, turns: drive/turn}}
     live: {{queue: block, wait: 200ms}}
 """
 
 
-def graph(steps: int = 1000) -> Graph:
-    return load_text(TEXT.format(steps=steps))
+def graph(steps: int = 1000, score: str = "Score") -> Graph:
+    return load_text(TEXT.format(steps=steps, score=score))
 
 
 @dataclass
@@ -137,12 +171,17 @@ class Faults:
     still: Sequence[tuple[str, int, int]] = ()
 
 
-def recorded(graph: Graph, faults: Faults, path: Path) -> Path:
-    """Makes and records the run: time goes on by 5 ms, messages arrive, operators that do not stand still work."""
+def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None = None) -> Path:
+    """Makes and records the run: time goes on by 5 ms, messages arrive, operators that do not stand still work.
+
+    `played`: a recording of the source's messages.
+    """
     clock = [0.0]
     driver = Driver()
     emitter = Emitting(driver)
-    emitter.recorder = Recorder(path, graph, set(graph.streams), {"metadata": metadata_of(graph, "run"), "overwrite": False})
+    emitter.recorder = Recorder(
+        path, graph, set(graph.streams), {"metadata": metadata_of(graph, "run"), "overwrite": False}
+    )
     for node in graph.nodes.values():
         if not node.source:
             live = LiveRunner(
@@ -156,9 +195,9 @@ def recorded(graph: Graph, faults: Faults, path: Path) -> Path:
             )
             driver.add(live)
     driver.set_up()
-    arrivals = _arrivals(graph, faults, emitter)
+    arrivals = _arrivals(graph, faults, emitter, played)
     due = 0
-    end = arrivals[-1][0] + 2000 * MS
+    end = arrivals[-1][0] + 10 * MS
     for now in range(0, end, 5 * MS):
         clock[0] = now * 1e-9
         while due < len(arrivals) and arrivals[due][0] <= now:
@@ -170,10 +209,10 @@ def recorded(graph: Graph, faults: Faults, path: Path) -> Path:
             for runner in driver.operators:
                 if runner.node.name not in still:
                     runner.step()
-    for stream in graph.streams:
-        if graph.nodes[graph.streams[stream].node].source:
+    for stream, made in graph.streams.items():
+        if graph.nodes[made.node].source and not made.static:
             emitter.end(stream, None, "end of source")
-    for now in range(end, end + 3000 * MS, 50 * MS):
+    for now in range(end, end + 1000 * MS, 50 * MS):
         clock[0] = now * 1e-9
         for runner in driver.operators:
             while runner.step():
@@ -184,32 +223,50 @@ def recorded(graph: Graph, faults: Faults, path: Path) -> Path:
     return path
 
 
-def _arrivals(graph: Graph, faults: Faults, emitter: Any) -> list[tuple[int, str, Entry]]:
+def _arrivals(graph: Graph, faults: Faults, emitter: Any, played: Recording | None) -> list[tuple[int, str, Entry]]:
     """(when, ns; stream; message) of what the source sends, in order of the time of arrival; records its firings."""
     (node,) = graph.sources()
     log = FiringLog(node.name, emitter)
     numbers = dict.fromkeys(node.outputs, 0)
     found: list[tuple[int, str, Entry]] = []
     latest = dict.fromkeys(node.outputs, NEVER)
-    log.add("setup", NEVER + 1, 0, outputs=(None,) * len(node.outputs), detail={"params": dict(node.params)})
-    for step in node.make().stream():  # type: ignore[attr-defined]
-        outputs = []
-        for port, stream in node.outputs.items():
-            message = step.get(port)
-            if message is None:
-                outputs.append(None)
-                continue
-            k = numbers[port]
-            numbers[port] += 1
-            digest = message.digest()
-            outputs.append(Emission(k, message.stamp, digest))
-            when = message.stamp - STAMP + faults.late.get((port, k), 0) * MS
-            latest[port] = when = max(when, latest[port])  # a stream keeps its order
-            found.append((when, stream, Entry(message.stamp, message, k, 0, digest, stream)))
-        log.add("fire", message_stamp(step), 0, outputs=tuple(outputs))
-    log.add("finish", message_stamp(step), 0, outputs=(None,) * len(node.outputs))
+    last = STAMP
+    static, steps = ({}, node.make().stream()) if played is None else _played(played, node)  # type: ignore[attr-defined]
+    outputs = [_sent(static.get(port), stream, 0) for port, stream in node.outputs.items()]
+    log.add("setup", NEVER + 1, 0, outputs=_emissions(outputs), detail={"params": dict(node.params)})
+    for entry in filter(None, outputs):
+        emitter.message(entry.stream, entry)
+        emitter.end(entry.stream, None, "static")
+    for step in steps:
+        outputs = [_sent(step.get(port), stream, numbers[port]) for port, stream in node.outputs.items()]
+        for port, entry in zip(node.outputs, outputs, strict=True):
+            if entry is not None:
+                when = entry.stamp - STAMP + faults.late.get((port, numbers[port]), 0) * MS
+                latest[port] = when = max(when, latest[port])  # a stream keeps its order
+                found.append((when, entry.stream, entry))
+                numbers[port] += 1
+                last = entry.stamp
+        log.add("fire", last, 0, outputs=_emissions(outputs))
+    log.add("finish", last, 0, outputs=(None,) * len(node.outputs))
     return sorted(found, key=lambda one: (one[0], one[2].stamp))
 
 
-def message_stamp(step: Mapping[str, Message]) -> int:
-    return next(iter(step.values())).stamp
+def _sent(message: Message | None, stream: str, number: int) -> Entry | None:
+    return None if message is None else Entry(message.stamp, message, number, 0, message.digest(), stream)
+
+
+def _emissions(sent: Sequence[Entry | None]) -> tuple[Emission | None, ...]:
+    return tuple(None if entry is None else Emission(entry.seq, entry.stamp, entry.digest) for entry in sent)
+
+
+def _played(recording: Recording, node: Node) -> tuple[dict[str, Message], Iterator[Mapping[str, Message]]]:
+    """What a source gave in a recording: its static messages by port, and its steps, from the stamp `STAMP` on."""
+    ports = {stream: port for port, stream in node.outputs.items() if stream in recording.streams}
+    there = list(recording.messages(list(ports)))
+    static = {ports[item.stream]: item.message for item in there if recording.streams[item.stream].static}
+    moving = [item for item in there if not recording.streams[item.stream].static]
+    ahead = STAMP - min(item.message.stamp for item in moving)
+    steps = itertools.groupby(moving, key=lambda item: item.message.stamp)
+    return static, (
+        {ports[item.stream]: item.message.replace(stamp=stamp + ahead) for item in items} for stamp, items in steps
+    )
