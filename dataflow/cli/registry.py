@@ -120,6 +120,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("debug:debug", MAKE),
     Command("debug:capture", MAKE),
     Command("blame:blame", MAKE),
+    Command("blame:drops", MAKE),
     Command("sweep:sweep", MAKE),
     Command("compare:compare", MAKE),
     Command("inspection:check", LOOK),

@@ -1,4 +1,4 @@
-"""What another machine needs to run its operators: their code, compared by digest, and their files, which are sent.
+"""The needs of another machine: the code of its operators, compared by digest, and their files, which are sent.
 
 Code is installed, never sent: a difference is an error that names the file. Files are those that parameters name by a
 relative path (weights, calibrations); they are sent into the agent's folder, in which its processes run. A file that is

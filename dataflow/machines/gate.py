@@ -1,8 +1,8 @@
 """The gate of one machine, through which its processes send to those of other machines, and get from them.
 
 To its own machine's processes a gate is one more process, linked to them by rings. A stream passes to each other
-machine once, whoever takes it there. Control messages pass through the same pipe, behind what was sent before them: so,
-as on one machine, what a process had sent when it reported something has arrived where that is heard.
+machine once, however many processes take it there. Control messages pass through the same pipe, behind what was sent
+before them: so, as on one machine, what a process had sent when it reported something has arrived where that is heard.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Gate:
         """The messages and ends of static streams: a process that was started again gets them again."""
         self._counted = ""
         self.extra = 0
-        """Envelopes that arrived at processes here beyond one for each that came, for the proof of quiescence."""
+        """Copies that were made of envelopes beyond one of each, for the proof of quiescence."""
         self.malformed = 0
 
     def handle(self, item: tuple[Any, ...]) -> None:
@@ -117,17 +117,27 @@ class Gate:
     # Out
 
     def _leave(self, key: str, payload: bytes) -> None:
-        droppable = self._droppable(key, payload)
+        head = None if key in self._routes.raw else decode_head(payload)
         frame = _KEY.pack(self._numbers[key]) + payload
-        for machine in self._routes.takers.get(key, ()):
-            if machine in self._pipes:
-                self._pipes[machine].send(frame, droppable=droppable)
+        self._count(head, self._send(key, frame, head, but=None))
 
-    def _droppable(self, key: str, payload: bytes) -> bool:
-        if key in self._routes.raw or key in self._routes.static:
+    def _send(self, key: str, frame: bytes, head: Head | None, *, but: str | None) -> int:
+        """Sends a frame to the machines that take its key; returns how many those are."""
+        sent = 0
+        for machine in self._routes.takers.get(key, ()):
+            if machine != but and machine in self._pipes:
+                self._pipes[machine].send(frame, droppable=self._droppable(key, head))
+                sent += 1
+        return sent
+
+    def _droppable(self, key: str, head: Head | None) -> bool:
+        if head is None or key in self._routes.static:
             return False
-        head = decode_head(payload)
         return head.kind in (Kind.MESSAGE, Kind.PROBE) or (head.kind is Kind.FRONTIER and head.stamp != NEVER)
+
+    def _count(self, head: Head | None, copies: int) -> None:
+        if head is None or head.kind is not Kind.PROBE:
+            self.extra += copies - 1
 
     # In
 
@@ -145,21 +155,16 @@ class Gate:
             self.malformed += 1
             print(f"dropped a malformed frame from machine {machine!r}: {error}", file=sys.stderr)
             return
-        for other in self._routes.takers.get(key, ()):
-            if other != machine and other in self._pipes:
-                self._pipes[other].send(frame, droppable=head is not None and self._droppable(key, payload))
-        self._deliver(key, payload, head)
+        sent = self._send(key, frame, head, but=machine)
+        self._count(head, sent + self._deliver(key, payload, head))
 
-    def _deliver(self, key: str, payload: bytes, head: Head | None) -> None:
-        if key in self._routes.static and head is not None and head.kind in (Kind.MESSAGE, Kind.END):
-            if head.kind is Kind.MESSAGE:
-                self._once[key] = [payload]
-            else:
-                self._once.setdefault(key, []).append(payload)
+    def _deliver(self, key: str, payload: bytes, head: Head | None) -> int:
+        """Sends an envelope to the processes here that take its key; returns how many those are."""
         if head is None:
-            self.extra += self._fanout.send(key, [payload], droppable=False) - 1
-            return
+            return self._fanout.send(key, [payload], droppable=False)
+        if key in self._routes.static and head.kind is Kind.MESSAGE:
+            self._once[key] = [payload]
+        elif key in self._routes.static and head.kind is Kind.END:
+            self._once.setdefault(key, []).append(payload)
         said = Envelope(head.kind, head.stream, head.incarnation, head.seq, head.stamp, None, head.reason, head.wall)
-        sent = self._fanout.send(key, [payload], said, droppable=self._droppable(key, payload))
-        if head.kind is not Kind.PROBE:
-            self.extra += sent - 1
+        return self._fanout.send(key, [payload], said, droppable=self._droppable(key, head))

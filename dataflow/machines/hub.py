@@ -162,7 +162,7 @@ class Hub:
             self._channel.send("busy", machine=name)
 
     def _said(self, machine: str, word: Word) -> None:
-        """Passes on what an agent says. What its process had sent before it closed has arrived first."""
+        """Passes on a word of an agent. What its process had sent before it closed has arrived first."""
         label, kind, fields = word
         if kind == "said" and fields["kind"] == "closed":
             self._gate.push_all()

@@ -1,7 +1,7 @@
 """The agent of a machine: the hand of a supervisor that runs elsewhere. It starts, watches and ends processes here.
 
-It waits for a run, takes part in it, and waits for the next one. What it starts ends with it, and with the run: when
-the supervisor was not heard for too long, too.
+It waits for a run, takes part in it, and waits for the next one. Its processes end with it, with the run, and when
+the supervisor is not heard for too long.
 """
 
 from __future__ import annotations

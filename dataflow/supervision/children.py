@@ -1,6 +1,6 @@
 """The processes of a run on one machine: started, listened to, signalled and buried, by the supervisor or its agent.
 
-What happens to them is fed on as events; what is to be done comes as calls. Nothing here waits, but `bury`.
+Their news are fed on as events, orders come as calls. Nothing here waits, but `bury`.
 """
 
 from __future__ import annotations

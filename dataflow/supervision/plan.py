@@ -146,8 +146,7 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
 
     streams = set(graph.streams)
     if plan.log is not None:
-        silent = {s for s in streams if graph.streams[s].node in replaced} - set(plan.log.streams)
-        streams -= silent
+        streams -= {s for s in streams if graph.streams[s].node in replaced} - set(plan.log.streams)
 
     made_in = {stream: labels[graph.streams[stream].node] for stream in streams}
     taken_in: dict[str, set[str]] = {stream: set() for stream in streams}

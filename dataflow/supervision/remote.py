@@ -73,8 +73,9 @@ class Remote:
             "live": self._plan.live,
         }
 
-    def _routes(self) -> Routes:
-        """Returns what passes between machines; the supervisor's is called ""."""
+    def _routes(self, of: str = "") -> Routes:
+        """Returns what passes between machines, as one of them sends it; the supervisor's is called "", and is the only
+        one that others send to."""
         graph = self._plan.graph
         takers: dict[str, list[str]] = {}
         for (maker, _), keys in self._pairs.items():
@@ -84,6 +85,8 @@ class Remote:
                         takers.setdefault(key, []).append(machine)
         raw = frozenset(firings_key(graph.namespace, node) for node in graph.nodes)
         takers = {key: sorted(set(machines)) for key, machines in takers.items()}
+        if of:
+            takers = {key: [""] if set(machines) - {of} else [] for key, machines in takers.items()}
         return Routes(sorted(takers), takers, graph.static & takers.keys(), raw & takers.keys())
 
     # Before the run
@@ -126,7 +129,7 @@ class Remote:
             processes=[asdict(self._processes[label]) for label in labels],
             pairs=[[*pair, list(keys)] for pair, keys in self._pairs.items() if {*labels, gate} & set(pair)],
             gate=link_of(self._plan.live, self._processes, self._pairs, gate),
-            routes=self._routes().to_json(),
+            routes=self._routes(machine).to_json(),
             threads={name: wanted[name] for name in THREADS},
             live=self._plan.live,
         )

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import HERE, end, join
+from joined_agents import HERE, end, join
 from relay import Relay
 
 from dataflow.graph import load_text

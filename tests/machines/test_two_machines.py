@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
-from conftest import HERE, Robot, end, join
+from joined_agents import HERE, Robot, end, join
 
 from dataflow.graph import load_text
 from dataflow.supervision.core.report import RunFailed, RunReport
@@ -20,16 +20,19 @@ from dataflow.supervision.plan import Meeting
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
 
+RUNTIME = HERE.parent / "runtime"
+sys.path.append(str(RUNTIME))
 GRAPH = """\
 graph: two
 namespace: test
 operators:
   sensor: {use: "machine_operators:Sensor", params: {steps: 120, size: SIZE}, machine: robot, MORE}
-  here: {use: "machine_operators:Scale", inputs: {x: sensor/count}}
-  there: {use: "machine_operators:Scale", inputs: {x: here/y}, machine: robot, process: own}
-  beside: {use: "machine_operators:Scale", inputs: {x: sensor/count}, machine: robot, process: own}
+  here: {use: "machine_operators:Scale", inputs: {x: sensor/count}, live: {queue: block}}
+  there: {use: "machine_operators:Scale", inputs: {x: here/y}, machine: robot, process: own, live: {queue: block}}
+  beside: {use: "machine_operators:Scale", inputs: {x: sensor/count}, machine: robot, process: own,
+    live: {queue: block}}
   witness: {use: "machine_operators:Witness", inputs: {x: here/y}, machine: robot, process: own}
-  last: {use: "machine_operators:Scale", inputs: {x: there/y}}
+  last: {use: "machine_operators:Scale", inputs: {x: there/y}, live: {queue: block}}
 """
 
 
@@ -115,7 +118,7 @@ def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:
 @pytest.mark.long
 def test_a_supervisor_that_is_killed_leaves_no_operators_and_the_machine_takes_the_next_run(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
-    agent = join("robot", endpoint, tmp_path / "files", "--patience", "2")
+    agent = join("robot", endpoint, tmp_path / "files", "--timeout", "2")
     graph = tmp_path / "two.yaml"
     graph.write_text(GRAPH.replace("SIZE", "1").replace(", MORE", "").replace("steps: 120", "steps: 1000000"))
     command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--live", "--listen", endpoint, "--quiet"]
@@ -138,3 +141,32 @@ def await_(condition: Callable[[], bool], within: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+@pytest.mark.long
+def test_streams_of_a_run_are_equal_on_one_two_and_three_machines(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
+    agents = [join(name, endpoint, tmp_path / name, code=RUNTIME) for name in ("robot", "arm")]
+    steps = "params: {count: 200, ratio: 4}"
+    digests = []
+    for left, smooth in ((None, None), ("robot", None), ("robot", "arm")):
+        places = {"LEFT": left, "SMOOTH": smooth}
+        text = (
+            "graph: three\nnamespace: test\noperators:\n"
+            f"  left: {{use: 'runtime_operators:Counter', {steps}LEFT}}\n"
+            "  smooth: {use: 'runtime_operators:Smooth', inputs: {x: left/fast}SMOOTH}\n"
+            "  sum: {use: 'runtime_operators:Sum', inputs: {x: smooth/mean}}\n"
+        )
+        for word, machine in places.items():
+            text = text.replace(word, f", machine: {machine}" if machine else "")
+        digests.append(run(load_text(text), machines=Meeting(endpoint), window=(16, 1 << 20)).streams)
+
+    for agent in agents:
+        end(agent)
+    assert digests[0] == digests[1] == digests[2]
+    assert digests[0]["test/smooth/mean"][0] > 100
+
+
+def test_a_placement_that_puts_two_machines_into_one_process_is_refused(robot: Robot) -> None:
+    with pytest.raises(ValueError, match=r"process 'all' would be on several machines \(robot, this one\)"):
+        two(robot, placement="one_process")

@@ -14,7 +14,7 @@ Authority = Annotated[Path, typer.Option("--authority", metavar="FOLDER", help="
 
 
 def join(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name: what `machine:` says in graphs.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name in graphs (`machine:`).")],
     connect: Annotated[
         str, typer.Option("--connect", metavar="ENDPOINT", help="Where the run listens (`dataflow run --listen`).")
     ],
@@ -23,16 +23,16 @@ def join(
         Path, typer.Option("--folder", metavar="FOLDER", help="Where operators run, and files that are sent lie.")
     ] = Path("dataflow-agent"),
     path: ModuleFolders = None,
-    patience: Annotated[
+    timeout: Annotated[
         float,
-        typer.Option("--patience", metavar="SECONDS", help="Operators go on for so long without the supervisor."),
+        typer.Option("--timeout", metavar="SECONDS", help="Operators go on for so long without the supervisor."),
     ] = 30.0,
     once: Annotated[bool, typer.Option("--once", metavar=FLAG, help="End after one run.")] = False,
 ) -> None:
     """Let this machine take part in graphs that run elsewhere.
 
     It waits for a run, compares its code with the run's, takes the files that it lacks, and starts, watches and ends
-    the operators that the graph gives to it. When the supervisor is not heard for too long (--patience), it ends
+    the operators that the graph gives to it. When the supervisor is not heard for too long (--timeout), it ends
     them. Then it waits for the next run; Ctrl-C ends it.
 
     Examples:
@@ -45,7 +45,7 @@ def join(
 
     find_modules_in(path)
     with friendly_errors():
-        agent = Agent(name, connect, keys, folder, say, patience=patience)
+        agent = Agent(name, connect, keys, folder, say, patience=timeout)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: agent.stop())
         agent.run(once=once)
@@ -54,7 +54,7 @@ def join(
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder to make.")],
 ) -> None:
-    """Make an authority, which issues keys. Its folder stays where it is: whoever has it can issue keys.
+    """Make an authority, which issues keys. Its folder stays where it is: who has it can issue keys.
 
     Examples:
 
