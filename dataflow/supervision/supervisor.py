@@ -13,6 +13,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.threads import environment
@@ -28,10 +29,12 @@ from dataflow.supervision.core.report import RunFailed, RunReport, Status
 from dataflow.supervision.early_nursery import EarlyNursery
 from dataflow.supervision.nursery import Nursery, adopting
 from dataflow.supervision.plan import LINK, RunPlan, process_plans
-from dataflow.supervision.remote import Remote
 from dataflow.supervision.rings import Pairs, Rings, pairs_of
 from dataflow.transport import registry, reserve_endpoints
 from dataflow.transport.log_file import LogFile
+
+if TYPE_CHECKING:
+    from dataflow.supervision.remote import Remote
 
 TICK = 0.05
 PART_WITHIN = 4.0
@@ -139,6 +142,8 @@ class Supervisor:
 
     def _meet(self, pairs: Pairs) -> None:
         """Waits (bounded) until the other machines of the graph are there and have what they need."""
+        from dataflow.supervision.remote import Remote  # most runs need no network
+
         meeting = self.plan.machines
         assert meeting is not None
         self._remote = Remote(
