@@ -1,48 +1,15 @@
-"""An agent that plays the other machine, and keys for both."""
+"""An agent that plays the other machine."""
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
-import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
+from agents import HERE, Robot, end, join
 
-HERE = Path(__file__).resolve().parent
 sys.path.append(str(HERE))
-END_WITHIN = 20.0
-
-
-@dataclass(frozen=True, slots=True)
-class Robot:
-    """A machine that has joined: where runs have to listen, the agent's folder, and that of its code."""
-
-    endpoint: str
-    folder: Path
-    code: Path
-    process: subprocess.Popen[str]
-
-
-def join(name: str, connect: str, folder: Path, *words: str, code: Path = HERE) -> subprocess.Popen[str]:
-    """Starts an agent, which finds operators in `code`."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "dataflow.cli.main", "join", name, "--connect", connect, "--folder", folder, *words],
-        env={**os.environ, "PYTHONPATH": str(code)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def end(process: subprocess.Popen[str]) -> str:
-    """Ends an agent in order; returns what it said."""
-    process.send_signal(signal.SIGTERM)
-    return process.communicate(timeout=END_WITHIN)[0]
 
 
 @pytest.fixture(scope="session")

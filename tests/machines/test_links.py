@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import HERE, end, join
-from relay import Relay
+from agents import HERE, end, join
+from link_relay import Relay
 
 from dataflow.graph import load_text
 from dataflow.machines.keys import TOOLS, KeysError, issue, new_authority, settings
