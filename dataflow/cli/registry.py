@@ -120,6 +120,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("debug:debug", MAKE),
     Command("debug:capture", MAKE),
     Command("blame:blame", MAKE),
+    Command("blame:drops", MAKE),
     Command("sweep:sweep", MAKE),
     Command("compare:compare", MAKE),
     Command("inspection:check", LOOK),
@@ -145,6 +146,8 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("following.live:echo", FOLLOW, elsewhere=True),
     Command("following.live:hz", FOLLOW, elsewhere=True),
     Command("following.top:top", FOLLOW, elsewhere=True),
+    Command("following.health:health", FOLLOW),
+    Command("following.health:metrics", FOLLOW),
     Command("following.logs:logs", FOLLOW),
     Command("following.pub:pub", FOLLOW, elsewhere=True),
     Command("following.reload:reload", FOLLOW),
@@ -162,7 +165,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow new operator NearestObstacle
           dataflow new graph obstacle_watch
         """,
-        (Command("new:operator"), Command("new:graph"), Command("new:project")),
+        (Command("new:operator"), Command("new:graph"), Command("new:project"), Command("new:service")),
     ),
     Family(
         "keys",

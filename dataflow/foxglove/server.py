@@ -13,6 +13,9 @@ from dataflow.messages import Message
 from dataflow.recording.streams.frames import FrameTree
 
 FRAMES = "/frames"
+LOOPBACK = "127.0.0.1"
+BACKLOG = 256
+"""Messages that wait for a client that is slow; then its oldest are dropped. Other clients do not wait."""
 
 
 class Topics:
@@ -27,11 +30,6 @@ class Topics:
         for transforms in self._frames.transforms(stream, message):
             yield FRAMES, transforms
         yield f"/{stream.removeprefix(self._prefix).lstrip('/')}", message
-
-
-LOOPBACK = "127.0.0.1"
-BACKLOG = 256
-"""Messages that wait for a client that is slow; then its oldest are dropped. Other clients do not wait."""
 
 
 class FoxgloveError(RuntimeError):

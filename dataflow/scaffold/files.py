@@ -5,7 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -95,6 +95,35 @@ def project_files(name: str) -> Mapping[Path, str]:
         Path("tests", "test_brightness.py"): operator[Path("test_brightness.py")],
         Path("tests", "test_graphs.py"): templates.GRAPH_TEST.substitute(words),
     }
+
+
+def service_files(
+    name: str, command: Sequence[str], *, folder: Path, out: Path, user: str, days: int
+) -> Mapping[Path, str]:
+    """A unit of systemd that runs `command` in `folder` as `user`, and what deletes files in `out` after `days`.
+
+    Raises `NameFault` for a name that systemd does not take.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_.-]+", name):
+        raise NameFault(f"{name!r} cannot be the name of a service: write letters, digits, '_', '-' and '.'")
+    words = {
+        "name": name,
+        "user": user,
+        "folder": str(folder).replace("%", "%%"),
+        "command": " ".join(map(_systemd_word, command)),
+        "out": _systemd_word(str(out)),
+        "days": str(days),
+    }
+    return {
+        Path(f"{name}.service"): templates.SERVICE.substitute(words),
+        Path(f"{name}.conf"): templates.SERVICE_FILES.substitute(words),
+    }
+
+
+def _systemd_word(word: str) -> str:
+    """A word as a unit of systemd has it: '%' and '$' doubled, quoted where it has spaces or quotes."""
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    return f'"{escaped}"' if re.search(r"""[\s"']""", word) else escaped
 
 
 def _trimmed(text: str) -> str:

@@ -404,3 +404,36 @@ __pycache__/
 *.egg-info/
 /out/
 """
+
+SERVICE = Template("""\
+# $name, started with the machine. To install it:
+#   sudo cp $name.service /etc/systemd/system/ && sudo cp $name.conf /etc/tmpfiles.d/
+#   sudo systemctl daemon-reload && sudo systemctl enable --now $name
+[Unit]
+Description=dataflow graph $name
+After=network.target
+StartLimitIntervalSec=0
+
+[Service]
+User=$user
+WorkingDirectory=$folder
+RuntimeDirectory=$name
+RuntimeDirectoryMode=0700
+Environment=XDG_RUNTIME_DIR=%t/$name
+ExecStart=$command
+# SIGTERM to the supervisor alone: it ends the others in order, and has up to 60 s to close its files
+KillMode=mixed
+TimeoutStopSec=75
+# a new run after a failure that the graph's restart policies do not cover
+Restart=on-failure
+RestartSec=2
+LimitNOFILE=8192
+
+[Install]
+WantedBy=multi-user.target
+""")
+
+SERVICE_FILES = Template("""\
+# systemd-tmpfiles: deletes recordings of $name older than $days days; a run itself bounds its files
+d $out - - - ${days}d
+""")

@@ -19,6 +19,7 @@ from dataflow.sweep.work import Result, perform
 
 AHEAD = 4
 """Tasks handed to a cluster for each of its processors, so that none waits for this process."""
+MOST_JOBS = 256
 
 
 def local(tasks: Sequence[Task], jobs: int, timeout: float) -> Generator[tuple[Task, Result]]:
@@ -82,9 +83,6 @@ def on_ray(
     finally:
         with suppress(Exception):  # an interrupted cluster that does not answer must not hide why it was left
             ray.shutdown()
-
-
-MOST_JOBS = 256
 
 
 @dataclass(slots=True)

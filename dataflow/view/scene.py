@@ -16,6 +16,17 @@ from dataflow.view.frames import Attach, Change, Detach, FrameTree, Matrix, NewR
 from dataflow.view.layout import Layout, is_truth
 from dataflow.view.viewpoint import Vector, Viewpoint
 
+SCENE = "/scene"
+"""Entity of the drawing frame: the origin of the 3-D view."""
+FRAMES = "/frames"
+"""Entities of the frames: `/frames/<name>`."""
+TIMELINE = "stamp"
+"""The one timeline: event time."""
+VIEWER_LOG = "/viewer/log"
+"""Entity of what the viewer itself has to say."""
+ASSUMPTION_GRACE = 1_000_000_000
+"""Event time (ns) for which a frame may stay unplaced before the viewer reports it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Offer:
@@ -59,22 +70,6 @@ class Unshown:
         if owner is not None:
             return None
         return offer if offer.static or self._wanted.setdefault(child, stamp) < stamp else None
-
-
-SCENE = "/scene"
-"""Entity of the drawing frame: the origin of the 3-D view."""
-
-FRAMES = "/frames"
-"""Entities of the frames: `/frames/<name>`."""
-
-TIMELINE = "stamp"
-"""The one timeline: event time."""
-
-VIEWER_LOG = "/viewer/log"
-"""Entity of what the viewer itself has to say."""
-
-ASSUMPTION_GRACE = 1_000_000_000
-"""Event time (ns) for which a frame may stay unplaced before the viewer reports it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,9 @@ from operators.status import counted_status
 _FADES = 0.9  # share of what walls said before that a cloud leaves
 _ENOUGH = 1.0  # m² of wall
 _AGREED = 0.9  # length of the mean of unit vectors at four times the angle: half of them within 4 degrees
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+_THICKNESS = 0.02  # metres, of a surface's box
 
 
 class WallDirections(Remembered):
@@ -55,12 +58,6 @@ class WallDirections(Remembered):
         angle = math.atan2(self._sum.imag, self._sum.real) / 4
         c, s = math.cos(angle), math.sin(angle)
         return np.array([[c, s, 0.0], [-s, c, 0.0]])
-
-
-Array = NDArray[np.float64]
-Labels = NDArray[np.int32]
-
-_THICKNESS = 0.02  # metres, of a surface's box
 
 
 @dataclass

@@ -26,6 +26,8 @@ from operators.status import counted_status
 Values = NDArray[np.float64]
 
 _SAMPLES = 100
+Nearness = NDArray[np.float32]
+LEAST_CONTRAST = 4.0  # standard deviation of grey levels below which an image shows nothing
 
 
 @dataclass(frozen=True)
@@ -84,11 +86,6 @@ def _candidates(nearness: Values, inverse: Values, rng: np.random.Generator, shi
         a = a[nearness[a] > 0]
         found = np.column_stack([inverse[a] / nearness[a], np.zeros(len(a))])
     return np.asarray(found[found[:, 0] > 0])
-
-
-Nearness = NDArray[np.float32]
-
-LEAST_CONTRAST = 4.0  # standard deviation of grey levels below which an image shows nothing
 
 
 class MonoDepth(Operator):

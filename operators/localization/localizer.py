@@ -49,6 +49,7 @@ _LEVELS = {
     "waiting": Level.WARN,
     "lost": Level.ERROR,
 }
+Array = NDArray[np.float64]
 
 
 def written(pose: Array) -> str:
@@ -89,9 +90,6 @@ def status_of(
             places = {"pose": written(own.mean)} | ({} if own.other is None else {"other place": written(own.other)})
             rows.append((f"{name} alone", text, Level.WARN if off else Level.OK, places))
     return status_of_rows(stamp, rows)
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(kw_only=True)

@@ -39,6 +39,10 @@ _HIDDEN, _LAST = 64, 48
 _LEVELS = 64.0
 _SURE = 3.0
 """A preference beyond which a class is sure."""
+_ROWS, _KEPT = 900_000, 1500
+"""Blocks that are kept to learn from, of all images and of one, at most: they stay in memory, 0.6 kB each."""
+Batch = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Pixels, preferences, first and second class, and the true class of each pixel, of N blocks."""
 
 
 class BorderNetwork(nn.Module):
@@ -94,13 +98,6 @@ class DeployedBorders(nn.Module):
         sums = pixels.flatten(1).float() @ self.get_buffer("whole")
         seen = sums * self.get_buffer("step") + self.network.seen.bias
         return self.network.decide(seen, preferences, first, second)
-
-
-_ROWS, _KEPT = 900_000, 1500
-"""Blocks that are kept to learn from, of all images and of one, at most: they stay in memory, 0.6 kB each."""
-
-Batch = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Pixels, preferences, first and second class, and the true class of each pixel, of N blocks."""
 
 
 class BorderTask(SecondTask[MaskedImage, Batch]):

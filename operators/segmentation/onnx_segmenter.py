@@ -21,6 +21,8 @@ from operators.segmentation.drawing import draw_segmentation
 from operators.segmentation.labelled import labelled, least_of
 from operators.status import Row, status_of_rows
 
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, by which most were trained
+
 
 def scores_of(output: NDArray[Any], classes: int | None, probabilities: bool) -> NDArray[np.float32]:
     """Returns scores (C, H, W) of an output (1, C, H, W), or (1, H, W, C) where that alone fits so many classes.
@@ -67,9 +69,6 @@ def best_of(scores: NDArray[np.float32], probabilities: bool) -> tuple[NDArray[n
     if probabilities:
         return best, np.clip(highest, 0, 1)
     return best, (1 / np.exp(scores - highest).sum(axis=0, dtype=np.float32)).astype(np.float32)
-
-
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, by which most were trained
 
 
 class OnnxSegmenter(Operator):

@@ -5,12 +5,21 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
+
+from dataflow.cli.support.debug_shell import Shell
+from dataflow.debugging.debugger import Debugger
+from dataflow.messages.base import Message
+from dataflow.recording import Recording
+from dataflow.sync.entries import entries_of
+from dataflow.view import ViewerSink
 
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
 LIVE = KEPT / "live.mcap"
@@ -83,6 +92,68 @@ def test_calls_are_json() -> None:
     assert json.loads(first)["number"] == 0
     assert json.loads(second) | {"same": True, "error": None, "operator": "tally"} == json.loads(second)
     assert last == "122 calls: all give what was recorded"
+
+
+def test_an_editor_is_served_until_it_leaves() -> None:
+    words = [sys.executable, "-m", "dataflow.cli.main", "debug", str(LIVE), "smooth@1", "--path", str(KEPT)]
+    with subprocess.Popen([*words, "--dap", "0"], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        host, port = server.stdout.readline().split()[5].split(":")
+        with socket.create_connection((host, int(port)), timeout=60) as editor, editor.makefile("rwb") as stream:
+            for seq, command in enumerate(("initialize", "launch", "configurationDone", "threads", "disconnect")):
+                data = json.dumps({"seq": seq, "type": "request", "command": command}).encode()
+                stream.write(b"Content-Length: %d\r\n\r\n%s" % (len(data), data))
+            stream.flush()
+            told = stream.read().decode()
+        assert server.wait(60) == 0
+    assert host == "127.0.0.1"
+    assert '"reason": "entry"' in told
+    assert '"name": "smooth call 29 of 42' in told
+    assert '"event": "terminated"' in told
+
+
+class Drawing:
+    """A viewer that only notes what it is given."""
+
+    def __init__(self) -> None:
+        self.drawn: list[tuple[str, int]] = []
+
+    def log(self, stream: str, message: Message) -> bool:
+        self.drawn.append((stream, message.stamp))
+        return True
+
+
+@pytest.fixture
+def prompt(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Shell, Drawing]]:
+    monkeypatch.syspath_prepend(str(KEPT))
+    with Recording(LIVE) as recording:
+        debugger, viewer = Debugger(recording, "smooth"), Drawing()
+        yield Shell(debugger, 0, viewer=cast(ViewerSink, viewer)), viewer
+        debugger.close()
+
+
+def test_the_viewer_is_given_what_calls_that_are_gone_to_were_given_and_made(prompt: tuple[Shell, Drawing]) -> None:
+    shell, viewer = prompt
+    shell.onecmd("goto 4")
+    shell.onecmd("goto 2")
+    fired = shell._debugger.at
+    assert fired is not None
+    given = [(entry.stream, entry.stamp) for value in fired.firing.inputs.values() for entry in entries_of(value)]  # type: ignore[union-attr]
+    made = [(each.stream, each.here.stamp) for each in fired.made if each.here is not None]
+    assert given
+    assert made
+    assert viewer.drawn[-len(given + made) :] == given + made
+    assert len(viewer.drawn) > len(given + made)
+
+
+def test_expressions_and_parts_of_the_state_are_completed(prompt: tuple[Shell, Drawing]) -> None:
+    shell, _ = prompt
+    assert shell.complete_print("out", "", 0, 0) == []
+    shell.onecmd("goto 4")
+    assert shell.complete_print("inp.", "", 0, 0) == [f"inp.{name}" for name in shell._debugger.node.inputs]
+    assert "out.mean.vectors" in shell.complete_until("out.mean.v", "", 0, 0)
+    before = shell._debugger.at.states()[0] if shell._debugger.at else None
+    assert shell.complete_state("", "", 0, 0) == sorted(before or ())
 
 
 @pytest.mark.long

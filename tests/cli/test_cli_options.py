@@ -88,6 +88,7 @@ ELSEWHERE: dict[str, tuple[str, str]] = {
     "completion": ("--install", "it writes into the home folder: test_cli_completion.py"),
     "run": ("--step", "it needs a terminal's keys: tests of playback"),
     "replay": ("--step --map --clock --strict", "a terminal, bags: test_cli_bags.py"),
+    "drops": ("*", "it needs losses: test_cli_drops.py"),
     "view": ("--import", "another file of Rerun: tests of the view"),
     "foxglove": ("--start --end --clock --speed --stream", "a server that goes on until Ctrl-C: tests/foxglove"),
     "verify": (

@@ -42,6 +42,7 @@ def test_the_json_report_stands_alone_on_stdout(recorded) -> None:
     assert report["files"]["@recorder"]["path"] == str(path)
 
 
+@pytest.mark.long
 def test_a_replay_makes_the_same_digests_and_diff_agrees(dataflow, recorded, tmp_path: Path) -> None:
     path, report = recorded
     again = tmp_path / "again.mcap"

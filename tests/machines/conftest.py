@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 
 import pytest
-from agents import HERE, Robot, end, join
+from joined_agents import HERE, Robot, end, join
 
 sys.path.append(str(HERE))
 

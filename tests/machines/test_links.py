@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from agents import HERE, end, join
+from joined_agents import HERE, end, join
 from link_relay import Relay
 
 from dataflow.graph import load_text

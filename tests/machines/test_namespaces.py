@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from agents import HERE, end
+from joined_agents import HERE, end
 
 from dataflow.graph import load_text
 from dataflow.machines.keys import issue, new_authority

@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
-from agents import HERE, Robot, end, join
+from joined_agents import HERE, Robot, end, join
 
 from dataflow.graph import load_text
 from dataflow.supervision.core.report import RunFailed, RunReport

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import sys
 import threading
 import time
@@ -12,7 +13,9 @@ from typing import Any
 
 import pytest
 from runtime_operators import number
+from typer.testing import CliRunner
 
+from dataflow.cli.main import app
 from dataflow.client.attach import find_running
 from dataflow.client.processes import Processes, processes_of
 from dataflow.graph import load_graph
@@ -75,7 +78,14 @@ def _forget() -> None:
         sys.modules.pop(name, None)
 
 
-def _run(folder: Path, act: Callable[[Processes, Supervisor], None]) -> Path:
+def _command(*words: str, code: int = 0) -> str:
+    """What `dataflow reload` prints."""
+    done = CliRunner().invoke(app, ["reload", *words, "--graph", "reloaded"])
+    assert done.exit_code == code, done.output
+    return done.stdout if code == 0 else done.stderr
+
+
+def _run(folder: Path, act: Callable[[Processes], None]) -> Path:
     """Runs the graph live while `act` does something to it; returns the recording."""
     recording = folder / "run.mcap"
     supervisor = Supervisor(RunPlan(load_graph(folder / "graph.yaml", live=True), live=True, record=recording))
@@ -84,7 +94,7 @@ def _run(folder: Path, act: Callable[[Processes, Supervisor], None]) -> Path:
     try:
         with processes_of(find_running("reloaded", wait=30)) as processes:
             _await_firings(processes, "after", 20)
-            act(processes, supervisor)
+            act(processes)
             _await_firings(processes, "after", 20)
     finally:
         supervisor.stop()
@@ -117,11 +127,13 @@ def _records(recording: Path, operator: str) -> list[Any]:
 def test_new_code_goes_on_with_the_state_and_the_run_verifies_identical(folder: Path) -> None:
     outcomes: list[dict[str, Any]] = []
 
-    def reload(processes: Processes, supervisor: Supervisor) -> None:
+    def reload(processes: Processes) -> None:
         for weight in (100, 10_000):
             (folder / "weights_reloaded.py").write_text(HELPER.replace("WEIGHT = 1", f"WEIGHT = {weight}"))
-            outcomes.append(processes.reload("sum", 30))
+            outcomes.append(json.loads(_command("sum", "--json")))
             _await_firings(processes, "after", 5)
+        assert "is a source, which holds its device" in _command("ticks", code=1)
+        assert "did you mean 'sum'?" in _command("sun", code=2)
 
     recording = _run(folder, reload)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -119,6 +120,33 @@ def test_a_name_that_python_has_already_is_refused(name: str, words: str) -> Non
 )
 def test_names_of_modules_and_classes(name: str, module: str, kind: str) -> None:
     assert (snake(name), camel(name)) == (module, kind)
+
+
+GRAPH = "graph: patrol\noperators:\n  camera: {use: operators.sources:SyntheticRgbd}\n"
+
+
+@pytest.mark.parametrize("flight", [False, True])
+def test_a_service_is_a_unit_that_systemd_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flight: bool) -> None:
+    folder = tmp_path / "my robot 100%"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    (folder / "patrol.yaml").write_text(GRAPH + ("record: {keep: 60s, folder: kept}\n" if flight else ""))
+
+    call("new", "service", "patrol.yaml", "--user", "root", "--days", "3")
+
+    unit = (folder / "patrol.service").read_text()
+    assert ("--keep-disk 20GB" in unit) == (not flight)
+    kept = (folder / "patrol.conf").read_text().splitlines()[-1]
+    assert kept == f'd "{str(folder).replace("%", "%%")}/{"kept" if flight else "out"}" - - - 3d'
+    assert "is there already" in call("new", "service", "patrol.yaml", code=2).stderr
+    assert "cannot be the name" in call("new", "service", "patrol.yaml", "--name", "a b", code=2).stderr
+    if (analyze := shutil.which("systemd-analyze")) is not None:
+        monkeypatch.setenv("SYSTEMD_LOG_LEVEL", "warning")
+        done = subprocess.run(
+            [analyze, "verify", folder / "patrol.service"], capture_output=True, text=True, timeout=60
+        )
+        about = [line for line in done.stderr.splitlines() if "patrol" in line]
+        assert (done.returncode, about) == (0, [])
 
 
 def test_the_page_shows_what_is_written() -> None:

@@ -1,9 +1,10 @@
-"""`dataflow blame`: what decided a value."""
+"""`dataflow blame`: what decided a value. `dataflow drops`: which lost messages cost a figure."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,11 +21,13 @@ from dataflow.cli.support.arguments import (
     find_modules_in,
     graph_file,
     number,
+    span,
 )
 from dataflow.cli.support.output import count, err, fail, friendly_errors, out, plural, print_json, seconds, table
 
 if TYPE_CHECKING:
     from dataflow.blame.chain import Chain, Effect, Link
+    from dataflow.drops.search import Cost
     from dataflow.graph import Graph
 
 MOST_ROWS = 40
@@ -94,6 +97,89 @@ def blame(
         _print(chain, field)
     if not chain.whole:
         raise typer.Exit(1)
+
+
+def drops(
+    recording: RecordingFile,
+    worse: Annotated[
+        str,
+        typer.Option("--worse", metavar="EXPRESSION", help='True of figures that are bad: "ate_rmse_m > 0.05".'),
+    ],
+    budget: Budget = 60.0,
+    graph: Annotated[
+        Path | None,
+        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
+    ] = None,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    json: Json = False,
+) -> None:
+    """Find which drops, late messages and timeouts of a live run cost its result.
+
+    The operators between them and the figures are replayed with some of them undone: these messages come in time. What
+    is named is a smallest set without which the figures are not worse: it suffices, and no part of it does. Another set
+    may, too. What sources dropped before they numbered it is not in the file.
+
+    Exit code 0; 1: the time was up before the set was known to be a smallest; 2: it cannot be found, with the reason.
+
+    Examples:
+
+      dataflow drops run.mcap --worse "ate_rmse_m > 0.05"
+      dataflow drops run.mcap --worse "score.recall < 0.8 or score.precision < 0.8" --budget 300
+    """
+    with friendly_errors():
+        recording = existing_recording(recording)
+        if graph is None and settings:
+            raise fail("--set changes a graph file: name it with --graph")
+        find_modules_in(path)
+        take_environment(recording)
+        from dataflow.drops.search import Drops
+        from dataflow.graph import load_graph
+        from dataflow.recording import Recording
+
+        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+        with Recording(recording) as opened, progress() as show:
+
+            def watch(replays: int, left: int) -> None:
+                show(f"{plural(replays, 'replay')}; losses undone in the next one: {count(left)}")
+
+            try:
+                cost = Drops(opened, worse, loaded, budget=budget, watch=watch).find()
+            except SyntaxError as error:
+                raise fail(f"--worse {worse}: no Python expression: {error.msg}") from None
+            begin, _ = span(opened, opened.streams) or (0, 0)
+    if json:
+        print_json(asdict(cost))
+    else:
+        _print_cost(cost, worse, begin)
+    if not cost.minimal:
+        raise typer.Exit(1)
+
+
+def _print_cost(cost: Cost, worse: str, begin: int) -> None:
+    made = table("lost at", "operator", "input", "message of", "reason", right=("lost at",))
+    for loss in cost.named[:MOST_ROWS]:
+        at = f"{(loss.stamp - begin) * 1e-9:.3f} s"
+        made.add_row(at, *map(Text, (loss.operator, loss.input, loss.stream or "tick", loss.reason)))
+    out.print(made)
+    if len(cost.named) > MOST_ROWS:
+        out.print(f"and {count(len(cost.named) - MOST_ROWS)} more: --json has all")
+    for name, value in cost.figures.items():
+        text = f"{name}: {_text(value)}; without these {_text(cost.undone.get(name))}"
+        out.print(Text(f"{text}, without any of the losses {_text(cost.best.get(name))}"), soft_wrap=True)
+    if cost.minimal:
+        text = (
+            f"{len(cost.named)} of {count(cost.losses)} losses: a smallest set, not the only cause. Without them it is"
+        )
+        out.print(Text(f"{text} not {worse}; with any one of them it is. Another set may do the same."), soft_wrap=True)
+    else:
+        text = f"the time was up: without these {len(cost.named)} it is not {worse}, but fewer may do (--budget)"
+        out.print(Text(text, style="yellow"), soft_wrap=True)
+    unsent = f"; {count(cost.not_sent)} recorded as a number only" if cost.not_sent else ""
+    out.print(f"steps that sources dropped before they numbered them are not in the file{unsent}", soft_wrap=True)
+    names = ", ".join(cost.operators)
+    text = f"{plural(cost.replays, 'replay')} of {names}: {plural(cost.calls, 'call')} made in {seconds(cost.seconds)}"
+    out.print(Text(text), soft_wrap=True)
 
 
 def _found(recording: Path, text: str, graph: Graph | None, budget: float, tolerance: float) -> Chain:
@@ -170,7 +256,7 @@ def _other(value: Any, before: Any) -> str:
 
 
 def _text(value: Any) -> str:
-    text = "none" if value is None else " ".join(str(value).split())
+    text = f"{value:.4g}" if isinstance(value, float) else "none" if value is None else " ".join(str(value).split())
     return text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + "…"
 
 

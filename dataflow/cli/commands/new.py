@@ -1,4 +1,4 @@
-"""`dataflow new operator`, `new graph`, `new project`."""
+"""`dataflow new operator`, `new graph`, `new project`, `new service`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, TypeVar
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.arguments import Json
+from dataflow.cli.support.arguments import GraphFile, Json, find_modules_in
 from dataflow.cli.support.output import fail, out, print_json
 
 HERE = Path()
@@ -97,6 +97,54 @@ def project(
     package = _named(lambda: snake(name))
     hints = (f"run its tests and its graph: cd {_shown(folder)} && pytest && dataflow run graphs/{package}.yaml",)
     _write({folder / file: text for file, text in made.items()}, hints, json=json)
+
+
+def service(
+    graph: GraphFile,
+    name: Annotated[
+        str | None, typer.Option("--name", metavar="NAME", help="Of the service; by default that of the graph.")
+    ] = None,
+    user: Annotated[str | None, typer.Option("--user", metavar="USER", help="Who runs it; by default you.")] = None,
+    keep_disk: Annotated[
+        str, typer.Option("--keep-disk", metavar="SIZE", help="Bytes of recordings that a run keeps.")
+    ] = "20GB",
+    days: Annotated[
+        int, typer.Option("--days", metavar="N", help="Days after which recordings are deleted.", min=1)
+    ] = 14,
+    to: To = HERE,
+    json: Json = False,
+) -> None:
+    """Write a systemd unit that runs a graph live from the start of the machine, in this folder and installation.
+
+    A graph with a flight recorder keeps what that keeps; any other is recorded into out/, in files of ten minutes, the
+    oldest of which are deleted beyond `--keep-disk`. The second file deletes the recordings of earlier runs.
+
+    Examples:
+
+      dataflow new service robot.yaml
+      dataflow new service robot.yaml --user robot --keep-disk 50GB --to deploy
+    """
+    import getpass
+    import sys
+
+    from dataflow.cli.support.arguments import graph_file
+    from dataflow.cli.support.output import friendly_errors
+    from dataflow.graph import load_graph
+    from dataflow.scaffold.files import service_files
+
+    file = graph_file(graph)
+    find_modules_in(None)
+    with friendly_errors():
+        loaded = load_graph(file, live=True)
+    flight, folder = loaded.record.flight, Path.cwd()
+    command = [str(Path(sys.prefix, "bin", "dataflow")), "run", str(file.resolve()), "--live", "--quiet"]
+    if flight is None:
+        command += ["--record", "out/{time}.mcap", "--split-every", "10min", "--keep-disk", keep_disk]
+    kept = folder / (flight.folder if flight is not None else "out")
+    wanted, who = name or loaded.name, user or getpass.getuser()
+    files = _named(lambda: service_files(wanted, command, folder=folder, out=kept, user=who, days=days))
+    hints = (f"check it: systemd-analyze verify {_shown(to / f'{wanted}.service')}", "install it as its head describes")
+    _write({to / made: text for made, text in files.items()}, hints, json=json)
 
 
 def _named(make: Callable[[], Made]) -> Made:

@@ -29,6 +29,17 @@ from dataflow.graph.yaml.tree import UNKNOWN, Entry, Items, Leaf, Table, Tree, a
 from dataflow.messages.base import Message, message_types
 from dataflow.operator import Operator
 
+NOT = "not "
+TOP_KEYS = (
+    "graph", "namespace", "params", "inputs", "operators", "outputs", "record", "view", "seed", "threads", "network",
+)  # fmt: skip
+OPERATOR_KEYS = ("use", "when", "inputs", "params", "process", "machine", "live", "sync")
+NESTED_KEYS = ("use", "when", "inputs", "params", "process", "machine")
+OPTIONAL = "?"
+"""Ends the type of an input of a nested graph that need not be given."""
+ReadFile = Callable[[str], str]
+"""Text of a graph file by its path relative to the root file's folder; raises OSError or UnicodeDecodeError."""
+
 
 def operator_parameters(
     full: str, cls: type[Operator], given: Table, place: Place, problems: Problems
@@ -80,9 +91,6 @@ def _report(full: str, cls: type[Operator], fault: Any, given: Table, place: Pla
             problems.add(value.place, f"{full}: parameter {name!r}: {message}, got {said}", hint)
 
 
-NOT = "not "
-
-
 def failed(tree: Tree | None, inputs: Mapping[str, GraphInput], problems: Problems) -> str | None:
     """The condition that does not hold, as it is written, or None where all do; reports what is none."""
     if tree is None:
@@ -116,17 +124,6 @@ def given(entry: Choice | Pattern) -> bool:
     if isinstance(entry, Pattern):
         return True
     return any(given(inner) for way in entry.ways for inner in way)
-
-
-TOP_KEYS = (
-    "graph", "namespace", "params", "inputs", "operators", "outputs", "record", "view", "seed", "threads", "network",
-)  # fmt: skip
-OPERATOR_KEYS = ("use", "when", "inputs", "params", "process", "machine", "live", "sync")
-NESTED_KEYS = ("use", "when", "inputs", "params", "process", "machine")
-OPTIONAL = "?"
-"""Ends the type of an input of a nested graph that need not be given."""
-ReadFile = Callable[[str], str]
-"""Text of a graph file by its path relative to the root file's folder; raises OSError or UnicodeDecodeError."""
 
 
 class Expander:

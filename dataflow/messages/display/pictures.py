@@ -11,6 +11,23 @@ import numpy.typing as npt
 
 _GREY, _RGB = 0, 2
 _LEVEL = 4
+_TURBO = np.array(
+    [
+        [0.13572138, 0.09140261, 0.10667330],
+        [4.61539260, 2.19418839, 12.64194608],
+        [-42.66032258, 4.84296658, -60.58204836],
+        [132.13108234, -14.18503333, 110.36276771],
+        [-152.94239396, 4.27729857, -89.90310912],
+        [59.28637943, 2.82956604, 27.34824973],
+    ]
+)
+SHOWN_PIXELS = 960
+"""Pictures are thinned to at most this width and height."""
+_CLOUD_PIXELS = 360
+Pixels = npt.NDArray[np.uint8]
+"""(H, W) or (H, W, 3)."""
+Picture = tuple[str, bytes]
+"""A format, and a file of it."""
 
 
 def png(pixels: npt.NDArray[np.uint8]) -> bytes:
@@ -36,27 +53,6 @@ def turbo(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     colors: npt.NDArray[np.uint8] = (np.clip(powers @ _TURBO, 0.0, 1.0) * 255).astype(np.uint8)
     colors[np.isnan(values)] = 0
     return colors
-
-
-_TURBO = np.array(
-    [
-        [0.13572138, 0.09140261, 0.10667330],
-        [4.61539260, 2.19418839, 12.64194608],
-        [-42.66032258, 4.84296658, -60.58204836],
-        [132.13108234, -14.18503333, 110.36276771],
-        [-152.94239396, 4.27729857, -89.90310912],
-        [59.28637943, 2.82956604, 27.34824973],
-    ]
-)
-
-
-SHOWN_PIXELS = 960
-"""Pictures are thinned to at most this width and height."""
-_CLOUD_PIXELS = 360
-Pixels = npt.NDArray[np.uint8]
-"""(H, W) or (H, W, 3)."""
-Picture = tuple[str, bytes]
-"""A format, and a file of it."""
 
 
 def of_pixels(pixels: Pixels) -> Picture:

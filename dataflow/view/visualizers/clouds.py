@@ -23,6 +23,8 @@ _WAITING = 16
 """Clouds that wait for the pose of their stamp."""
 
 _BITS = 21  # of a coordinate of a cell
+_FARTHEST = 1e30  # metres
+_KEPT_AT_ONCE = 6_000  # points of one cloud that are looked at for cells: more clouds will come
 
 
 @dataclass(slots=True)
@@ -70,10 +72,6 @@ class KeptPoints:
             if seen == self.after:
                 new.append(index)
         return inside[np.array(new, np.int64)]
-
-
-_FARTHEST = 1e30  # metres
-_KEPT_AT_ONCE = 6_000  # points of one cloud that are looked at for cells: more clouds will come
 
 
 @visualizer(PointCloud, "space")

@@ -33,6 +33,17 @@ _ALONG, _WHOLE = 12, 12
 """Samples along a side, and along the sides of what is seen of the whole."""
 _FORGOTTEN = 0.25
 """Share of values that training leaves out, so that no object is learned by heart."""
+SIDE = 48
+LEAST, MOST = 0.08, 64
+_SCORING = (0.01, 0.5, 100)  # least score, overlap for suppression, most boxes
+_SAME = 0.4
+"""Overlap from which a box is of an object."""
+_JITTER, _ASTRAY = 0.05, 0.12
+"""Standard deviations by which sides of found boxes and of true ones are moved, as shares of the box's size."""
+_ROWS, _SHOWN = 100_000, 150
+"""Boxes that are kept to learn from, of all images and of one, at most: they stay in memory, 17 kB each."""
+_STRIDES = (8, 16)
+_HEAD = re.compile(r"/heads\.(\d+)/")
 
 
 class RefinerNetwork(nn.Module):
@@ -83,19 +94,6 @@ class RefinerNetwork(nn.Module):
         known = self.known(torch.cat([self.around(surroundings), places], dim=1)).reshape(-1, _HIDDEN)
         outwards: Tensor = self.mixed(self.strip(strip.flatten(1)) + self.whole(whole.flatten(1)) + known)
         return outwards.reshape(-1, 4) * self.get_buffer("signs")
-
-
-SIDE = 48
-LEAST, MOST = 0.08, 64
-_SCORING = (0.01, 0.5, 100)  # least score, overlap for suppression, most boxes
-_SAME = 0.4
-"""Overlap from which a box is of an object."""
-_JITTER, _ASTRAY = 0.05, 0.12
-"""Standard deviations by which sides of found boxes and of true ones are moved, as shares of the box's size."""
-_ROWS, _SHOWN = 100_000, 150
-"""Boxes that are kept to learn from, of all images and of one, at most: they stay in memory, 17 kB each."""
-_STRIDES = (8, 16)
-_HEAD = re.compile(r"/heads\.(\d+)/")
 
 
 @dataclass(frozen=True, eq=False)

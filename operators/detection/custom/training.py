@@ -25,6 +25,7 @@ from operators.learning.network_weights import begin_with, fitting_facts, sample
 
 Sizes = NDArray[np.float32]
 """(N, 2) widths and heights in pixels."""
+_SCORING = (0.01, 0.5, 100)  # least score, overlap for suppression, most boxes
 
 
 def size_iou(sizes: Sizes, anchors: Sizes) -> NDArray[np.float32]:
@@ -67,9 +68,6 @@ def fit_anchors(sizes: Sizes, count: int, seed: int, rounds: int = 50) -> Sizes:
 def mean_best_iou(sizes: Sizes, anchors: Sizes) -> float:
     """Tells how well the anchors cover the sizes: the mean over objects of the best anchor's IoU."""
     return float(size_iou(np.asarray(sizes, np.float32), anchors).max(axis=1).mean())
-
-
-_SCORING = (0.01, 0.5, 100)  # least score, overlap for suppression, most boxes
 
 
 class DetectorTask(ImageTask[DetectionData]):

@@ -20,6 +20,7 @@ from operators.geometry.se3 import Matrix, about_fixed_axes, adjoint
 from operators.odometry.lidar.tracker import LidarTracker, State, Tracked, TrackerConfig
 
 _STAMPED = {"begin": 0.0, "middle": 0.5, "end": 1.0}
+_LEVELS = {State.PREDICTED: Level.WARN, State.LOST: Level.ERROR}
 
 
 class Sweep(BaseModel):
@@ -40,9 +41,6 @@ class Sweep(BaseModel):
         azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
         turned = np.mod((self.begins - azimuth) if self.clockwise else (azimuth - self.begins), 2 * math.pi)
         return ((turned / (2 * math.pi) - _STAMPED[self.stamped]) * self.period).astype(np.float32)
-
-
-_LEVELS = {State.PREDICTED: Level.WARN, State.LOST: Level.ERROR}
 
 
 @dataclass(kw_only=True)

@@ -26,6 +26,10 @@ from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 
 Watches = tuple[Watch, Watch]
+# Variances are this much larger than residuals say: neighbouring tracks err together (calibrated against truth).
+SYSTEMATIC = 500.0
+GATE = 2.0  # pixels by which a corner may be off the pose
+TOP_SPEED = 3.0  # m/s beyond the last speed that a pose which is recognised in the same map may ask of the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +68,6 @@ def observe(left: NDArray[np.uint8], right: NDArray[np.uint8], stamp: int, last:
 def _gray(image: NDArray[np.uint8]) -> Gray:
     gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     return np.ascontiguousarray(gray)
-
-
-# Variances are this much larger than residuals say: neighbouring tracks err together (calibrated against truth).
-SYSTEMATIC = 500.0
-GATE = 2.0  # pixels by which a corner may be off the pose
-TOP_SPEED = 3.0  # m/s beyond the last speed that a pose which is recognised in the same map may ask of the camera
 
 
 @dataclass(frozen=True, eq=False)

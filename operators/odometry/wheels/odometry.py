@@ -16,6 +16,10 @@ from dataflow.operator import KEPT, Counts, Duration, In, Operator, Out, Param
 from operators.odometry.wheels.differential_drive import DifferentialDrive, DriveNoise
 from operators.status import counted_status
 
+Array = NDArray[np.float64]
+UNREADABLE = "unreadable"
+_FLAT = 1e-6  # variance of height, roll and pitch: the floor is taken as flat
+
 
 @dataclass(frozen=True, eq=False)
 class Reading:
@@ -67,12 +71,6 @@ def _each(own: Array | None, given: float | None, name: str, count: int) -> Arra
 
 def _sides(values: Array, places: list[list[int]]) -> Array:
     return np.array([values[side].mean() for side in places])
-
-
-Array = NDArray[np.float64]
-
-UNREADABLE = "unreadable"
-_FLAT = 1e-6  # variance of height, roll and pitch: the floor is taken as flat
 
 
 @dataclass(kw_only=True)

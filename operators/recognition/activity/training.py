@@ -31,6 +31,23 @@ from operators.simulator.classes import ACTIVITIES
 from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 LAYERS = 2
+KIND = "activity"
+TOLERANCE = 0.5
+_STRIDES = (1, 2, 2, 3, 4)
+_UNSEEN = 0.15  # how much a moment out of sight counts
+_LEAST = 0.35
+_STILL = [ACTIVITIES.index(name) for name in ("standing", "sitting", "resting")]
+_SPEED = NAMES.index("speed, short")
+_MOVING = [
+    NAMES.index(name)
+    for name in (
+        *("speed, short", "speed, long", "rise, short", "rise, long", "way gone", "growth of the longer side"),
+        *("seat: closing", "seat: speed along", "table: closing", "drink: closing", "drink: speed"),
+    )
+]
+_SIDES = [NAMES.index("longer side"), NAMES.index("shorter side")]
+_GROWN = [NAMES.index("longer side over its least"), NAMES.index("shorter side over its least")]
+Scored = list[tuple[Track | SensedTrack, NDArray[np.int64], NDArray[np.bool_]]]
 
 
 class ActivityNetwork(nn.Module):
@@ -68,26 +85,6 @@ class ActivityStep(nn.Module):
         entered = network.enter((features[:, None] - network.mean) / network.scale)
         passed, (hidden, cell) = network.lstm(entered, (hidden, cell))
         return network.leave(passed[:, 0]).softmax(dim=1), hidden, cell
-
-
-KIND = "activity"
-TOLERANCE = 0.5
-_STRIDES = (1, 2, 2, 3, 4)
-_UNSEEN = 0.15  # how much a moment out of sight counts
-_LEAST = 0.35
-
-
-_STILL = [ACTIVITIES.index(name) for name in ("standing", "sitting", "resting")]
-_SPEED = NAMES.index("speed, short")
-_MOVING = [
-    NAMES.index(name)
-    for name in (
-        *("speed, short", "speed, long", "rise, short", "rise, long", "way gone", "growth of the longer side"),
-        *("seat: closing", "seat: speed along", "table: closing", "drink: closing", "drink: speed"),
-    )
-]
-_SIDES = [NAMES.index("longer side"), NAMES.index("shorter side")]
-_GROWN = [NAMES.index("longer side over its least"), NAMES.index("shorter side over its least")]
 
 
 def _columns(group: str) -> tuple[list[int], NDArray[np.float32]]:
@@ -250,9 +247,6 @@ def drawn(episode: Episode, rng: np.random.Generator, variations: int) -> list[T
     for _ in range(variations):
         tracks += tracked_sequences(episode, int(rng.choice(_STRIDES)), rng)
     return tracks
-
-
-Scored = list[tuple[Track | SensedTrack, NDArray[np.int64], NDArray[np.bool_]]]
 
 
 def scored_tracks(episodes: Sequence[Episode], seed: int) -> dict[str, Scored]:

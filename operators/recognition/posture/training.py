@@ -21,6 +21,9 @@ from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 _CHANNELS = (24, 48, 96)
 _HIDDEN = 128
+F32 = NDArray[np.float32]
+_LIMBS = 4.0  # weight of where the limbs are
+_BATCH = 256
 
 
 class PostureNetwork(nn.Module):
@@ -81,12 +84,6 @@ def _halved(inputs: int, outputs: int) -> nn.Module:
 
 def _convolution(inputs: int, outputs: int, stride: int = 1) -> tuple[nn.Module, nn.Module]:
     return nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs)
-
-
-F32 = NDArray[np.float32]
-
-_LIMBS = 4.0  # weight of where the limbs are
-_BATCH = 256
 
 
 class PostureTask:

@@ -20,7 +20,7 @@ LARGE = 0.8  # metres on the ground from which a thing is seldom seen whole, so 
 _COARSE = 0.3  # metres from which a thing is often hidden in part
 _WITHIN = 0.8  # share of an image box that is in that of an object, where the rest is hidden
 _COVERING = 0.6  # share of the smaller of two image boxes, from which one covers the other
-_TRACKED = 0.5  # by which what is at an object's place and of its track is likelier of it
+_TRACKED = 0.5  # by which what may be an object, and is of its track, is likelier it
 _SLACK = 0.02  # of the distance, by which points stray
 
 
@@ -92,8 +92,7 @@ def alike(
 ) -> float:
     """Returns how likely an observation is of an object: in [0, 1], more if it is of its track, 0 where it is not.
 
-    `image` compares them where there is an image. `large` things are seldom seen whole: their voxels tell. What is of
-    the track and the class of an object at whose place it is needs no more evidence.
+    `image` compares them where there is an image. `large` things are seldom seen whole: their voxels tell.
     """
     away = outside(cells.middle, object.box)
     reach = s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(cells.middle - each.image.eye))
@@ -107,8 +106,7 @@ def alike(
         share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
         return 0.5 * share if share >= 0.5 else 0.0
     value = 0.3 * (1 - away / reach) + 0.1 * color_likeness(each.color, object.color)
-    if each.track in object.tracks:
-        return _TRACKED + value + 0.6 * (0.0 if image is None else image.iou)
+    value += _TRACKED if each.track in object.tracks else 0.0
     if image is not None and image.iou >= s.image_overlap:
         return value + 0.6 * image.iou
     if image is not None and not large:  # what is hidden in part shows in part of its box

@@ -33,6 +33,15 @@ Indices = NDArray[np.int64]
 CAUCHY = 2.0  # residuals of this many sigmas count half
 NEAR = 0.1  # metres; nearer points are behind or in the lens
 _STILL = 1e-5  # metres and radians: a step less than this ends the iterations
+FEWEST = 3  # views of a point; points of two views are covered by the sight between them
+MOST = 400  # points
+ITERATIONS = 3
+PIXEL = 0.5  # working pixels, at least, by which a described feature errs
+DEPTH = 0.002  # metres by which its depth errs besides the noise, since it is its patch's
+# Of the observations' information, which is believed: features err together from view to view, and the sights and the
+# odometry that tie the same keyframes rest on many of the same pixels.
+STRENGTH = 0.05
+WRONG = 25.0  # squared sigmas of a pixel beyond which a sighting is of something else
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,17 +141,6 @@ class _Solver:
         D[:, :2] = D[:, :2] @ T[:3, :3]
         D[:, 2, 2] = 1.0 / self.seen.sigma_depths
         return D
-
-
-FEWEST = 3  # views of a point; points of two views are covered by the sight between them
-MOST = 400  # points
-ITERATIONS = 3
-PIXEL = 0.5  # working pixels, at least, by which a described feature errs
-DEPTH = 0.002  # metres by which its depth errs besides the noise, since it is its patch's
-# Of the observations' information, which is believed: features err together from view to view, and the sights and the
-# odometry that tie the same keyframes rest on many of the same pixels.
-STRENGTH = 0.05
-WRONG = 25.0  # squared sigmas of a pixel beyond which a sighting is of something else
 
 
 def adjust_newest(graph: KeyframeGraph[View], points: MapPoints, fitter: Fitter, newest: int) -> None:

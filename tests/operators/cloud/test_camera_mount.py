@@ -189,7 +189,7 @@ def test_a_given_base_is_passed_on_when_it_changes() -> None:
     assert again["base_extrinsics"].digest() == then.replace(stamp=3).digest()
 
 
-@pytest.mark.parametrize("pair", [("depth", "color"), ("color", "depth")])
+@pytest.mark.parametrize("pair", [pytest.param(("depth", "color"), marks=pytest.mark.long), ("color", "depth")])
 def test_the_base_holds_all_cameras_whichever_is_the_parent(pair: tuple[str, str]) -> None:
     T = np.eye(4)
     T[0, 3] = 0.05

@@ -63,7 +63,7 @@ def errors(drive: Drive, poses: list[Any], since: float = 1.0) -> tuple[float, f
     return float(far), float(turned), len(off)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_a_scan_finds_the_robot_anywhere_in_the_map(seed: int) -> None:
     drive = Drive(5.0, seed)
     played, _ = localized(drive, {"scan": drive.scans()})
@@ -140,6 +140,7 @@ def test_a_lidar_that_degrades_loses_its_say_and_the_pose_stays_right(wrong: dic
     assert count > 130
 
 
+@pytest.mark.long
 def test_landmarks_that_degrade_lose_their_say_to_the_lidar() -> None:
     drive = Drive(7.0)
     sensors = {"scan": drive.scans(), "seen": drive.sightings(off=0.5, after=3.0)}

@@ -208,6 +208,7 @@ def test_unmodelled_extrinsics_cost_accuracy() -> None:
     assert told < 0.7 * untold
 
 
+@pytest.mark.long
 def test_pure_rotation_is_followed() -> None:
     poses = [se3.exp(np.array([0, 0, 0, 0, 0.03 * i, 0])) for i in range(15)]
     frames = [(render(T, K_COLOR)[0], render(T, K_DEPTH)[1]) for T in poses]
@@ -304,6 +305,7 @@ def repeated(frames: list[Frame], first: int, last: int) -> list[Frame]:
     return [*frames[:first], *[frames[first]] * (last - first), *frames[last:]]
 
 
+@pytest.mark.long
 def test_frozen_images_are_noticed_and_not_used() -> None:
     frames, poses = sequence(40)
     color_stuck = [(stuck[0], f[1]) for stuck, f in zip(repeated(frames, 10, 25), frames, strict=True)]
@@ -478,6 +480,7 @@ def mover_sequence(count: int) -> Sequence:
     return moved, poses
 
 
+@pytest.mark.long
 def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
     frames, poses = mover_sequence(25)
     results = follow(frames, rate=10.0)
@@ -489,6 +492,7 @@ def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
     assert errors(results, poses)[0] < 0.03
 
 
+@pytest.mark.long
 def test_keyframes_hold_nothing_of_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     frames, _ = mover_sequence(25)
     odometry, fits = RgbdOdometry(camera()), []
@@ -699,6 +703,7 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
     assert pack_state(one.snapshot()) == pack_state(other.snapshot())
 
 
+@pytest.mark.long
 def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
     frames, _ = sequence(40)
     stamps = [k * 33_000_000 for k in range(8)]

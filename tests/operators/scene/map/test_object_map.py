@@ -112,13 +112,14 @@ def test_neighbours_that_are_seen_beside_each_other_are_two(gap: float) -> None:
     assert len(after([[(THING, BOX), (beside, MUG)]] * 8).confirmed()) == 2
 
 
-@pytest.mark.parametrize(("track", "id"), [(3, 1), (4, 2), (-1, 2)], ids=["same track", "another", "none"])
-def test_what_is_near_a_thing_and_of_its_track_is_that_thing(track: int, id: int) -> None:
-    known = after([[(THING, MUG)]] * 6, tracks=[3])
+@pytest.mark.parametrize(("track", "id"), [(3, 1), (4, 2), (9, 1), (-1, 1)], ids=["first", "second", "new", "none"])
+def test_of_two_things_that_a_view_may_show_it_is_the_one_of_its_track(track: int, id: int) -> None:
+    behind: Solid = ((2.22, 0.0, 0.1), THING[1])
+    known = after([[(THING, MUG), (behind, MUG)]] * 6, tracks=[3, 4])
     T = looking(0.0)
-    beside = replace(observation(((2.0, 0.1, 0.1), THING[1]), MUG, T), track=track)
-    assert known.update(2 * SECOND, [beside], RangeView((beside.points - T[:3, 3]) @ T[:3, :3], T, 0.012)) == [id]
-    assert track in (-1, *known.objects[id].tracks)
+    between = replace(observation(((2.1, 0.0, 0.1), THING[1]), MUG, T), track=track)
+    assert known.update(2 * SECOND, [between], RangeView((between.points - T[:3, 3]) @ T[:3, :3], T, 0.012)) == [id]
+    assert track in (-1, known.objects[id].tracks[-1])
 
 
 def test_a_merged_object_has_the_tracks_of_both_and_the_last_ones_are_kept() -> None:

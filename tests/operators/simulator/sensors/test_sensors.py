@@ -423,6 +423,7 @@ def test_a_camera_sights_landmarks_by_the_same_bearings_without_ranges() -> None
     np.testing.assert_array_equal(c.covariances, b.covariances[:, 1:, 1:])
 
 
+@pytest.mark.long
 def test_a_landmark_behind_something_is_not_sighted() -> None:
     source = robot(duration="100ms", movers=False, landmarks={"rate": 10, "missing": 0, "max_range": 100})
     (message,) = stream(source, "sightings")

@@ -1,4 +1,4 @@
-"""Agents that play other machines of a graph: `dataflow join` in processes of a test."""
+"""Agents on this machine that play another one."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent.parent / "machines"
-"""The folder of the operators that they run."""
-END_WITHIN = 40.0
+HERE = Path(__file__).resolve().parents[1] / "machines"
+"""The folder of the operators that their runs use."""
+END_WITHIN = 20.0
 
 
 @dataclass(frozen=True, slots=True)
