@@ -64,6 +64,7 @@ class Supervisor:
         self._announced = contextlib.ExitStack()
         self._over: commands.Over | None = None
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._boxes = Boxes(plan.graph, self._processes, live=plan.live)
         self._remote: Remote | None = None
         self._stops = 0
         self._asked: deque[events.PlaybackAsked | events.TriggerAsked] = deque()
@@ -110,9 +111,8 @@ class Supervisor:
             stack.callback(self._words.close)
             self._selector = stack.enter_context(selectors.DefaultSelector())
             self._clock = AwakeClock()
-            boxes = Boxes(self.plan.graph, self._processes, live=self.plan.live)
             self._here = Children(
-                self._start_nursery(), self._selector, rings, boxes, self._clock, self._feed_here, self._heard
+                self._start_nursery(), self._selector, rings, self._boxes, self._clock, self._feed_here, self._heard
             )
             stack.callback(self._here.bury)
             self._selector.register(self._woken, selectors.EVENT_READ, None)
