@@ -112,7 +112,7 @@ def capture(
     few = max(1, len(debugger.calls) // SMALL)
     too_large = False
     for begin in _beginnings(records, debugger, fired, wrong):
-        changes = _changes(records, debugger, begin, fired)
+        changes = changes_between(records, debugger, begin.place, fired.number)
         if (shots := _shots(debugger, begin.first, fired, changes)) is None:
             too_large = True
             continue
@@ -211,16 +211,17 @@ def _beginnings(records: Sequence[FiringRecord], debugger: Debugger, fired: Fire
         yield Beginning(fired.before, number, here, text)
 
 
-def _changes(
-    records: Sequence[FiringRecord], debugger: Debugger, begin: Beginning, fired: Fired
+def changes_between(
+    records: Sequence[FiringRecord], debugger: Debugger, begin: tuple[int, int], last: int
 ) -> Mapping[int, Sequence[Change]]:
-    """The changes behind a beginning, by the number of the call before which they were made."""
+    """The changes behind a place in the records (incarnation, number), up to the call `last`; by the number of the call
+    before which they were made."""
     changes: dict[int, list[Change]] = defaultdict(list)
     for r in records:
         place = r.incarnation, r.index
-        if r.kind in ("param", "reset") and begin.place < place:
+        if r.kind in ("param", "reset") and begin < place:
             number = bisect.bisect_left(debugger.calls, place, key=lambda call: (call.incarnation, call.record))
-            if number <= fired.number:
+            if number <= last:
                 name = r.detail["name" if r.kind == "param" else "input"]
                 changes[number].append(Change(r.kind, name, r.detail.get("value"), (r.incarnation, r.stamp)))
     return changes
@@ -240,7 +241,7 @@ def _shots(
         if each.number >= first:
             pending.extend(changes.get(each.number, ()))
         if each.number >= first and each.firing is not None:
-            shots.append(_shot(debugger, each, tuple(pending)))
+            shots.append(shot_of(debugger, each, tuple(pending)))
             pending.clear()
             entries = [entry for given in each.firing.inputs.values() for entry in entries_of(given)]
             new = {entry.digest: entry.value for entry in entries if entry.digest not in held}
@@ -253,7 +254,8 @@ def _shots(
     return shots if nbytes <= MOST_BYTES else None
 
 
-def _shot(debugger: Debugger, fired: Fired, changes: tuple[Change, ...]) -> Shot:
+def shot_of(debugger: Debugger, fired: Fired, changes: tuple[Change, ...]) -> Shot:
+    """Returns a call of the debugger, with the changes before it, as one that can be made apart from it."""
     record, firing = fired.record, fired.firing
     assert firing is not None
     effects = {name: value for name, value in record.detail.items() if name == "effects"}

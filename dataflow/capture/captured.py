@@ -244,7 +244,7 @@ def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[Shot]) -> Outc
         journal.begin(shot.effects)
         try:
             for change in shot.changes:
-                _change(calls, change)
+                make_change(calls, change)
             outputs = calls.process(shot.firing)
         except KeyboardInterrupt:
             raise
@@ -255,7 +255,8 @@ def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[Shot]) -> Outc
     return Outcome(shots[-1].firing, ports, outputs, None, tuple(before))
 
 
-def _change(calls: Calls, change: Change) -> None:
+def make_change(calls: Calls, change: Change) -> None:
+    """Changes a parameter, or resets. Raises what the operator raises."""
     if change.kind == "param":
         calls.parameter(change.name, change.value, change.place)
     else:

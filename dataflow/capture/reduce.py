@@ -45,3 +45,22 @@ def smallest(items: Sequence[T], shows: Callable[[Sequence[T]], bool]) -> Sequen
         else:
             parts = min(2 * parts, len(left))
     return left
+
+
+def needed(items: Sequence[T], shows: Callable[[Sequence[T]], bool]) -> Sequence[T]:
+    """A part of `items`, in their order, that shows it, by bisection: about log2(len(items)) questions for each item.
+
+    `items` show it. The next one found is the first item of the shortest end that shows it, together with those found
+    before. All of them are needed if more items never take the effect away; else `smallest` leaves some out.
+    """
+    found: list[T] = []
+    left = list(items)
+    while not shows(found):
+        does, does_not = 0, len(left)
+        while does_not - does > 1:
+            middle = (does + does_not) // 2
+            does, does_not = (middle, does_not) if shows([*found, *left[middle:]]) else (does, middle)
+        found, left = [*found, left[does]], left[does + 1 :]
+        if not left:
+            break
+    return found

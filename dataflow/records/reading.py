@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import islice
+from itertools import dropwhile, islice
 from typing import Any, NamedTuple, Protocol
 
 from dataflow.recording import Recording, RecordingError
 from dataflow.records.firing import CALLS, KINDS, FiringRecord, FiringRecordError, Rows, decode_rows, unpack_batch
-from dataflow.records.order import Outline, Outliner, Place, emitted, in_order
+from dataflow.records.order import Outline, Outliner, Place, emitted, in_order, merged
 from dataflow.sync import InputRef, MessageRef
 
 _BEHIND = (2**63, 0)
@@ -157,6 +157,16 @@ class FiringLog:
     def outlined(self, maker: Maker, found: Outliner) -> None:
         """Notes the outline that a pass over all of a maker's records has found."""
         self._outlines[maker.name] = found.done(partial(self.records, maker.name))
+
+    def since(self, maker: Maker, begin: Place) -> Iterator[FiringRecord]:
+        """The records of `maker` from a place (incarnation, index) on, in that order, each once."""
+        runs = [run.since(begin) for run in self.outline(maker).runs]
+        records = in_order(runs, partial(self.records, maker.name))
+        return dropwhile(lambda record: (record.incarnation, record.index) < begin, records)
+
+    def repeated(self, maker: Maker) -> Iterator[FiringRecord]:
+        """The records of `maker` by (incarnation, index); of several with one place, the first of the file first."""
+        return merged(self.outline(maker).runs, partial(self.records, maker.name))
 
     def ordered(self, maker: Maker) -> Iterator[FiringRecord]:
         """The records of `maker` by (incarnation, index), each once."""

@@ -50,6 +50,7 @@ def test_a_call_is_shown_with_what_was_given_made_and_changed() -> None:
     assert "  vectors" in told
 
 
+@pytest.mark.long
 def test_the_hashes_and_threads_are_those_of_a_run() -> None:
     told = debug("busy", "--do", "goto 0", "--do", "print __import__('os').environ['PYTHONHASHSEED']")
 
@@ -66,6 +67,7 @@ def test_lines_of_standard_input_are_done_and_one_that_cannot_be_is_an_error() -
     assert "until ): no Python expression" in told
 
 
+@pytest.mark.long
 def test_pdb_stops_at_the_first_line_of_process() -> None:
     told = debug("smooth", lines="step\np type(x).__name__\nc\nquit\n")
 
@@ -74,6 +76,7 @@ def test_pdb_stops_at_the_first_line_of_process() -> None:
     assert told.count("as recorded") == 2
 
 
+@pytest.mark.long
 def test_pdb_that_is_left_leaves_the_call_as_it_was() -> None:
     told = debug("smooth", lines="step\nq\nquit\n")
 
@@ -81,6 +84,7 @@ def test_pdb_that_is_left_leaves_the_call_as_it_was() -> None:
     assert "BdbQuit" not in told
 
 
+@pytest.mark.long
 def test_calls_are_json() -> None:
     told = debug("tally", "--do", "next", "--do", "next", "--do", "diff", "--json")
 
@@ -152,11 +156,13 @@ def test_expressions_and_parts_of_the_state_are_completed(prompt: tuple[Shell, D
     assert shell.complete_state("", "", 0, 0) == sorted(before or ())
 
 
+@pytest.mark.long
 def test_what_cannot_begin_is_named() -> None:
     assert "there are: busy, look, smooth, tally" in debug("none", code=2)
     assert "expected the number of a call, or @SECONDS" in debug("busy@x", code=2)
 
 
+@pytest.mark.long
 def test_verify_prints_the_command_that_goes_to_the_difference(
     dataflow: Any, small: Path, recorded: tuple[Path, Any], tmp_path: Path
 ) -> None:

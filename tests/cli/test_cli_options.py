@@ -31,6 +31,7 @@ TRIED: tuple[str, ...] = (
     "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json --live-effects",
     "capture RECORDING --op sum --firing 3 --predicate stamp --graph GRAPH --set count=30 --path HERE --to OUT.py"
     " --overwrite --json",
+    "blame RECORDING --field mean@0 --budget 60 --tolerance 0.1 --graph GRAPH --set count=30 --path HERE --json",
     "check GRAPH --path HERE --set count=4 --json",
     "show GRAPH --path HERE --set count=4 --json",
     "show GRAPH --mermaid",
@@ -87,6 +88,7 @@ ELSEWHERE: dict[str, tuple[str, str]] = {
     "completion": ("--install", "it writes into the home folder: test_cli_completion.py"),
     "run": ("--step", "it needs a terminal's keys: tests of playback"),
     "replay": ("--step --map --clock --strict", "a terminal, bags: test_cli_bags.py"),
+    "drops": ("*", "it needs losses: test_cli_drops.py"),
     "view": ("--import", "another file of Rerun: tests of the view"),
     "foxglove": ("--start --end --clock --speed --stream", "a server that goes on until Ctrl-C: tests/foxglove"),
     "verify": (

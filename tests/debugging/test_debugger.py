@@ -238,6 +238,7 @@ record: {{snapshots: 2s}}
 """
 
 
+@pytest.mark.long
 def test_the_way_to_a_call_does_not_depend_on_the_length_of_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -269,9 +270,7 @@ def test_the_way_to_a_call_does_not_depend_on_the_length_of_the_recording(
             assert further is not None
             assert further.same
             debugger.close()
-    assert (
-        costs[1] < 2 * costs[0]
-    )  # all of them would be four times as many; batches end where the recorder's clock has it
+    assert costs[1] < 1600 // 4  # of 1,600 records, whose batches end by the recorder's clock
 
 
 def test_edited_source_is_taken_over_and_compared_from_the_same_state(added: Recording, tmp_path: Path) -> None:
@@ -354,5 +353,5 @@ def test_setup_that_fails_is_tried_anew(added: Recording, tmp_path: Path) -> Non
 
 def test_other_operators_that_are_gone_do_not_matter() -> None:
     with Recording(KEPT / "perception.mcap") as recording:
-        debugger = Debugger(recording, "tracker")
+        debugger = Debugger(recording, "motion_check")
         assert debugger.goto(1).same

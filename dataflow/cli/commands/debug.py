@@ -106,7 +106,7 @@ def debug(
         if dap is not None and (do or json or view):
             raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
         find_modules_in(path)
-        _take_environment(recording)
+        take_environment(recording)
         from dataflow.graph import load_graph
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
@@ -164,7 +164,7 @@ def capture(
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
         find_modules_in(path)
-        _take_environment(recording)
+        take_environment(recording)
         from dataflow.graph import load_graph
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
@@ -309,7 +309,7 @@ def _converse(shell: Shell, lines: list[str], *, interactive: bool) -> None:
         raise typer.Exit(DIFFERENT)
 
 
-def _take_environment(recording: Path) -> None:
+def take_environment(recording: Path) -> None:
     """Begins anew with the environment of operators where this process has another one: libraries read the number of
     their threads, and Python the salt of hashes, when they begin."""
     from dataflow.cli import start

@@ -1,0 +1,202 @@
+"""The recorded calls of one operator, made again with other inputs."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from dataflow.capture.capture import changes_between, shot_of
+from dataflow.capture.captured import Shot, make_change
+from dataflow.debugging.debugger import Debugger
+from dataflow.debugging.fired import Fired
+from dataflow.execution.calls import Calls
+from dataflow.execution.effects.journal import RecordedJournal
+from dataflow.execution.failure import RAISED
+from dataflow.execution.restarts import close_quietly
+from dataflow.graph.model import Graph
+from dataflow.messages.base import Message
+from dataflow.recording import Recording
+from dataflow.records.cuts import parameters_at
+from dataflow.records.firing import CALLS
+from dataflow.records.reading import FiringLog
+from dataflow.reexecution.recorded_run import seeding_of
+from dataflow.sync import NEVER, Firing
+
+MOST_BYTES = 2**28
+"""Of the states that are kept of one operator."""
+
+
+AHEAD = 100_000_000
+"""Duration (ns) of calls before those that are asked for, that are read with them."""
+
+
+class Call(NamedTuple):
+    """A call: the operator, and the number of the call among the operator's, as `debug` counts them."""
+
+    operator: str
+    number: int
+
+
+class Line:
+    """The calls of one operator. `shots`: those whose inputs are held, by number, from `first` on without a gap.
+
+    Raises as `Debugger`.
+    """
+
+    def __init__(self, recording: Recording, graph: Graph, operator: str, made: Callable[[], None]) -> None:
+        """`made` is called before each call that is made again."""
+        self._debugger = Debugger(recording, operator, graph)
+        self.node = node = self._debugger.node
+        records = list(FiringLog.read(recording).ordered(node))
+        self.records = [record for record in records if record.kind in CALLS]
+        self._changes = [r for r in records if r.kind not in CALLS and r.outcome != "error"]
+        self._changes_parameters = any(r.kind == "param" for r in self._changes)
+        setups = sorted((r.incarnation, r.index) for r in self._changes if r.kind in ("setup", "cut"))
+        places = [(r.incarnation, r.index) for r in self.records]
+        before = [bisect.bisect_left(setups, place) for place in places]
+        self._begins = [bisect.bisect_left(places, setups[k - 1]) if k else 0 for k in before]
+        self.shots: dict[int, Shot] = {}
+        self.first = len(self.records)
+        self._read: set[int] = set()
+        self._states: dict[int, bytes] = {}
+        """States before calls."""
+        self._graph, self._seeding, self._made = graph, seeding_of(recording), made
+        self._journal = RecordedJournal()
+        self._calls: Calls | None = None
+        self._at = -1
+        """The number of the call that `_calls` is just before, as it was then; -1: it was given other inputs."""
+
+    @property
+    def stateless(self) -> bool:
+        """Returns whether the operator declares that it has no state."""
+        return self.node.operator.stateless
+
+    def close(self) -> None:
+        """Closes the operator."""
+        self.leave()
+        self._debugger.close()
+
+    def begin_of(self, number: int) -> int:
+        """The number of the first call behind the operator's last `setup()` before a call."""
+        return self._begins[number]
+
+    def emitted(self, stream: str, place: tuple[int, int]) -> int | None:
+        """The number of the call that emitted a message (incarnation, number); None where it was no call."""
+        port = list(self.node.outputs.values()).index(stream)
+        for number, record in enumerate(self.records):
+            made = record.outputs[port] if port < len(record.outputs) else None
+            if made is not None and (record.incarnation, made.seq) == place:
+                return number
+        return None
+
+    def reach(self, first: int, last: int) -> list[int]:
+        """Reads the inputs of the calls from `first` to `last`; returns the numbers of those that were not held."""
+        if self._read.issuperset(range(first, last + 1)):
+            return []
+        first, until = self._ahead(first), last
+        while until in self._read:
+            until -= 1
+        fired = self._debugger.goto(first)
+        if fired.before is not None:
+            self._states[first] = fired.before
+        elif not self.stateless and first > (begin := self.begin_of(first)):
+            return self.reach(begin, last)
+        place = self.records[first].incarnation, self.records[first].index
+        changes = changes_between(self._changes, self._debugger, place, until)
+        added: list[int] = []
+
+        def take(each: Fired) -> bool:
+            if each.number <= until:
+                self._read.add(each.number)
+            if each.number <= until and each.firing is not None:
+                self.shots[each.number] = shot_of(self._debugger, each, tuple(changes.get(each.number, ())))
+                added.append(each.number)
+            return each.number >= until
+
+        if not take(fired):
+            self._debugger.until(take)
+        self.first = first if self.stateless else min(first, self.first)
+        return added
+
+    def _ahead(self, first: int) -> int:
+        """The number of a call before one, from which on they are read, too: going back begins anew each time."""
+        begin, left = self.begin_of(first), AHEAD
+        while first > begin and first - 1 not in self._read and (left := left - self.records[first - 1].duration) > 0:
+            first -= 1
+        return first
+
+    def begin(self, number: int, *, anew: bool = False) -> None:
+        """Brings the operator to just before a call, as it was then; `anew`: into the state of a new one.
+
+        Raises `OperatorFailure`, and what the operator raises.
+        """
+        is_there = self._at == number or (self.stateless and not self._changes_parameters)
+        if self._calls is not None and not anew and is_there:
+            return
+        alone = anew or self.stateless
+        near = number if alone else max((n for n in self._states if n <= number), default=self.first)
+        self._set_up(near)
+        if not anew and near in self._states:
+            assert self._calls is not None
+            self._calls.restore(self._states[near], (self.records[near].incarnation, self.records[near].stamp - 1))
+        self._at = near
+        for passed in range(near, number):
+            if passed in self.shots:
+                self.fire(passed, self.shots[passed].firing)
+        self._at = -1 if anew else number
+        self._keep(number)
+
+    def _set_up(self, number: int) -> None:
+        """Makes a new operator, with the parameters as they were before a call."""
+        self.leave()
+        record, node = self.records[number], self.node
+        place = record.incarnation, record.index
+        at_setup, since = parameters_at(r for r in self._changes if (r.incarnation, r.index) < place)
+        self._calls = calls = Calls(node, node.make(), self._graph.seed, version=self._seeding, effects=self._journal)
+        for name, value in at_setup.items():
+            calls.parameter(name, value, (0, NEVER))
+        calls.setup()
+        for name, value in since.items():
+            calls.parameter(name, value, (0, NEVER))
+
+    def fire(self, number: int, firing: Firing, *, other: bool = False) -> Mapping[str, Message] | None:
+        """Makes a call, with the recorded inputs or `other` ones, and the changes behind it; returns its messages by
+        port, None where it raises. The operator was brought there by `begin` and what followed."""
+        assert self._calls is not None
+        self._made()
+        self._journal.begin(self.shots[number].effects)
+        as_recorded = self._at == number and not other
+        try:
+            return self._calls.process(firing)
+        except KeyboardInterrupt:
+            raise
+        except RAISED:
+            return None
+        finally:
+            self._go_on(number + 1)
+            self._at = number + 1 if as_recorded else -1
+
+    def skip(self, number: int) -> None:
+        """Leaves a call out, but for the changes behind it."""
+        self._go_on(number + 1)
+        self._at = -1
+
+    def _go_on(self, number: int) -> None:
+        assert self._calls is not None
+        for change in self.shots[number].changes if number in self.shots else ():
+            make_change(self._calls, change)
+
+    def _keep(self, number: int) -> None:
+        if self.stateless or self._at != number or number in self._states or self._calls is None:
+            return
+        record = self.records[number]
+        state = self._calls.snapshot((record.incarnation, record.stamp - 1))
+        if state is not None and sum(map(len, self._states.values())) + len(state) <= MOST_BYTES:
+            self._states[number] = state
+
+    def leave(self) -> None:
+        """Closes the operator that the calls are made with."""
+        if self._calls is not None:
+            close_quietly(self._calls.operator)
+        self._calls, self._at = None, -1

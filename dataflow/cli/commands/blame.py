@@ -1,0 +1,287 @@
+"""`dataflow blame`: what decided a value. `dataflow drops`: which lost messages cost a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.text import Text
+
+from dataflow.cli.commands.debug import take_environment
+from dataflow.cli.support.arguments import (
+    Json,
+    ModuleFolders,
+    RecordingFile,
+    Settings,
+    existing_recording,
+    find_modules_in,
+    graph_file,
+    number,
+    span,
+)
+from dataflow.cli.support.output import count, err, fail, friendly_errors, out, plural, print_json, seconds, table
+
+if TYPE_CHECKING:
+    from dataflow.blame.chain import Chain, Effect, Link
+    from dataflow.drops.search import Cost
+    from dataflow.graph import Graph
+
+MOST_ROWS = 40
+LONGEST_VALUE = 60
+Budget = Annotated[
+    float,
+    typer.Option(
+        "--budget",
+        metavar="SECONDS",
+        parser=number(0.1, 86_400, "seconds"),
+        help="Time to look for it; what is left then is named.",
+    ),
+]
+
+
+def blame(
+    recording: RecordingFile,
+    field: Annotated[
+        str,
+        typer.Option("--field", metavar="STREAM.FIELD@SECONDS", help="The value, of the last message by that time."),
+    ],
+    budget: Budget = 60.0,
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            "--tolerance",
+            metavar="PART",
+            parser=number(0, 1, "a part of the value"),
+            help="What a floating-point value must change by to count, as a part of it.",
+        ),
+    ] = 1e-4,
+    graph: Annotated[
+        Path | None,
+        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
+    ] = None,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    json: Json = False,
+) -> None:
+    """Find what decided a value: the chain of calls back to the sensors' messages.
+
+    Each call on the chain is made again from its state with an input nudged, replaced by the message before, or left
+    out, and so are all later calls that this reaches: an input that changes the value is on the chain, and so is the
+    call that made it. Earlier calls of an operator are tried where the value depends on its state.
+
+    Exit code 0; 1: the time was up before the chain was whole; 2: there is no such value, or it does not repeat.
+
+    Examples:
+
+      dataflow blame run.mcap --field "tracks.ids[3]@12.4"
+      dataflow blame run.mcap --field "tracks.boxes[ids == 7]@12.4" --budget 300
+      dataflow blame run.mcap --field odometry.position@3 --json
+    """
+    with friendly_errors():
+        recording = existing_recording(recording)
+        if graph is None and settings:
+            raise fail("--set changes a graph file: name it with --graph")
+        find_modules_in(path)
+        take_environment(recording)
+        from dataflow.graph import load_graph
+
+        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+        chain = _found(recording, field, loaded, budget, tolerance)
+    if json:
+        print_json(_as_json(chain))
+    else:
+        _print(chain, field)
+    if not chain.whole:
+        raise typer.Exit(1)
+
+
+def drops(
+    recording: RecordingFile,
+    worse: Annotated[
+        str,
+        typer.Option("--worse", metavar="EXPRESSION", help='True of figures that are bad: "ate_rmse_m > 0.05".'),
+    ],
+    budget: Budget = 60.0,
+    graph: Annotated[
+        Path | None,
+        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
+    ] = None,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    json: Json = False,
+) -> None:
+    """Find which drops, late messages and timeouts of a live run cost its result.
+
+    The operators between them and the figures are replayed with some of them undone: these messages come in time. What
+    is named is a smallest set without which the figures are not worse: it suffices, and no part of it does. Another set
+    may, too. What sources dropped before they numbered it is not in the file.
+
+    Exit code 0; 1: the time was up before the set was known to be a smallest; 2: it cannot be found, with the reason.
+
+    Examples:
+
+      dataflow drops run.mcap --worse "ate_rmse_m > 0.05"
+      dataflow drops run.mcap --worse "score.recall < 0.8 or score.precision < 0.8" --budget 300
+    """
+    with friendly_errors():
+        recording = existing_recording(recording)
+        if graph is None and settings:
+            raise fail("--set changes a graph file: name it with --graph")
+        find_modules_in(path)
+        take_environment(recording)
+        from dataflow.drops.search import Drops
+        from dataflow.graph import load_graph
+        from dataflow.recording import Recording
+
+        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+        with Recording(recording) as opened, progress() as show:
+
+            def watch(replays: int, left: int) -> None:
+                show(f"{plural(replays, 'replay')}; losses undone in the next one: {count(left)}")
+
+            try:
+                cost = Drops(opened, worse, loaded, budget=budget, watch=watch).find()
+            except SyntaxError as error:
+                raise fail(f"--worse {worse}: no Python expression: {error.msg}") from None
+            begin, _ = span(opened, opened.streams) or (0, 0)
+    if json:
+        print_json(asdict(cost))
+    else:
+        _print_cost(cost, worse, begin)
+    if not cost.minimal:
+        raise typer.Exit(1)
+
+
+def _print_cost(cost: Cost, worse: str, begin: int) -> None:
+    made = table("lost at", "operator", "input", "message of", "reason", right=("lost at",))
+    for loss in cost.named[:MOST_ROWS]:
+        at = f"{(loss.stamp - begin) * 1e-9:.3f} s"
+        made.add_row(at, *map(Text, (loss.operator, loss.input, loss.stream or "tick", loss.reason)))
+    out.print(made)
+    if len(cost.named) > MOST_ROWS:
+        out.print(f"and {count(len(cost.named) - MOST_ROWS)} more: --json has all")
+    for name, value in cost.figures.items():
+        text = f"{name}: {_text(value)}; without these {_text(cost.undone.get(name))}"
+        out.print(Text(f"{text}, without any of the losses {_text(cost.best.get(name))}"), soft_wrap=True)
+    if cost.minimal:
+        text = (
+            f"{len(cost.named)} of {count(cost.losses)} losses: a smallest set, not the only cause. Without them it is"
+        )
+        out.print(Text(f"{text} not {worse}; with any one of them it is. Another set may do the same."), soft_wrap=True)
+    else:
+        text = f"the time was up: without these {len(cost.named)} it is not {worse}, but fewer may do (--budget)"
+        out.print(Text(text, style="yellow"), soft_wrap=True)
+    unsent = f"; {count(cost.not_sent)} recorded as a number only" if cost.not_sent else ""
+    out.print(f"steps that sources dropped before they numbered them are not in the file{unsent}", soft_wrap=True)
+    names = ", ".join(cost.operators)
+    text = f"{plural(cost.replays, 'replay')} of {names}: {plural(cost.calls, 'call')} made in {seconds(cost.seconds)}"
+    out.print(Text(text), soft_wrap=True)
+
+
+def _found(recording: Path, text: str, graph: Graph | None, budget: float, tolerance: float) -> Chain:
+    from dataflow.blame.chain import Blame
+    from dataflow.blame.field import Field
+    from dataflow.recording import Recording
+
+    try:
+        field = Field.parse(text)
+    except ValueError as error:
+        raise fail(f"--field {error}") from None
+    with Recording(recording) as opened, progress() as show:
+
+        def watch(made: int, links: int) -> None:
+            show(f"{plural(made, 'call')} made again, {plural(links, 'link')} found")
+
+        return Blame(opened, field, graph, budget=budget, tolerance=tolerance, watch=watch).find()
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str], None]]:
+    """Shows a line of what is being done, where there is a terminal."""
+    with err.status("reading the recording") as status:
+        yield lambda text: status.update(Text(text))
+
+
+def _print(chain: Chain, field: str) -> None:
+    out.print(Text(f"{field} is {_text(chain.value)}, made by {_call(chain.target)}"), soft_wrap=True)
+    made = table("call", "its", "from", "the value then")
+    for link in chain.links[:MOST_ROWS]:
+        effects = "; ".join(_effect(effect, chain.value) for effect in link.effects)
+        made.add_row(*map(Text, (_call(link.call), link.input or "state", _origin(link), effects)))
+    if chain.links:
+        out.print(made)
+    if len(chain.links) > MOST_ROWS:
+        out.print(f"and {count(len(chain.links) - MOST_ROWS)} more: --json has all")
+    sensed = list(dict.fromkeys(_origin(link) for link in chain.sensed))
+    more = f" and {count(len(sensed) - MOST_ROWS)} more" if len(sensed) > MOST_ROWS else ""
+    told = ", ".join(sensed[:MOST_ROWS]) + more or "nothing that was sensed: no input changes it"
+    out.print(Text(f"decided by {told}"), soft_wrap=True)
+    for operator, first, last in chain.unsplit:
+        text = f"the time was up among calls {first} to {last} of {operator}, before it was known which left a mark"
+        out.print(Text(text, style="yellow"), soft_wrap=True)
+    if chain.left:
+        names = ", ".join(map(_call, chain.left[:5]))
+        text = f"the time was up: {plural(len(chain.left), 'call')} on the chain not looked into ({names}): --budget"
+        out.print(Text(text, style="yellow"), soft_wrap=True)
+    out.print(f"{plural(chain.made, 'call')} made again in {seconds(chain.seconds)}")
+
+
+def _call(call: tuple[str, int]) -> str:
+    return f"{call[0]} #{call[1]}"
+
+
+def _origin(link: Link) -> str:
+    if link.message is None:
+        return "" if link.maker is None else _call(link.maker)
+    stream, _, place = link.message
+    return f"{stream} #{place}" if link.maker is None else f"{_call(link.maker)}: {stream} #{place}"
+
+
+def _effect(effect: Effect, before: Any) -> str:
+    how = effect.way + (f" ({', '.join(effect.fields)})" if effect.fields else "")
+    return f"{how}{f' with {effect.together - 1} more' if effect.together > 1 else ''} → {_other(effect.value, before)}"
+
+
+def _other(value: Any, before: Any) -> str:
+    from dataflow.messages.base import Message
+    from dataflow.recording.streams.diff import differences
+
+    if isinstance(value, Message) and isinstance(before, Message) and type(value) is type(before):
+        return f"another {', '.join(found.field for found in differences(before, value, None)[0])}"
+    return _text(value)
+
+
+def _text(value: Any) -> str:
+    text = f"{value:.4g}" if isinstance(value, float) else "none" if value is None else " ".join(str(value).split())
+    return text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + "…"
+
+
+def _as_json(chain: Chain) -> dict[str, Any]:
+    return {
+        "value": chain.value,
+        "call": [*chain.target],
+        "stamp": chain.stamp,
+        "links": [
+            {
+                "call": [*link.call],
+                "stamp": link.stamp,
+                "input": link.input or None,
+                "message": None if link.message is None else [*link.message],
+                "from": None if link.maker is None else [*link.maker],
+                "effects": [
+                    {"way": e.way, "fields": e.fields, "value": e.value, "together": e.together} for e in link.effects
+                ],
+            }
+            for link in chain.links
+        ],
+        "sensed": [[*place] for place in dict.fromkeys(link.message for link in chain.sensed) if place is not None],
+        "whole": chain.whole,
+        "not_looked_into": [[*call] for call in chain.left],
+        "not_taken_apart": [[*each] for each in chain.unsplit],
+        "calls_made": chain.made,
+        "seconds": chain.seconds,
+    }

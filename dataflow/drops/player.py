@@ -1,0 +1,155 @@
+"""Calls of an operator that are made once for equal inputs and an equal past, whatever the replay."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import xxhash
+
+from dataflow.execution.calls import Calls, Place
+from dataflow.execution.effects.journal import EFFECTS, RecordedJournal
+from dataflow.execution.restarts import close_quietly
+from dataflow.graph.model import Node
+from dataflow.messages.base import Message
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.sync import NEVER, Firing
+from dataflow.sync.entries import entries_of
+
+SPACING = 0.1
+"""Seconds of work between two states that are kept."""
+MOST_BYTES = 2**28
+"""Of states, and of messages, that are kept of one operator."""
+_NEW = b""
+
+
+class Player:
+    """One operator, through all replays. Parameters change as in `records`, and effects get the answers in them."""
+
+    def __init__(self, node: Node, seed: int, version: int, records: Sequence[FiringRecord]) -> None:
+        self.node, self.stateless = node, node.operator.stateless
+        self._parameters = _parameters_of(records)
+        self._answers = {r.stamp: r.detail for r in records if r.kind in CALLS and EFFECTS in r.detail}
+        self._journal = RecordedJournal()
+        self.calls = Calls(node, node.make(), seed, version=version, effects=self._journal)
+        self.statics: Mapping[str, Message] | None = None
+        self.known: dict[bytes, Mapping[str, Message]] = {}
+        """Outputs by the past up to the call."""
+        self.summaries: dict[bytes, Mapping[str, float | int | str]] = {}
+        self._states: dict[bytes, bytes] = {}
+        self._held = self._state_bytes = 0
+        self._at: bytes | None = None
+        """The past of the operator as it is; None before its setup."""
+        self._worked = 0.0
+        self.made = 0
+
+    def set_up(self) -> Mapping[str, Message]:
+        """Sets the operator up, once; returns its static messages."""
+        if self.statics is None:
+            self.statics, self._at = self.calls.setup(), _NEW
+        return self.statics
+
+    def bring(self, pasts: Sequence[bytes], firings: Sequence[Firing]) -> None:
+        """Brings the operator to behind the last of some firings; `pasts` are those behind each, before them `_NEW`."""
+        if self.stateless or self._at == pasts[-1]:
+            return
+        near = next(
+            k for k in range(len(pasts) - 1, -1, -1) if not k or pasts[k] in self._states or pasts[k] == self._at
+        )
+        if pasts[near] != self._at:
+            close_quietly(self.calls.operator)
+            self.calls.operator = self.node.make()
+            self.calls.setup()
+            for _, name, value in self._due(NEVER, firings[near - 1].stamp if near else NEVER):
+                self.calls.parameter(name, value, (0, NEVER))
+            if near:
+                self.calls.restore(self._states[pasts[near]], (0, firings[near - 1].stamp))
+            self._at = pasts[near]
+        for k in range(near, len(pasts) - 1):
+            self._call(firings[k], firings[k - 1].stamp if k else NEVER, pasts[k + 1])
+
+    def process(self, pasts: list[bytes], firings: list[Firing], firing: Firing) -> Mapping[str, Message]:
+        """Makes the firing behind those, or gives what it gave in another replay; both lists are carried on.
+
+        Raises what the operator raises.
+        """
+        past = _past(b"" if self.stateless else pasts[-1], firing)
+        if (known := self.known.get(past)) is None:
+            self.bring(pasts, firings)
+            known = self._call(firing, firings[-1].stamp if firings else NEVER, past)
+            self._held += sum(message.nbytes() for message in known.values())
+            if self._held <= MOST_BYTES:
+                self.known[past] = known
+        if not self.stateless:
+            pasts.append(past)
+            firings.append(firing)
+        return known
+
+    def _call(self, firing: Firing, before: int, past: bytes) -> Mapping[str, Message]:
+        for _, name, value in self._due(before, firing.stamp):
+            self.calls.parameter(name, value, (0, firing.stamp - 1))
+        began = time.perf_counter()
+        self._at = None
+        self._journal.begin(self._answers.get(firing.stamp, {}))
+        made = self.calls.process(firing)
+        self.made += 1
+        self._at = past
+        self._worked += time.perf_counter() - began
+        if self._worked >= SPACING and not self.stateless and past not in self._states:
+            self._worked = 0.0
+            state = self.calls.snapshot((0, firing.stamp))
+            if state is not None and self._state_bytes + len(state) <= MOST_BYTES:
+                self._states[past] = state
+                self._state_bytes += len(state)
+        return made
+
+    def _due(self, after: int, until: int) -> Sequence[tuple[int, str, Any]]:
+        return [change for change in self._parameters if after < change[0] <= until]
+
+    def close(self) -> None:
+        """Closes the operator."""
+        close_quietly(self.calls.operator)
+
+
+class PlayedCalls(Calls):
+    """The calls of one replay, which a player makes."""
+
+    def __init__(self, player: Player) -> None:
+        calls = player.calls
+        super().__init__(calls.node, calls.operator, calls.seed, version=calls.version, effects=calls.effects)
+        self._player = player
+        self._pasts, self._firings = [_NEW], list[Firing]()
+
+    def setup(self) -> dict[str, Message]:
+        return dict(self._player.set_up())
+
+    def process(self, firing: Firing) -> dict[str, Message]:
+        return dict(self._player.process(self._pasts, self._firings, firing))
+
+    def summary(self, place: Place) -> dict[str, float | int | str]:
+        past = self._pasts[-1]
+        if past not in self._player.summaries:
+            self._player.bring(self._pasts, self._firings)
+            self._player.summaries[past] = self._player.calls.summary(place)
+        return dict(self._player.summaries[past])
+
+
+def _parameters_of(records: Sequence[FiringRecord]) -> list[tuple[int, str, Any]]:
+    """Returns the changes of parameters of a run: (stamp of the last call before + 1 ns, name, value)."""
+    found, last = [], NEVER
+    for record in records:
+        if record.kind == "param" and record.outcome != "error":
+            found.append((last + 1, record.detail["name"], record.detail["value"]))
+        last = record.stamp if record.kind in ("fire", "tick") else last
+    return found
+
+
+def _past(before: bytes, firing: Firing) -> bytes:
+    hashed = xxhash.xxh3_128(before)
+    hashed.update(f"{firing.stamp} {firing.kind} {firing.tick} {sorted(firing.stale)} {sorted(firing.late)}".encode())
+    for name, given in sorted(firing.inputs.items()):
+        hashed.update(f"{name} {type(given).__name__} ".encode())
+        for entry in entries_of(given):
+            hashed.update(entry.stream.encode() + entry.digest)
+    return hashed.digest()

@@ -1,0 +1,294 @@
+"""Finds a smallest set of losses that cost a figure."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+from dataflow.capture.reduce import needed, smallest
+from dataflow.drops.branch import Branch, Figures
+from dataflow.drops.losses import Loss, losses_of, sent_by
+from dataflow.drops.player import Player
+from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.threads import limited_threads
+from dataflow.graph.model import Graph
+from dataflow.recording import Recording
+from dataflow.records.figures import recorded_summaries
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.reading import FiringLog
+from dataflow.reexecution.engine import Feeding, plan_feeding
+from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, seeding_of
+
+SECONDS = 60.0
+
+
+class DropsError(ReplayError):
+    """Raised where it cannot be found what losses cost; the message has the reason."""
+
+
+class Worse:
+    """An expression that is true of figures that are bad, such as "ate_rmse_m > 0.05". Raises SyntaxError.
+
+    Names are those of figures, without what follows where only one begins so (of several the one that goes on with
+    `rmse`), or OPERATOR.FIGURE where several operators have it; other characters than letters and digits are `_`.
+    """
+
+    def __init__(self, text: str, summaries: Figures) -> None:
+        self.text = text
+        self._code = compile(text, "<worse>", "eval")
+        self._plain = {o: {_word(n): v for n, v in found.items()} for o, found in summaries.items()}
+        self._named = {name: self._meant(name) for name in self._code.co_names}
+        missing = [name for name, meant in self._named.items() if meant is None and not self._is_part(name)]
+        if missing or not any(self._named.values()):
+            known = ", ".join(sorted({n for found in self._plain.values() for n in found})) or "none"
+            raise DropsError(f"--worse {text}: no figure {', '.join(missing)}; there are: {known}")
+
+    @property
+    def operators(self) -> list[str]:
+        """The operators whose figures it sees."""
+        return list(dict.fromkeys(meant[0] for meant in self._named.values() if meant is not None))
+
+    def is_true(self, figures: Figures) -> bool:
+        """Returns whether it is true of figures. Raises `DropsError` where one is missing, or no number."""
+        names: dict[str, Any] = {}
+        for name, meant in self._named.items():
+            if meant is None:
+                continue
+            found = {_word(n): value for n, value in figures.get(meant[0], {}).items()}
+            names[name] = found.get(meant[1]) if meant[1] else SimpleNamespace(**found)
+        try:
+            return bool(eval(self._code, names))
+        except Exception as error:
+            raise DropsError(
+                f"--worse {self.text}: {type(error).__name__}: {error}; figures: {dict(figures)}"
+            ) from error
+
+    def values(self, figures: Figures) -> dict[str, Any]:
+        """Returns the figures that it sees, by name."""
+        seen: dict[str, Any] = {}
+        for operator, figure in filter(None, self._named.values()):
+            here = figures.get(operator, {})
+            seen |= {
+                f"{operator}: {n}": v
+                for n, v in here.items()
+                if _word(n) == figure or (not figure and self._is_part(_word(n)))
+            }
+        return seen
+
+    def _is_part(self, name: str) -> bool:
+        """Returns whether a name is that of a figure behind an operator's."""
+        behind = [operator for operator in self._plain if _word(operator) in self._code.co_names]
+        return name in self._code.co_names and any(name in self._plain[operator] for operator in behind)
+
+    def _meant(self, name: str) -> tuple[str, str] | None:
+        """The operator and figure of a name; of the name of an operator, "" for the figure."""
+        if operators := [operator for operator in self._plain if _word(operator) == name]:
+            return operators[0], ""
+        if self._is_part(name):
+            return None
+        for fits in (str.__eq__, _begins, lambda figure, name: _begins(figure, f"{name}_rmse")):
+            found = [(o, n) for o, figures in self._plain.items() for n in figures if fits(n, name)]
+            if len(found) == 1:
+                return found[0]
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Losses that cost the figures.
+
+    - `named`: a smallest set: without them it is not worse, and with any one of them it is. `minimal`: False where the
+      time was up before that was known of each.
+    - `losses`: how many there are in the `operators` between them and the figures.
+    - `figures`: as recorded; `undone`: without the named ones; `best`: without any.
+    - `not_sent`: steps that sources dropped before they were numbered: these are not in the file.
+    """
+
+    named: Sequence[Loss]
+    minimal: bool
+    losses: int
+    operators: Sequence[str]
+    figures: Mapping[str, Any]
+    undone: Mapping[str, Any]
+    best: Mapping[str, Any]
+    not_sent: int
+    replays: int
+    calls: int
+    seconds: float
+
+
+class Drops:
+    """Looks for the losses of a recorded run that made `worse` true of its figures.
+
+    `budget`: seconds; `watch` gets the numbers of replays and of losses that may still be left. Runs operators in this
+    process. Raises `DropsError`, `ReplayError`, `OperatorFailure`, and SyntaxError for `worse`.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        worse: str,
+        graph: Graph | None = None,
+        *,
+        budget: float = SECONDS,
+        watch: Callable[[int, int], None] = lambda replays, left: None,
+    ) -> None:
+        self._recording, self._budget, self._watch = recording, budget, watch
+        self.graph = graph_that_is_here(recording)[0] if graph is None else graph
+        self._log = FiringLog.read(recording)
+        names = [name for name in self.graph.nodes if name in self._log.operators]
+        self._recorded = recorded_summaries(recording, names)
+        self.worse = Worse(worse, self._recorded)
+        self._records = {name: list(self._log.ordered(self.graph.nodes[name])) for name in names}
+        self.replays = 0
+
+    def find(self) -> Cost:
+        """Finds them."""
+        began = time.monotonic()
+        if not self.worse.is_true(self._recorded):
+            raise DropsError(f"the recorded figures are not {self.worse.text}: {self.worse.values(self._recorded)}")
+        feeding, losses = self._plan()
+        if not losses:
+            raise DropsError("nothing was lost, or came late, between the sources and these figures")
+        branch = self._branch(feeding, losses)
+        try:
+            with limited_threads(self.graph.threads):
+                return self._search(branch, feeding, losses, began)
+        finally:
+            self._close()
+
+    def _plan(self) -> tuple[Feeding, list[Loss]]:
+        """The operators between losses and figures, with what feeds them, and the losses."""
+        graph = self.graph
+        above = _above(graph, self.worse.operators)
+        sent: dict[str, Sequence[tuple[tuple[int, int], int]]] = {}
+        for name, records in self._records.items():
+            sent |= sent_by(list(graph.nodes[name].outputs.values()), records)
+        losses: list[Loss] = []
+        for name in above:
+            node = graph.nodes[name]
+            if node.taken and not node.external and name in self._records:
+                losses += losses_of(node, self._records[name], sent, graph.static)
+        losing = {loss.operator for loss in losses}
+        between = [name for name in graph.nodes if name in above and losing & _above(graph, [name])]
+        inside = {s for name in between for s in graph.nodes[name].outputs.values()}
+        outer = plan_feeding(self._recording, graph, between, incomplete=inside)
+        return outer, sorted(losses)
+
+    def _branch(self, feeding: Feeding, losses: Sequence[Loss]) -> Branch:
+        version = seeding_of(self._recording)
+        self._players = {
+            name: Player(self.graph.nodes[name], self.graph.seed, version, self._records.get(name, ()))
+            for name in feeding.operators
+        }
+        return Branch(self._recording, self.graph, feeding, self._players, losses)
+
+    def _search(self, branch: Branch, feeding: Feeding, losses: Sequence[Loss], began: float) -> Cost:
+        before = self._replay(branch, ())
+        self._check(branch, before)
+        best = self._replay(branch, losses)
+        if self.worse.is_true(best):
+            found = self.worse.values(best)
+            raise DropsError(f"with all {len(losses)} losses undone it is {self.worse.text} still: {found}")
+        in_time = True
+
+        def heals(part: Sequence[Loss]) -> bool:
+            nonlocal in_time
+            if time.monotonic() > began + self._budget:
+                in_time = False
+                return False
+            self._watch(self.replays, len(part))
+            try:
+                return not self.worse.is_true(self._replay(branch, part))
+            except OperatorFailure:  # an operator cannot cope with what comes then: that heals nothing
+                return False
+
+        named = needed(losses, heals)
+        if in_time:
+            named = smallest(named, heals)
+        undone = self._replay(branch, named)
+        again = self._branch(feeding, losses)
+        if self.worse.values(self._replay(again, named)) != self.worse.values(undone):
+            raise DropsError("two equal replays do not give equal figures: dataflow verify --why shows what differs")
+        return Cost(
+            named=named,
+            minimal=in_time,
+            losses=len(losses),
+            operators=feeding.operators,
+            figures=self.worse.values(before),
+            undone=self.worse.values(undone),
+            best=self.worse.values(best),
+            not_sent=self._not_sent(),
+            replays=self.replays,
+            calls=sum(player.made for player in self._players.values()),
+            seconds=time.monotonic() - began,
+        )
+
+    def _replay(self, branch: Branch, undone: Sequence[Loss]) -> Figures:
+        self.replays += 1
+        return branch.replay(frozenset(undone))
+
+    def _check(self, branch: Branch, figures: Figures) -> None:
+        """Raises `DropsError` where a replay with all losses is not what was recorded: then one without them would show
+        nothing."""
+        for name, records in branch.records.items():
+            node = self.graph.nodes[name]
+            if node.source or name not in self._players:
+                continue
+            there, here = _firings(self._records[name]), _firings(records)
+            while len(there) > len(here) and there[-1][1]:  # beats behind the end of all streams, by the clock
+                there.pop()
+            if there != here:
+                k = next(
+                    (k for k, (a, b) in enumerate(zip(there, here, strict=False)) if a != b), min(len(there), len(here))
+                )
+                stamp = (there[k : k + 1] or here[k : k + 1])[0][0]
+                raise DropsError(
+                    f"the replay with all losses is not the recorded run: {name} has other firings from stamp {stamp} "
+                    "on (a restart, a clock that went back, other code? dataflow verify shows the latter)"
+                )
+        recorded, found = self.worse.values(self._recorded), self.worse.values(figures)
+        if recorded != found:
+            raise DropsError(f"the figures change by themselves: recorded {recorded}, replayed {found}")
+
+    def _not_sent(self) -> int:
+        sources = [records for name, records in self._records.items() if self.graph.nodes[name].source]
+        details = [r.detail for records in sources for r in records if r.kind in ("fire", "finish")]
+        return sum(n for detail in details for n in detail.values() if type(n) is int)
+
+    def _close(self) -> None:
+        for player in self._players.values():
+            player.close()
+
+
+def _above(graph: Graph, operators: Sequence[str]) -> set[str]:
+    """The operators, and all that they depend on."""
+    found, left = set(operators), list(operators)
+    while left:
+        for stream in graph.nodes[left.pop()].taken:
+            maker = graph.streams[stream].node
+            if maker not in found:
+                found.add(maker)
+                left.append(maker)
+    return found
+
+
+def _firings(records: Sequence[FiringRecord]) -> list[tuple[Any, ...]]:
+    """What firings were given and made, without what a replay numbers otherwise."""
+    return [
+        (r.stamp, r.tick, dict(r.inputs), [e and e.digest for e in r.outputs])
+        for r in records
+        if r.kind in CALLS and r.kind != "finish"
+    ]
+
+
+def _word(name: str) -> str:
+    return re.sub(r"\W", "_", name)
+
+
+def _begins(figure: str, name: str) -> bool:
+    return figure.startswith(f"{name}_")

@@ -1,0 +1,47 @@
+"""`dataflow drops` as it is typed, on a run that lost something."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import held_runs
+import pytest
+
+SUPPORT = str(Path(held_runs.__file__).parent)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> str:
+    faults = held_runs.Faults(still=[("odometry", 45, 55)])
+    path = tmp_path_factory.mktemp("held") / "run.mcap"
+    return str(held_runs.recorded(held_runs.graph(80), faults, path))
+
+
+@pytest.mark.long
+def test_the_loss_is_named_with_what_it_cost_and_what_is_not_known(dataflow, run: str) -> None:
+    told = dataflow("drops", run, "--worse", "end_error > 5", "--path", SUPPORT, "--budget", "60").stdout
+
+    assert "1.000 s" in told
+    assert "held/drive/step" in told
+    assert "overflow" in told
+    assert "a smallest set, not the only cause" in told
+    assert "are not in the file" in told
+
+
+@pytest.mark.long
+def test_it_is_json_with_another_graph_and_settings(dataflow, run: str, tmp_path: Path) -> None:
+    graph = tmp_path / "held.yaml"
+    graph.write_text(held_runs.TEXT.format(steps=80, score="Score"))
+    words = ("--graph", str(graph), "--set", "drive.steps=80", "--path", SUPPORT, "--json")
+
+    told = json.loads(dataflow("drops", run, "--worse", "end_error > 5", *words).stdout)
+
+    assert [loss["stamp"] for loss in told["named"]] == [held_runs.STAMP + 10**9]
+    assert told["minimal"] is True
+
+
+def test_no_expression_is_refused(dataflow, run: str) -> None:
+    told = dataflow("drops", run, "--worse", "end_error >", "--path", SUPPORT, code=2)
+
+    assert "--worse end_error >: no Python expression" in told.stderr
