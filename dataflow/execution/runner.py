@@ -36,7 +36,10 @@ SHORT = 1_000_000
 messages imply the same frontier at once."""
 
 CPU_SPACING = 250_000_000
-"""ns of an operator's CPU time between two snapshots of its state, where they are spaced by that."""
+"""ns of CPU time between two snapshots of an operator's state, where they are spaced by that: of its own time, and of
+what repeating it takes besides."""
+REPEATING = 2_000_000
+"""ns that repeating a call takes besides: reading, decoding, comparing (`benchmarks/debugging.md`)."""
 
 MOST_DROPPED = 10_000
 """Stamps that one step may drop before it returns to its driver, which has other work."""
@@ -213,9 +216,11 @@ class OperatorRunner(Runner):
 
     def _snapshot_if_due(self, stamp: int) -> None:
         """Records the operator's state, about every `snapshots` ns of event time, then at the same firings in every
-        run; or every `CPU_SPACING` ns of its CPU time."""
+        run; or every `CPU_SPACING` ns of the CPU time that it takes to repeat its calls."""
         assert self.snapshots is not None
-        at, spacing = (self.work.cpu_ns, CPU_SPACING) if self.snapshots == "cpu" else (stamp, self.snapshots)
+        at, spacing = stamp, self.snapshots
+        if spacing == "cpu":
+            at, spacing = self.work.cpu_ns + self.firings * REPEATING, CPU_SPACING
         if self._next_snapshot is None:
             self._next_snapshot = at + spacing
         if at < self._next_snapshot:

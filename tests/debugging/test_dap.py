@@ -264,6 +264,16 @@ def test_steps_into_are_the_lines_of_a_run_with_prints_and_five_steps_back_undo_
         assert client.seen() == expected[first + 12]
 
 
+def test_a_breakpoint_is_hit_in_a_later_call_after_a_step_back(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, stopOnEntry=False) as client:
+        client.breakpoints(TOTAL)
+        client.ask("configurationDone")
+        client.stopped()
+        client.go("stepBack")
+        assert [client.go("continue") for _ in range(3)] == [("breakpoint", TOTAL)] * 3
+        assert client.call() == 2
+
+
 def test_reverse_continue_goes_to_the_last_hit_of_this_call_then_of_earlier_ones(
     recorded: tuple[Recording, Path],
 ) -> None:

@@ -89,14 +89,14 @@ class Session:
 
     def _go(self) -> None:
         """Makes one call under watch, and finds what is next."""
-        going = self._going
-        fired = self._made(going.call, self._at_line)
+        fired = self._made(self._going.call, self._at_line)
         if self._away is not None:
             self._going = self._led()
             return
         if self._over:
             return
         self._check(fired)
+        going = self._going  # a stop has changed what it stops at
         stops = self._breaks if going.stops == self._breaks else self._first_line
         if going.call + 1 < len(self._debugger.calls):
             self._going = Going(going.call + 1, stops)
