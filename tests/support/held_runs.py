@@ -206,7 +206,7 @@ def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None 
             due += 1
         still = {name for name, first, last in faults.still if first * 20 * MS <= now < last * 20 * MS}
         working = [runner for runner in driver.operators if runner.node.name not in still]
-        while any([runner.step() for runner in working]):
+        while sum(runner.step() for runner in working):
             pass
     for stream, made in graph.streams.items():
         if graph.nodes[made.node].source and not made.static:
