@@ -33,7 +33,7 @@ from dataflow.messages import (  # noqa: E402
 )
 from dataflow.messages import Transforms as TransformSet  # noqa: E402
 from dataflow.messages.geometry import transform_points  # noqa: E402
-from operators.cloud.back_projection import Rays, beside_edge, within_range  # noqa: E402
+from operators.cloud.cloud_builder import Rays, beside_edge, within_range  # noqa: E402
 from operators.mapping import OccupancyMapper, TsdfMap  # noqa: E402
 from operators.mapping.placing import placed  # noqa: E402
 from operators.simulator import SimulatedRobot  # noqa: E402

@@ -21,7 +21,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     arguments = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-    from operators.evaluation.orientation_error import differences, errors
+    from operators.evaluation.orientation_metrics import differences, errors
     from operators.fusion import OrientationFilter
     from operators.sources import BroadImu
     from operators.sources.broad_imu import read_trial

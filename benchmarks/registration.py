@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree  # noqa: E402
 from dataflow.messages import Diagnostics, Message, Odometry, PointCloud, Pose, Transforms  # noqa: E402
 from dataflow.messages.geometry import invert, transform_points  # noqa: E402
 from operators.cloud import CloudRegistration  # noqa: E402
-from operators.cloud.back_projection import Rays, within_range  # noqa: E402
+from operators.cloud.cloud_builder import Rays, within_range  # noqa: E402
 from operators.geometry import se3  # noqa: E402
 from operators.odometry import LidarOdometry  # noqa: E402
 from operators.simulator import SimulatedRobot  # noqa: E402

@@ -124,7 +124,7 @@ def recognition(folder: Path) -> list[str]:
     import torch
 
     from operators.learning.export import export_network
-    from operators.recognition.network import ClassifierNetwork, DeployedClassifier
+    from operators.recognition.training import ClassifierNetwork, DeployedClassifier
 
     torch.manual_seed(7)
     file, facts = folder / "things.onnx", {"kind": "classifier", "classes": ["a", "b", "c"], "width": 64, "height": 64}

@@ -8,7 +8,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final, TypeVar
 
 import pydantic
 from pydantic.fields import FieldInfo
@@ -18,6 +18,9 @@ from dataflow.ports import Batch, In, InputPort, OperatorDefinitionError, Operat
 from dataflow.sync.stamps import parse_duration
 
 _PORTS: tuple[type, ...] = (In, Sampled, Batch, Out)
+_EVERY: Final = "__takes_every_input__"
+
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 Fault = Callable[[str, str], OperatorDefinitionError]
 """Makes the error for (attribute, what is wrong with it)."""
@@ -211,10 +214,18 @@ def _input_port(name: str, port: In[Any] | Sampled[Any] | Batch[Any], accepted: 
     return InputPort(name, "in", accepted, port.many, port.doc)
 
 
+def takes_every_input(process: Method) -> Method:
+    """Marks a `process()` that takes the context, and every input of its class by name, whatever they are."""
+    vars(process)[_EVERY] = True
+    return process
+
+
 def process_takes(process: Any, missing: bool, inputs: Mapping[str, InputPort], fault: Fault) -> tuple[str, ...]:
     """The arguments of `process()` by name, held against the inputs; `missing`: the class defines none."""
     if missing:
         raise fault("process", "is missing: define process(self, " + ", ".join(inputs) + ")")
+    if getattr(process, _EVERY, False):
+        return (*inputs, "context")
     parameters = list(inspect.signature(process).parameters.values())[1:]
     names = [p.name for p in parameters]
     for parameter in parameters:

@@ -92,7 +92,7 @@ Journaled = Callable[[Callable[..., Any], Sequence[Any], Mapping[str, Any]], Any
 """Makes a call with positional and named arguments through a journal."""
 
 FINDING = "finding"
-"""Key of a summary's text that stands among the first lines at a run's end: something is wrong with what was given."""
+"""Key of a report's summary for the operator's finding, which stands among the first lines at a run's end."""
 
 
 class Operator:
@@ -274,6 +274,10 @@ class Operator:
     def summary(self) -> Mapping[str, float | int | str]:
         """Returns figures to show at the end of a run, by default those of a state `Counts`; read after `finish()`."""
         return dict(self.state.counts) if issubclass(self.spec.state or object, Counts) else {}
+
+    def finding(self) -> str:
+        """Returns in a line what is wrong with what was given, "" for nothing: for `dataflow top` and a run's end."""
+        return ""
 
     @classmethod
     def trained_in_simulation(cls, params: Mapping[str, Any]) -> bool:

@@ -246,9 +246,9 @@ def _listed(value: Any, place: str, length: int | None = None) -> Any:
 def _scalar(kind: type, value: Any, place: str) -> Any:
     if isinstance(value, np.ndarray) and value.shape == ():
         value = value.item()
-    if not isinstance(value, _SCALARS[kind]) or (kind is int and isinstance(value, bool)):
+    if not isinstance(value, _SCALARS[kind]):
         raise StateError(f"{place}: expected a {kind.__name__}, got a {type(value).__name__}")
-    return None if value is None else kind(value)
+    return value if value is None or isinstance(value, bool) else kind(value)  # Python counts with bools, too
 
 
 def _message(value: Any, place: str) -> Message:

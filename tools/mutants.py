@@ -1,6 +1,6 @@
 """Counts how many of some random faults in a package its tests find.
 
-usage: python tools/mutants.py PACKAGE [--tests FOLDER] [--count N] [--seed N]      (PACKAGE: such as dataflow/sync)
+usage: python tools/mutants.py PACKAGE [--tests FOLDER] [--count N] [--seed N] [--quick]   (PACKAGE: dataflow/sync)
 
 A mutant differs from the package in one place: a comparison, an operator of arithmetic or logic, a number, a returned
 value or a dropped statement. Equal seeds draw equal mutants of equal sources, so that the tests of two commits can be
@@ -129,9 +129,10 @@ def drawn(package: Path, count: int, seed: int) -> list[Mutant]:
     return random.Random(seed).sample(every, min(count, len(every)))
 
 
-def passes(checkout: Path, tests: str) -> bool:
-    """Runs tests, up to the first that fails, in a copy of the checkout."""
+def passes(checkout: Path, tests: str, quick: bool = False) -> bool:
+    """Runs tests, up to the first that fails, in a copy of the checkout; `quick` leaves the long ones out."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", "--timeout", "120", tests]
+    command += ["-m", "not long"] if quick else []
     environment = os.environ | {"PYTHONPATH": str(checkout)}
     environment.setdefault("PERCEPTION_DATA", str(REPOSITORY.parent / "shared" / "data"))
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -153,6 +154,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tests", help="default: the folder that mirrors the package")
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quick", action="store_true", help="leave long tests out, as a bare `pytest` does")
     given = parser.parse_args(arguments)
     package = given.package
     tests = given.tests or str(Path("tests", *package.parts[package.parts[0] == "dataflow" :]))
@@ -162,7 +164,7 @@ def main(arguments: list[str] | None = None) -> int:
             source = REPOSITORY / name
             (shutil.copytree if source.is_dir() else shutil.copy2)(source, checkout / name)
         started = time.monotonic()
-        if not passes(checkout, tests):
+        if not passes(checkout, tests, given.quick):
             print(f"{tests} fails without any mutant", file=sys.stderr)
             return 2
         print(f"{tests} passes in {time.monotonic() - started:.0f} s", flush=True)
@@ -172,7 +174,7 @@ def main(arguments: list[str] | None = None) -> int:
         for mutant in mutants:
             source_of = mutant.file.read_bytes()
             mutant.file.write_bytes(mutant.written(source_of))
-            found = not passes(checkout, tests)
+            found = not passes(checkout, tests, given.quick)
             mutant.file.write_bytes(source_of)
             killed += found
             print(f"{'killed  ' if found else 'SURVIVED'} {mutant}", flush=True)

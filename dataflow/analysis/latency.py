@@ -14,17 +14,29 @@ Clocks: wall time of one machine. Where a run spread over several, their offset 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import heapq
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
 from dataflow.records.firing import WITHHELD, FiringRecord, decode_batch
+from dataflow.records.reading import FiringLog
 from dataflow.sync import InputRef, MessageRef
 
+T = TypeVar("T")
+KEPT = 16_384
+"""Messages of a stream that are kept while not all of its consumers have taken one, and firings between two looks at
+which may go."""
+NEVER = (2**63, 0)
+AHEAD = 60 * 10**9
+"""Event time (ns) by which the firing that made a message may lie behind that which takes it, beside the tolerance."""
+FEW = 1024
+"""So few messages of a stream are kept without a look."""
 Place = tuple[str, int, int]
 """A message: stream, incarnation, number."""
 
@@ -86,19 +98,26 @@ class _Made:
 
 @dataclass(slots=True)
 class _Path:
-    latencies: list[int] = field(default_factory=list)
+    latencies: array[int] = field(default_factory=lambda: array("q"))
     work: dict[str, int] = field(default_factory=dict)
     wait: dict[str, int] = field(default_factory=dict)
 
 
 def recorded_latencies(recording: Recording, graph: Graph) -> list[PathLatency]:
     """The latencies of all paths of a recorded run, sources and sinks in graph order. Raises `RecordingError`."""
-    return latencies(graph, {name: list(_records(recording, name)) for name in graph.nodes})
+    log = FiringLog.read(recording)
+    return latencies(graph, {name: _Recorded(log, node) for name, node in graph.nodes.items()})
 
 
-def _records(recording: Recording, operator: str) -> Iterator[FiringRecord]:
-    for _, payload in recording.firings(operator):
-        yield from decode_batch(payload).records
+@dataclass(frozen=True, slots=True)
+class _Recorded:
+    """The records of one operator in order, read whenever they are iterated over."""
+
+    log: FiringLog
+    node: Node
+
+    def __iter__(self) -> Iterator[FiringRecord]:
+        return self.log.ordered(self.node)
 
 
 def batch_latencies(graph: Graph, batches: Iterable[bytes]) -> list[PathLatency]:
@@ -110,29 +129,139 @@ def batch_latencies(graph: Graph, batches: Iterable[bytes]) -> list[PathLatency]
     return latencies(graph, records)
 
 
-def latencies(graph: Graph, records: Mapping[str, Sequence[FiringRecord]]) -> list[PathLatency]:
-    """The latencies of all paths, from the records of each operator in their order.
+def latencies(graph: Graph, records: Mapping[str, Iterable[FiringRecord]]) -> list[PathLatency]:
+    """The latencies of all paths, from the records of each operator in their order, which are iterated over twice.
 
-    A sink is an operator that causes no firing of another one.
+    A sink is an operator that causes no firing of another one. In memory are the latencies, 8 bytes each, and of each
+    stream the messages that may still be taken: those from the last one on that each consumer took, but at most
+    `KEPT`, which is more than any queue holds.
     """
-    calls = {name: [r for r in records.get(name, ()) if _is_firing(r)] for name in graph.nodes}
-    stamps = _stamps(graph, calls)
-    causes = {name: _causing_inputs(node, calls[name], stamps) for name, node in graph.nodes.items()}
-    made: dict[Place, _Made] = {}
+    causes = _causes(graph, records)
+    ranks = {name: rank for rank, name in enumerate(_in_order(graph, causes))}
     paths: dict[tuple[str, str], _Path] = {}
     consumed = {stream for name, inputs in causes.items() for i in inputs for stream in graph.nodes[name].inputs[i]}
-    for name in _in_order(graph, causes):
-        node = graph.nodes[name]
-        sink = not node.source and not consumed & set(node.outputs.values())
-        for record in calls[name]:
-            firing = _firing(node, record, causes[name], made)
-            if firing is None:
-                continue
-            made.update((place, firing) for place, _ in _emitted(node, record))
-            if sink:
-                for source in firing.origin:
-                    _enter(paths.setdefault((source, name), _Path()), firing, source)
+    sinks = {n for n, node in graph.nodes.items() if not node.source and not consumed & set(node.outputs.values())}
+
+    def made_by(node: Node, record: FiringRecord, made: Window[_Made]) -> _Made | None:
+        places = (place for port in causes[node.name] for place in _places(record.inputs.get(port)))
+        known = [firing for place in places if (firing := made.get(place)) is not None]
+        firing = _firing(node, record, [cause for cause in known if ranks[cause.operator] <= ranks[node.name]])
+        if firing is not None and node.name in sinks:
+            for source in firing.origin:
+                _enter(paths.setdefault((source, node.name), _Path()), firing, source)
+        return firing
+
+    _Walk(graph, records, causes, made_by).run()
     return [_summary(source, sink, path) for (source, sink), path in _sorted(graph, paths)]
+
+
+class Window(Generic[T]):
+    """What is known of the messages that may still be taken, by stream."""
+
+    def __init__(self, streams: Iterable[str]) -> None:
+        self._known: dict[str, dict[tuple[int, int], T]] = {stream: {} for stream in streams}
+
+    def get(self, place: Place) -> T | None:
+        """What is known of a message; None where its firing is not known."""
+        return self._known.get(place[0], {}).get(place[1:])
+
+    def put(self, place: Place, value: T) -> None:
+        """Notes a message that was sent."""
+        self._known[place[0]][place[1:]] = value
+
+    def __getitem__(self, stream: str) -> Mapping[tuple[int, int], T]:
+        return self._known[stream]
+
+    def forget(self, stream: str, taken: Sequence[tuple[int, int] | None]) -> None:
+        """Drops messages before the last ones that the consumers of a stream took, None: none so far."""
+        known = self._known[stream]
+        floors = [place for place in taken if place is not None]
+        kept = set(floors) | set(list(known)[-KEPT:])
+        least = min(floors, default=NEVER) if len(floors) == len(taken) else None
+        self._known[stream] = {
+            place: value for place, value in known.items() if place in kept and (least is None or place >= least)
+        }
+
+
+class _Walk(Generic[T]):
+    """Goes through the firings of all operators at once, by stamp, producers before those whose firings they cause.
+
+    `make`: returns what is known of a firing, from what is known of the messages before it; None: not known.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        records: Mapping[str, Iterable[FiringRecord]],
+        causes: Mapping[str, Sequence[str]],
+        make: Callable[[Node, FiringRecord, Window[T]], T | None],
+    ) -> None:
+        self._graph, self._causes, self._make = graph, causes, make
+        self._makers = {name: stream.node for name, stream in graph.streams.items()}
+        self._ranks = {name: rank for rank, name in enumerate(_in_order(graph, causes))}
+        self._left = {name: filter(_is_firing, records.get(name, ())) for name in graph.nodes}
+        self._heads = {name: next(left, None) for name, left in self._left.items()}
+        self._window = Window[T](graph.streams)
+        self._taken: dict[str, dict[tuple[str, str], tuple[int, int] | None]] = {stream: {} for stream in graph.streams}
+        """By stream, for each input of a consumer the last message that it took."""
+        for name, node in graph.nodes.items():
+            for port in causes[name]:
+                for stream in node.inputs[port]:
+                    self._taken[stream][name, port] = None
+        self._busy: set[str] = set()
+        self._steps = 0
+
+    def run(self) -> None:
+        """Goes through all of them."""
+        ahead = [(head.stamp, self._ranks[name], name) for name, head in self._heads.items() if head is not None]
+        heapq.heapify(ahead)
+        while ahead:
+            _, rank, name = heapq.heappop(ahead)
+            if self._heads[name] is None:
+                continue
+            self._step(name)
+            head = self._heads[name]
+            if head is not None:
+                heapq.heappush(ahead, (head.stamp, rank, name))
+            if self._steps >= KEPT:
+                self._steps = 0
+                self._forget()
+
+    def _step(self, name: str) -> None:
+        """Takes the next firing of an operator, behind those that made what it took."""
+        record, node = self._heads[name], self._graph.nodes[name]
+        assert record is not None
+        self._steps += 1
+        self._busy.add(name)
+        for port in self._causes[name]:
+            for place in _places(record.inputs.get(port)):
+                self._reach(place, record.stamp + node.tolerance + AHEAD)
+                if (name, port) in self._taken.get(place[0], ()):
+                    self._taken[place[0]][name, port] = place[1:]
+        made = self._make(node, record, self._window)
+        if made is not None:
+            for place, _ in _emitted(node, record):
+                self._window.put(place, made)
+        self._busy.discard(name)
+        self._heads[name] = next(self._left[name], None)
+
+    def _reach(self, place: Place, latest: int) -> None:
+        """Goes on with the maker of a message up to there, or up to the stamp `latest`."""
+        maker = self._makers.get(place[0], "")
+        while self._window.get(place) is None and maker not in self._busy:
+            head = self._heads.get(maker)
+            if head is None or head.stamp > latest:
+                return
+            if any(at > place for at, _ in _emitted(self._graph.nodes[maker], head) if at[0] == place[0]):
+                return
+            self._step(maker)
+
+    def _forget(self) -> None:
+        for stream, taken in self._taken.items():
+            if len(self._window[stream]) > FEW:
+                self._window.forget(
+                    stream, [place for (name, _), place in taken.items() if self._heads[name] is not None]
+                )
 
 
 def _is_firing(record: FiringRecord) -> bool:
@@ -146,33 +275,35 @@ def _emitted(node: Node, record: FiringRecord) -> Iterator[tuple[Place, int]]:
             yield (stream, record.incarnation, emission.seq), emission.stamp
 
 
-def _stamps(graph: Graph, calls: Mapping[str, Sequence[FiringRecord]]) -> dict[Place, int]:
-    return {
-        place: stamp
-        for name, node in graph.nodes.items()
-        for record in calls[name]
-        for place, stamp in _emitted(node, record)
-    }
+def _causes(graph: Graph, records: Mapping[str, Iterable[FiringRecord]]) -> dict[str, tuple[str, ...]]:
+    """The inputs whose messages cause the firings of each operator: triggers, else batches, else all."""
+    triggers = {name: dict.fromkeys(node.inputs, True) for name, node in graph.nodes.items()}
+    last: dict[tuple[str, str, str], tuple[int, int]] = {}
+    batches: set[tuple[str, str]] = set()
 
+    def look(node: Node, record: FiringRecord, stamps: Window[Mapping[Place, int]]) -> Mapping[Place, int]:
+        """An input triggers if it has, in every firing, messages of its stamp that no firing had before."""
+        for port, ref in record.inputs.items():
+            if isinstance(ref, tuple):
+                batches.add((node.name, port))
+            for stream, *at in _places(ref):
+                place = at[0], at[1]
+                known = stamps.get((stream, *place))
+                stamp = record.stamp if known is None else known[stream, *place]
+                before = last.get((node.name, port, stream))
+                if (before is not None and place <= before) or abs(stamp - record.stamp) > node.tolerance:
+                    triggers[node.name][port] = False
+                last[node.name, port, stream] = place
+        return dict(_emitted(node, record))
 
-def _causing_inputs(node: Node, calls: Sequence[FiringRecord], stamps: Mapping[Place, int]) -> tuple[str, ...]:
-    """The inputs whose messages cause the firings: triggers, else batches, else all."""
-    batches = {name for record in calls for name, ref in record.inputs.items() if isinstance(ref, tuple)}
-    single = [name for name in node.inputs if name not in batches]
-    triggers = tuple(name for name in single if _triggers(node, name, calls, stamps))
-    return triggers or tuple(name for name in node.inputs if name in batches) or tuple(single)
-
-
-def _triggers(node: Node, name: str, calls: Sequence[FiringRecord], stamps: Mapping[Place, int]) -> bool:
-    """Returns whether an input has, in every firing, messages of its stamp that no firing had before."""
-    seen: set[Place] = set()
-    for record in calls:
-        for place in _places(record.inputs.get(name)):
-            stamp = stamps.get(place, record.stamp)
-            if place in seen or abs(stamp - record.stamp) > node.tolerance:
-                return False
-            seen.add(place)
-    return bool(seen)
+    _Walk(graph, records, {name: tuple(node.inputs) for name, node in graph.nodes.items()}, look).run()
+    taken = {(name, port) for name, port, _ in last}
+    found: dict[str, tuple[str, ...]] = {}
+    for name, node in graph.nodes.items():
+        single = [port for port in node.inputs if (name, port) not in batches]
+        trigger = tuple(port for port in single if triggers[name][port] and (name, port) in taken)
+        found[name] = trigger or tuple(port for port in node.inputs if (name, port) in batches) or tuple(single)
+    return found
 
 
 def _in_order(graph: Graph, causes: Mapping[str, Sequence[str]]) -> list[str]:
@@ -190,12 +321,11 @@ def _in_order(graph: Graph, causes: Mapping[str, Sequence[str]]) -> list[str]:
     return order
 
 
-def _firing(node: Node, record: FiringRecord, inputs: Sequence[str], made: Mapping[Place, _Made]) -> _Made | None:
+def _firing(node: Node, record: FiringRecord, given: Sequence[_Made]) -> _Made | None:
     """None for a firing whose causes are unknown (they lie before the recording, or were not recorded)."""
     begin, end = record.wall_start, record.wall_start + record.duration
     if node.source:
         return _Made(node.name, begin, end, None, {node.name: begin})
-    given = [made[place] for name in inputs for place in _places(record.inputs.get(name)) if place in made]
     if not given:
         return None
     origin: dict[str, int] = {}
@@ -232,7 +362,7 @@ def _enter(path: _Path, firing: _Made, source: str) -> None:
 
 def _summary(source: str, sink: str, path: _Path) -> PathLatency:
     count = len(path.latencies)
-    p50, p99 = np.percentile(path.latencies, [50, 99])
+    p50, p99 = np.percentile(np.asarray(path.latencies), [50, 99])
     shares = tuple(
         Share(operator, work / count, path.wait.get(operator, 0) / count)
         for operator, work in reversed(path.work.items())

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
@@ -29,6 +31,8 @@ class Command:
     name: str = ""
     """By default that of the function."""
     ignore_unknown_options: bool = False
+    elsewhere: bool = False
+    """It follows graphs of other machines, too: `--connect` and `--keys`."""
 
     @property
     def called(self) -> str:
@@ -45,10 +49,40 @@ class Command:
         """Registers the function with an application."""
         module, _, function = self.home.partition(":")
         called: Callable[..., None] = getattr(import_module(f"dataflow.cli.commands.{module}"), function)
+        if self.elsewhere:
+            called = _elsewhere(called)
         settings = {"ignore_unknown_options": True} if self.ignore_unknown_options else {}
         app.command(
             self.called, rich_help_panel=self.panel, help=paragraphs(called.__doc__ or ""), context_settings=settings
         )(called)
+
+
+def _elsewhere(called: Callable[..., None]) -> Callable[..., None]:
+    """Returns a command with the options that name a graph of another machine."""
+
+    @functools.wraps(called)
+    def at(*words: Any, connect: str | None = None, keys: Path | None = None, **options: Any) -> None:
+        if connect is None:
+            called(*words, **options)
+            return
+        from dataflow.client.attach import elsewhere
+
+        with elsewhere(connect, keys):
+            called(*words, **options)
+
+    where = typer.Option("--connect", metavar="ENDPOINT", help="Follow a graph of another machine: its --listen.")
+    held = typer.Option("--keys", metavar="FOLDER", help="Keys of tools or of a machine, for --connect.")
+    added = {"connect": Annotated[str | None, where], "keys": Annotated[Path | None, held]}
+    signature = inspect.signature(called, eval_str=True)
+    known = list(signature.parameters.values())
+    more = [inspect.Parameter(name, _KEYWORD, default=None, annotation=kind) for name, kind in added.items()]
+    at.__signature__ = signature.replace(parameters=[*known, *more])  # type: ignore[attr-defined]
+    at.__annotations__ = {each.name: each.annotation for each in (*known, *more)}
+    del at.__wrapped__  # type: ignore[attr-defined]
+    return at
+
+
+_KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +114,7 @@ class Family:
 BUILT_IN: tuple[Command | Family, ...] = (
     Command("demo:demo", MAKE),
     Command("run:run", MAKE),
+    Command("machines:join", MAKE),
     Command("replay:replay", MAKE),
     Command("verification:verify", MAKE),
     Command("debug:debug", MAKE),
@@ -105,17 +140,20 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("merging:recover", MATERIAL),
     Command("latency:latency", LOOK),
     Command("lint:lint", LOOK),
-    Command("viewing:view", LOOK),
-    Command("foxglove:foxglove", LOOK),
+    Command("viewing:view", LOOK, elsewhere=True),
+    Command("foxglove:foxglove", LOOK, elsewhere=True),
     Command("following.live:list_running", FOLLOW, "list"),
-    Command("following.live:echo", FOLLOW),
-    Command("following.live:hz", FOLLOW),
-    Command("following.top:top", FOLLOW),
+    Command("following.live:echo", FOLLOW, elsewhere=True),
+    Command("following.live:hz", FOLLOW, elsewhere=True),
+    Command("following.top:top", FOLLOW, elsewhere=True),
+    Command("following.health:health", FOLLOW),
+    Command("following.health:metrics", FOLLOW),
     Command("following.logs:logs", FOLLOW),
-    Command("following.pub:pub", FOLLOW),
-    Command("following.recording:record", FOLLOW),
-    Command("playback:playback", FOLLOW),
-    Command("following.recording:trigger", FOLLOW),
+    Command("following.pub:pub", FOLLOW, elsewhere=True),
+    Command("following.reload:reload", FOLLOW),
+    Command("following.recording:record", FOLLOW, elsewhere=True),
+    Command("playback:playback", FOLLOW, elsewhere=True),
+    Command("following.recording:trigger", FOLLOW, elsewhere=True),
     Family(
         "new",
         MAKE,
@@ -127,7 +165,21 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow new operator NearestObstacle
           dataflow new graph obstacle_watch
         """,
-        (Command("new:operator"), Command("new:graph"), Command("new:project")),
+        (Command("new:operator"), Command("new:graph"), Command("new:project"), Command("new:service")),
+    ),
+    Family(
+        "keys",
+        MAKE,
+        """Make the keys by which machines and tools know each other.
+
+        Examples:
+
+          dataflow keys new authority
+          dataflow keys add laptop --authority authority --serves 192.168.1.2
+          dataflow keys add robot --authority authority
+          dataflow keys add my_tools --authority authority --tools
+        """,
+        (Command("machines:new"), Command("machines:add")),
     ),
     Family(
         "param",
@@ -141,11 +193,13 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow param dump tuned.yaml
         """,
         (
-            Command("following.param:set_", name="set", ignore_unknown_options=True),  # so that -1 is a value
-            Command("following.param:get"),
-            Command("following.param:list_", name="list"),
-            Command("following.param:dump"),
-            Command("following.param:load"),
+            Command(
+                "following.param:set_", name="set", ignore_unknown_options=True, elsewhere=True
+            ),  # so that -1 is a value
+            Command("following.param:get", elsewhere=True),
+            Command("following.param:list_", name="list", elsewhere=True),
+            Command("following.param:dump", elsewhere=True),
+            Command("following.param:load", elsewhere=True),
         ),
     ),
 )

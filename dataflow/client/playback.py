@@ -9,8 +9,8 @@ from typing import Any
 
 import msgpack
 
-from dataflow.client.attach import NotRunning, reached
-from dataflow.transport import Bus, NetworkConfig
+from dataflow.client.attach import NotRunning, network_of, reached
+from dataflow.transport import Bus
 from dataflow.transport.keys import runtime_key
 from dataflow.transport.registry import RunningGraph
 
@@ -60,7 +60,7 @@ class Steering:
 @contextmanager
 def steering(found: RunningGraph) -> Iterator[Steering]:
     """Opens what steers a run."""
-    with Bus(NetworkConfig(connect=found.endpoints)) as bus:
+    with Bus(network_of(found)) as bus:
         reached(bus, found)
         yield Steering(found, bus)
 

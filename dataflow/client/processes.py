@@ -10,8 +10,9 @@ from typing import Any
 
 import msgpack
 
+from dataflow.client.attach import network_of
 from dataflow.messages import Message
-from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
+from dataflow.transport import Bus, Envelope, Kind
 from dataflow.transport.bounded import within
 from dataflow.transport.codec import encode
 from dataflow.transport.keys import runtime_key
@@ -38,7 +39,8 @@ class ProcessStatus:
     `counts`: per operator firings, messages emitted, messages dropped, CPU time (ns), last stamp, wall time (ns).
     `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
     (input, "timeout" or "late"). `behind`: per source the seconds by which its last message was behind the clock when
-    it was read, and when it was sent. `firings`: batches of firing records, where they were asked for.
+    it was read, and when it was sent. `firings`: batches of firing records, where they were asked for. `found`: what
+    operators found wrong with what they were given.
     """
 
     process: str
@@ -48,6 +50,18 @@ class ProcessStatus:
     waits: Mapping[str, Mapping[tuple[str, str], int]] = field(default_factory=dict)
     behind: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     firings: Sequence[bytes] = ()
+    found: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class MachineStatus:
+    """Another machine: whether its link is up, by how much its clock is ahead (`offset`, ns, at most half of `delay`
+    wrong), and the messages that were dropped since its link took too little."""
+
+    up: bool
+    offset: int
+    delay: int
+    dropped: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +101,11 @@ class Processes:
         answers = self._bus.ask(runtime_key(self._namespace, "status", "**"), asked, timeout=timeout)
         return sorted(map(_status, answers), key=lambda status: status.process)
 
+    def machines(self, timeout: float) -> dict[str, MachineStatus]:
+        """By name, the other machines of the graph."""
+        answers = self._bus.ask(runtime_key(self._namespace, "machines"), timeout=timeout)
+        return {n: MachineStatus(**s) for a in answers for n, s in msgpack.unpackb(a, raw=False).items()}
+
     def parameters(self, operators: Iterable[str], timeout: float) -> dict[str, dict[str, Parameter]]:
         """By operator, of those whose processes answer: between two firings."""
         wanted = list(operators)
@@ -100,14 +119,24 @@ class Processes:
 
     def set_parameter(self, operator: str, name: str, value: Any, timeout: float) -> Any:
         """Changes a parameter; the value as the operator took it. Raises `Refused`, `NoAnswer`."""
-        for said in self._until(operator, {"name": name, "value": value}, timeout):
+        return self._answered(operator, {"name": name, "value": value}, timeout, "the change is made")
+
+    def _answered(self, operator: str, request: Mapping[str, Any], timeout: float, then: str) -> Any:
+        for said in self._until(operator, request, timeout):
             if not said["ok"]:
                 raise Refused(said["error"])
             return said["value"]
         raise NoAnswer(
             f"no answer for {operator!r} within {timeout:g} s: it is being started again, hangs, or works on one "
-            "firing for longer than that; the change is made when it comes to it"
+            f"firing for longer than that; {then} when it comes to it"
         )
+
+    def reload(self, operator: str, timeout: float) -> dict[str, Any]:
+        """Has an operator go on with its code as it is in its files now; what its process answers (`Runner.reload`).
+
+        Raises `Refused`, `NoAnswer`.
+        """
+        return dict(self._answered(operator, {"reload": True}, timeout, "it is reloaded"))
 
     def takers(self, timeout: float) -> dict[str, Taker]:
         """The sources that take messages from outside, by name."""
@@ -146,13 +175,14 @@ def _status(answer: bytes) -> ProcessStatus:
         {name: {(i, what): n for i, what, n in found} for name, found in said["waits"].items()},
         {name: (read, sent) for name, (read, sent) in said["behind"].items()},
         said.get("firings", ()),
+        said["found"],
     )
 
 
 @contextlib.contextmanager
 def processes_of(found: RunningGraph) -> Iterator[Processes]:
     """A connection to the processes of a running graph, which are reached one after the other from now on."""
-    bus = Bus(NetworkConfig(connect=found.endpoints))
+    bus = Bus(network_of(found))
     try:
         yield Processes(bus, found.namespace)
     finally:

@@ -18,14 +18,14 @@ from typing import Any
 
 import zenoh
 
-from dataflow.client.attach import reached, types_of
+from dataflow.client.attach import network_of, reached, types_of
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message, MessageError
 from dataflow.recording import RecordingWriter
 from dataflow.recording.layout import ENDS
 from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.parts import OWNER_ONLY, WHOLE, Splitting, part_path, parts_of
-from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
+from dataflow.transport import Bus, Envelope, Kind
 from dataflow.transport.codec import TypeOf, decode
 from dataflow.transport.envelope import DecodeError
 from dataflow.transport.publisher import undeclare
@@ -235,7 +235,7 @@ class Subscription:
 @contextmanager
 def subscribed(found: RunningGraph, streams: Sequence[str]) -> Iterator[Subscription]:
     """A subscription to streams of a running graph, the static ones first."""
-    with Bus(NetworkConfig(connect=found.endpoints)) as bus:
+    with Bus(network_of(found)) as bus:
         subscription = Subscription()
         callback: Any = zenoh.handlers.Callback(lambda sample: subscription.put(bytes(sample.payload)), indirect=False)
         declared = [bus.session.declare_subscriber(stream, callback) for stream in streams]

@@ -6,8 +6,8 @@ import secrets
 
 import msgpack
 
-from dataflow.client.attach import NotRunning, graph_of, reached
-from dataflow.transport import Bus, NetworkConfig
+from dataflow.client.attach import NotRunning, graph_of, network_of, reached
+from dataflow.transport import Bus
 from dataflow.transport.keys import runtime_key
 from dataflow.transport.registry import RunningGraph
 
@@ -19,7 +19,7 @@ def trigger(found: RunningGraph, text: str, *, timeout: float = ANSWER_WITHIN) -
     if graph_of(found).record.flight is None:
         raise NotRunning(f"graph {found.name!r} has no flight recorder: give it one with record: {{keep: 60s}}")
     request = msgpack.packb({"id": secrets.token_hex(8), "text": text})
-    with Bus(NetworkConfig(connect=found.endpoints)) as bus:
+    with Bus(network_of(found)) as bus:
         reached(bus, found)
         answers = bus.ask(runtime_key(found.namespace, "trigger", "**"), request, timeout=timeout)
     if not any(msgpack.unpackb(answer, raw=False)["ok"] for answer in answers):

@@ -7,14 +7,22 @@ from __future__ import annotations
 
 import bisect
 import pdb
+import traceback
 from bdb import BdbQuit
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import accumulate
 from types import CodeType
+from typing import Any
 
-from dataflow.debugging.fired import Call, Fired, Made, Probe, Process, Through, call_of
+from dataflow.debugging.fired import Abandoned, Call, Fired, Made, Probe, Process, States, Through, call_of
+from dataflow.debugging.ring import Held, Ring
 from dataflow.debugging.sources import Sources
+from dataflow.execution.calls import value_of
 from dataflow.execution.failure import readable
+from dataflow.execution.ports import Emitter
+from dataflow.execution.recorded import RecordedRunner
+from dataflow.execution.threads import limit_threads
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
@@ -22,13 +30,16 @@ from dataflow.recording.streams.diff import differences
 from dataflow.records.cuts import Taken, cut_record
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog
+from dataflow.records.repetition import Repetition, look_at
 from dataflow.records.window import records_from
 from dataflow.reexecution.engine import Recomputation, plan_feeding
-from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, recorded_message
-from dataflow.sync import Firing
+from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, recorded_message, seeding_of
+from dataflow.sync import Entry, Firing
 
-AHEAD = 60 * 10**9
+AHEAD = 2 * 10**9
 """Span (ns) behind a call that is gone to in which records are read: those that follow are gone to as well."""
+REACH = 3 * 10**9
+"""Span (ns) before a call in which a state is looked for at first."""
 NEAR = 16
 """Calls to a state further on, beyond which an operator is set up anew and begins there."""
 MOST_BYTES = 2**28
@@ -65,41 +76,96 @@ class Debugger:
         """States before calls, by the call's number, as `cut` records."""
         self._sources = Sources(node.operator)
         self._work: Recomputation | None = None
-        self._bounded = False
-        """True while only the records up to some time behind a call are read."""
+        self._end: int | None = None
+        """The stamp up to which records are read; None for all of them."""
+        self._setup: FiringRecord | None = None
+        """The record of the first `setup()`."""
+        self._ring = Ring()
         self._probe: Probe | None = None
         self._reached = -1
-        self._same = True
-        """True when the last call gave what was recorded."""
         self.at: Fired | None = None
 
     # ------------------------------------------------------------------------------------------------- going
 
-    def goto(self, number: int) -> Fired:
-        """Makes the call of that number, counted from 0 (from the end if negative), and those that it needs before.
+    def goto(self, number: int, through: Through | None = None) -> Fired:
+        """Goes to the call of that number, counted from 0 (from the end if negative): makes it, and those that it needs
+        before. One of the last calls that were made here is not made again, unless by `through`, which then makes it.
 
         Raises `DebugError` where there is none, or where it cannot be made again; `OperatorFailure`.
         """
         number = range(len(self.calls))[number] if -len(self.calls) <= number < len(self.calls) else number
         if not 0 <= number < len(self.calls):
             raise DebugError(f"{self.node.name} has calls 0 to {len(self.calls) - 1}, there is no {number}")
-        state = number if self.node.operator.stateless else max(self._nearest_kept(number), self._nearest(number))
-        if self._work is None or number <= self._reached or state > self._reached + NEAR:
-            self._begin(number, self.calls[number].stamp + AHEAD)
-        if self._reach(number) != number and self._bounded:
-            self._begin(number)
-            self._reach(number)
-        if self._reached != number:
-            raise DebugError(self._unreached(number))
-        self.at = self._fired()
+        held = self._ring.get(number)
+        if held is None or held.stale or through is not None:
+            held = self._made_again(number, through) or self._made_on_the_way(number, through)
+        self.at = self._fired(held)
         return self.at
 
-    def _reach(self, number: int) -> int:
+    def _made_on_the_way(self, number: int, through: Through | None) -> Held:
+        """Makes a call by the records before it, going on from the last one where that lies near."""
+        state = number if self.node.operator.stateless else max(self._nearest_kept(number), self._nearest(number))
+        stamp = self.calls[number].stamp
+        behind = self._end is not None and stamp > self._end
+        if self._work is None or behind or number <= self._reached or state > self._reached + NEAR:
+            self._begin(number, stamp + AHEAD)
+        if self._reach(number, through) != number and self._end is not None:
+            self._begin(number)
+            self._reach(number, through)
+        held = self._ring.get(number)
+        if self._reached != number or held is None:
+            raise DebugError(self._unreached(number))
+        if held.stale:
+            self._leave()
+        return held
+
+    def _made_again(self, number: int, through: Through | None) -> Held | None:
+        """Makes a call from what is kept of it and of those before; None where that does not suffice."""
+        stateless = self.node.operator.stateless
+        way = self._ring.way_to(number, [number] if stateless else self._kept)
+        if not way or self._setup is None:
+            return None
+        cut = self._cut(way[0].call, way[0].changed, None) if stateless else self._kept[way[0].number]
+        records = [self._setup, cut, *(held.record for held in way)]
+        repetition = Repetition(lambda: iter(records), begin=cut.stamp, stateless=stateless)
+        look_at([repetition])
+        limit_threads(self.graph.threads)
+        runner = RecordedRunner(
+            self.node,
+            _Nowhere(),
+            static=self.graph.static,
+            repetition=repetition,
+            inputs={},
+            seed=self.graph.seed,
+            seeding=seeding_of(self._recording),
+            live_effects=self._live_effects,
+        )
+        probe = runner.calls = Probe(runner)
+        probe.target, probe.through = way[-1].call, through
+        try:
+            runner.setup()
+            entries = {(e.stream, e.incarnation, e.seq): e for held in way for e in held.entries()}
+            for _, entry in sorted(entries.items()):
+                runner.push(entry.stream, entry)
+            counts = [0]
+            while runner.step() and runner.record is not way[-1].record:
+                counts.append(runner.result.differing - runner.result.states)
+        finally:
+            runner.close()
+        if isinstance(probe.raised, KeyboardInterrupt):
+            raise KeyboardInterrupt
+        if runner.record is not way[-1].record:
+            return None
+        held = self._held(number, runner, same=runner.result.differing - runner.result.states == counts[-1])
+        self._take(held, probe)
+        return held
+
+    def _reach(self, number: int, through: Through | None = None) -> int:
         """Goes on to a call; returns the number of the one that was made last."""
         assert self._probe is not None
-        self._probe.target = self.calls[number]
-        for reached in self._onwards():
-            if reached >= number:
+        self._probe.target, self._probe.through = self.calls[number], through
+        for held in self._onwards():
+            if held.number >= number:
                 break
         return self._reached
 
@@ -125,15 +191,25 @@ class Debugger:
     def until(self, condition: Callable[[Fired], bool]) -> Fired | None:
         """Goes on to the next call for which `condition` is true; None where none is: then `at` stays."""
         after = -1 if self.at is None else self.at.number
+        while (held := self._ring.get(after + 1)) is not None and not held.stale:
+            after += 1
+            if self._goes_to(held, condition):
+                return self.at
         if after + 1 == len(self.calls):
             return None
-        if self._work is None or self._bounded:
+        if self._work is None or self._end is not None or self._reached > after:
             self._begin(after + 1)
-        for reached in self._onwards():
-            if reached > after and condition(self._fired()):
-                return self.goto(reached)
+        for held in self._onwards():
+            if held.number > after and self._goes_to(held, condition):
+                return self.at
         self._leave()
         return None
+
+    def _goes_to(self, held: Held, condition: Callable[[Fired], bool]) -> bool:
+        fired = self._fired(held)
+        if found := condition(fired):
+            self.at = fired
+        return found
 
     def first_difference(self) -> Fired | None:
         """Goes to the first call of all whose outputs or error are not the recorded ones."""
@@ -150,13 +226,7 @@ class Debugger:
         """
         if self.at is None:
             raise DebugError("no call was made yet: goto one")
-        self._begin(self.at.number, self.at.call.stamp + AHEAD)
-        assert self._probe is not None
-        self._probe.through = through
-        try:
-            return self.goto(self.at.number)
-        finally:
-            self._probe.through = None
+        return self.goto(self.at.number, through or _plainly)
 
     def step_into(self) -> Fired:
         """Makes the call once more under pdb, which stops at the first line of `process()` (`finish()`)."""
@@ -173,19 +243,21 @@ class Debugger:
             return made
 
         fired = self.again(through)
-        if self._probe is not None and isinstance(self._probe.raised, BdbQuit):
-            return self.again()
-        return fired
+        return self.again() if isinstance(fired.raised, BdbQuit) else fired
 
     def reload(self) -> Sequence[str]:
         """Takes over the modules whose source has changed; returns their names. The call where we are is not made
         again. Raises `DebugError` for source that does not compile or has no such operator any more."""
+        if self.at is not None:
+            self.at.packed()
         try:
             changed = self._sources.reload()
         except Exception as error:
             raise DebugError(f"the changed source cannot be used, the old one is: {readable(error)}") from error
         if changed:
-            self._kept = {n: r for n, r in self._kept.items() if self.at is not None and n == self.at.number}
+            at = None if self.at is None else self.at.number
+            self._kept = {n: r for n, r in self._kept.items() if n == at}
+            self._ring.leave_only(at)
             self._leave()
         return changed
 
@@ -208,7 +280,7 @@ class Debugger:
         cut = self._kept[kept] if kept >= max(0, self._nearest(number)) and not stateless else None
         if cut is not None:
             begin = cut.stamp
-        self._bounded = begin is not None and end is not None
+        self._end = None if begin is None else end
         self._start(begin, cut, end)
 
     def _start(self, begin: int | None, cut: FiringRecord | None, end: int | None) -> None:
@@ -225,7 +297,7 @@ class Debugger:
         )
         runner = work.runners[self.node.name]
         self._probe = runner.calls = Probe(runner)
-        self._work, self._reached = work, -1
+        self._work, self._reached, self._setup = work, -1, runner.record
         try:
             work.begin()
         except BaseException:
@@ -241,10 +313,12 @@ class Debugger:
         given = set() if cut is None else {cut.operator}
         stateful = {n for n, node in again.items() if not node.operator.stateless} - given
         stateless = again.keys() - stateful
-        return records_from(self._recording, makers.values(), begin, stateless=stateless, stateful=stateful, end=end)
+        return records_from(
+            self._recording, makers.values(), begin, stateless=stateless, stateful=stateful, end=end, reach=REACH
+        )
 
-    def _onwards(self) -> Iterator[int]:
-        """Makes one call after the other; yields their numbers."""
+    def _onwards(self) -> Iterator[Held]:
+        """Makes one call after the other; yields them."""
         assert self._work is not None
         assert self._probe is not None
         runner, probe = self._work.runners[self.node.name], self._probe
@@ -254,59 +328,74 @@ class Debugger:
             if result.verified == done:
                 continue
             done = result.verified
-            self._same = result.differing - result.states == differing
+            same = result.differing - result.states == differing
             differing = result.differing - result.states
             if isinstance(probe.raised, KeyboardInterrupt):
                 self._leave()
                 raise KeyboardInterrupt
             self._reached = self._number(call_of(runner.record))
-            self._keep()
-            yield self._reached
+            held = self._held(self._reached, runner, same=same)
+            self._take(held, probe)
+            yield held
 
     def _number(self, call: Call) -> int:
         return bisect.bisect_left(self.calls, (call.incarnation, call.record), key=lambda c: (c.incarnation, c.record))
 
-    def _keep(self) -> None:
-        """Keeps the state before the last call, if it was taken."""
-        assert self._probe is not None
-        assert self._work is not None
-        call, state = self._probe.call, self._probe.before
-        if call is None or state is None or call != self.calls[self._reached]:
+    def _held(self, number: int, runner: RecordedRunner, *, same: bool) -> Held:
+        """The call that a runner has made just now."""
+        record, probe = runner.record, runner.calls
+        assert record is not None
+        assert isinstance(probe, Probe)
+        changed = dict(runner.changed)
+        if record.detail.get("injected"):
+            return Held(number, record, None, {}, None, same, changed, (None, None))
+        states = (probe.before, probe.after) if probe.aimed or self.node.operator.stateless else None
+        if stale := isinstance(probe.raised, (BdbQuit, Abandoned)):
+            probe.raised.__traceback__ = None
+        return Held(number, record, probe.firing, probe.outputs, probe.raised, same, changed, states, stale)
+
+    def _take(self, held: Held, probe: Probe) -> None:
+        """Keeps a call, and the state before it, if that was taken."""
+        self._ring.add(held)
+        if held.firing is None or probe.before is None or probe.call != held.call:
             return
-        runner = self._work.runners[self.node.name]
-        place = FiringRecord(self.node.name, call.incarnation, call.record - 1, "fire", call.stamp - 1)
-        taken = Taken(again=False, at_setup={}, since=dict(runner.changed), state=state)
-        self._kept[self._reached] = cut_record(place, left_out=0, taken=taken, held=(), stamp=place.stamp)
+        self._kept[held.number] = self._cut(held.call, held.changed, probe.before)
         if sum(len(record.detail["state"]) for record in self._kept.values()) > MOST_BYTES:
             for number in sorted(self._kept)[1:-1:2]:
                 del self._kept[number]
 
-    def _fired(self) -> Fired:
-        assert self._work is not None
-        assert self._probe is not None
-        record, probe = self._work.runners[self.node.name].record, self._probe
-        assert record is not None
-        call = call_of(record)
-        injected = bool(record.detail.get("injected"))
-        recorded = record.detail.get("error", "") if record.outcome == "error" else None
-        error = None if injected else probe.error
-        made = tuple(self._made(record, {} if injected else probe.outputs))
+    def _cut(self, call: Call, changed: Mapping[str, Any], state: bytes | None) -> FiringRecord:
+        """The record by which an operator begins in front of a call."""
+        place = FiringRecord(self.node.name, call.incarnation, call.record - 1, "fire", call.stamp - 1)
+        taken = Taken(again=False, at_setup={}, since=changed, state=state)
+        return cut_record(place, left_out=0, taken=taken, held=(), stamp=place.stamp)
+
+    def _fired(self, held: Held) -> Fired:
+        record = held.record
+        raised = held.raised
         return Fired(
-            number=self._reached,
-            call=call,
-            inputs={} if injected else probe.inputs,
-            made=made,
-            before=None if injected else probe.before,
-            after=None if injected else probe.after,
-            error=error,
-            recorded_error=recorded,
-            injected=injected,
+            number=held.number,
+            call=held.call,
+            inputs={} if held.firing is None else {n: value_of(given) for n, given in held.firing.inputs.items()},
+            made=tuple(self._made(record, held.outputs)),
+            packed=partial(self._states, held),
+            error=None if raised is None else "".join(traceback.format_exception(raised)),
+            recorded_error=record.detail.get("error", "") if record.outcome == "error" else None,
+            injected=held.firing is None,
             record=record,
-            firing=None if injected else probe.firing,
-            raised=None if injected else probe.raised,
+            firing=held.firing,
+            raised=raised,
             ports=tuple(self.node.outputs),
-            same=self._same,
+            same=held.same,
         )
+
+    def _states(self, held: Held) -> States:
+        """The states before and after a call, which is made again if they were not taken."""
+        if held.states is None:
+            again = self._made_again(held.number, _plainly) or self._made_on_the_way(held.number, _plainly)
+            held.states = again.states
+        assert held.states is not None
+        return held.states
 
     def _made(self, record: FiringRecord, outputs: Mapping[str, Message]) -> Iterator[Made]:
         ports = self.node.outputs
@@ -335,6 +424,27 @@ class Debugger:
         if self._work is not None:
             self._work.close()
         self._work, self._reached = None, -1
+
+
+def _plainly(process: Process, firing: Firing) -> dict[str, Message]:
+    """Makes a call as it is."""
+    return process(firing)
+
+
+class _Nowhere(Emitter):
+    """Takes what an operator emits that is made again alone."""
+
+    def message(self, stream: str, entry: Entry) -> None:
+        """No operator is given it."""
+
+    def frontier(self, stream: str, frontier: int) -> None:
+        """No operator is given it."""
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        """No operator is given it."""
+
+    def record(self, record: FiringRecord) -> None:
+        """It is made by a record."""
 
 
 def _first_line(code: CodeType) -> int:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from dataflow.execution.calls import Calls, value_of
+from dataflow.execution.calls import Calls
 from dataflow.execution.failure import RAISED
 from dataflow.execution.recorded import RecordedRunner
 from dataflow.execution.snapshots import changes, unpack_state
@@ -16,6 +15,9 @@ from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import FieldDifference
 from dataflow.records.firing import FiringRecord
 from dataflow.sync import Firing
+
+States = tuple[bytes | None, bytes | None]
+"""The packed state before and after a call; None where the operator gives none."""
 
 
 class Call(NamedTuple):
@@ -25,6 +27,10 @@ class Call(NamedTuple):
     record: int
     kind: str
     stamp: int
+
+    def follows(self, other: Call) -> bool:
+        """Returns whether nothing was recorded between another call and this one."""
+        return (self.incarnation, self.record) == (other.incarnation, other.record + 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,17 +49,16 @@ class Made:
 class Fired:
     """A call that was made again. `number` counts the operator's calls from 0.
 
-    `inputs`: by name what `process()` was given, a message, None, a tuple, or a dict by stream. `before`, `after`: the
-    packed state, None where the operator gives none. `error` is the traceback of what it raised now, `recorded_error`
-    the text of then. `injected`: the run tried out a fault there, and did not call the operator.
+    `inputs`: by name what `process()` was given, a message, None, a tuple, or a dict by stream. `packed` gives the
+    states, for which it makes a call again that was only passed by. `error` is the traceback of what it raised now,
+    `recorded_error` the text of then. `injected`: the run tried out a fault there, and did not call the operator.
     """
 
     number: int
     call: Call
     inputs: Mapping[str, Any]
     made: tuple[Made, ...]
-    before: bytes | None
-    after: bytes | None
+    packed: Callable[[], States]
     error: str | None
     recorded_error: str | None
     injected: bool
@@ -71,9 +76,19 @@ class Fired:
         """Returns what came out now, by port."""
         return {made.port: made.here for made in self.made}
 
+    @property
+    def before(self) -> bytes | None:
+        """Returns the packed state before the call."""
+        return self.packed()[0]
+
+    @property
+    def after(self) -> bytes | None:
+        """Returns the packed state after the call."""
+        return self.packed()[1]
+
     def states(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
         """The state before and after, as `snapshot()` gives it."""
-        before, after = (None if state is None else unpack_state(state) for state in (self.before, self.after))
+        before, after = (None if state is None else unpack_state(state) for state in self.packed())
         return before, after
 
     def changed(self) -> tuple[str, ...]:
@@ -102,11 +117,15 @@ Through = Callable[[Process, Firing], dict[str, Message]]
 """Makes a call in place of `Process`, such as under a debugger."""
 
 
+class Abandoned(BaseException):
+    """Raised by a `Through` in the middle of a call that is not to be made to its end."""
+
+
 class Probe(Calls):
     """Calls an operator as re-execution does, and keeps what is seen of its last call.
 
-    Takes the state before and after the call `target`, and after each `SPACING` of work. `through` makes the call
-    `target`, if it is set.
+    Takes the state before and after the call `target`, after each `SPACING` of work, and behind records that are no
+    calls. `through` makes the call `target`, if it is set.
     """
 
     def __init__(self, runner: RecordedRunner) -> None:
@@ -114,39 +133,48 @@ class Probe(Calls):
         super().__init__(calls.node, calls.operator, calls.seed, version=calls.version, effects=calls.effects)
         self._runner = runner
         self._looked_at = 0
+        self._after: tuple[Call, bytes | None] | None = None
+        """The last call after which the state was taken, with that."""
         self.target: Call | None = None
         self.through: Through | None = None
         self.call: Call | None = None
         """The last call."""
         self.firing: Firing | None = None
-        self.inputs: Mapping[str, Any] = {}
         self.outputs: Mapping[str, Message] = {}
         self.before: bytes | None = None
         self.after: bytes | None = None
-        self.error: str | None = None
         self.raised: BaseException | None = None
+
+    @property
+    def aimed(self) -> bool:
+        """Returns whether the last call was the target."""
+        return self.call == self.target
 
     def process(self, firing: Firing) -> dict[str, Message]:
         """Makes the call. Raises what the operator raises."""
-        self.call = call = call_of(self._runner.record)
-        self.firing = firing
-        aimed = call == self.target
-        looks = aimed or self._runner.work.cpu_ns - self._looked_at >= SPACING
-        self.inputs = {name: value_of(given) for name, given in firing.inputs.items()}
-        self.outputs, self.error, self.raised = {}, None, None
+        previous, self.call = self.call, call_of(self._runner.record)
+        self.firing, self.outputs, self.raised = firing, {}, None
         self.before = self.after = None
-        if looks:
+        looks = self._runner.work.cpu_ns - self._looked_at >= SPACING
+        if self.aimed or looks or previous is None or not self.call.follows(previous):
             self._looked_at = self._runner.work.cpu_ns
-            self.before = self.snapshot((call.incarnation, call.stamp - 1))
+            self.before = self._state_before(self.call, previous)
         try:
-            through = self.through if aimed else None
+            through = self.through if self.aimed else None
             self.outputs = super().process(firing) if through is None else through(super().process, firing)
             return dict(self.outputs)
         except RAISED as error:
-            self.error, self.raised = "".join(traceback.format_exception(error)), error
+            self.raised = error
             raise
         finally:
-            self.after = self.snapshot((call.incarnation, call.stamp)) if aimed else None
+            if self.aimed:
+                self.after = self.snapshot((self.call.incarnation, self.call.stamp))
+                self._after = self.call, self.after
+
+    def _state_before(self, call: Call, previous: Call | None) -> bytes | None:
+        if self._after is not None and self._after[0] == previous and call.follows(previous):
+            return self._after[1]
+        return self.snapshot((call.incarnation, call.stamp - 1))
 
 
 def call_of(record: FiringRecord | None) -> Call:

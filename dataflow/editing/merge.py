@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,22 +13,22 @@ from typing import Any
 import numpy as np
 
 from dataflow.editing.extras import is_fact, take_over
-from dataflow.editing.joins import joined
-from dataflow.editing.part import copy_messages, graph_of, kept_stamps, outputs_of, write_firings
+from dataflow.editing.joins import Joined
+from dataflow.editing.part import Reading, as_stored, copy_messages, graph_of, kept_stamps, makers_of
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.editing.rolling import once
+from dataflow.editing.spool import Spool
 from dataflow.recording import Recorded, Recording
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, GRAPH, RECORDING, RUN, Kind
 from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.streams.copying import Copy, Mask, Origin, framing
 from dataflow.recording.streams.cutting import Cut, cut_of
-from dataflow.records.cuts import taken_by
-from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.sync.stamps import format_stamp
 
-Records = Mapping[str, Sequence[FiringRecord]]
+Records = Mapping[str, Iterable[FiringRecord]]
 
 
 def merge(
@@ -48,25 +50,26 @@ def merge(
     done = Edited(str(out))
     prefixes = [*prefixes, *[""] * (len(origins) - len(prefixes))]
     one_run = not any(prefixes) and are_of_one_run(origins)
-    if one_run:
-        origins = sorted(origins, key=_begin)
-        records = _joined_records(origins)
-        facts = _joined_metadata(origins, records, done)
-        kept = _taken_once(origins)
-    else:
-        _refuse_clashes(origins, prefixes)
-        records = {} if prefixes[0] else _records_of(origins[0])
-        facts = {name: dict(v) for name, v in origins[0].metadata.items() if is_fact(origins[0], name)}
-        kept = [_all_of(origin, run=not k and not prefixes[0]) for k, origin in enumerate(origins)]
-        _tell_clocks(origins, done)
-        _tell_runs(origins, prefixes, done)
-    total = sum(int(mask.sum()) for masks in kept for mask in masks.values())
-    with Copy(out, origins[0], compression=compression, overwrite=overwrite) as copy:
+    with ExitStack() as stack:
+        if one_run:
+            origins = sorted(origins, key=_begin)
+            kept = _taken_once(origins)
+            spool = stack.enter_context(Spool(out.parent, _joined_records(origins, stack)))
+            facts = _joined_metadata(origins, done, left_out=spool.left_out)
+        else:
+            _refuse_clashes(origins, prefixes)
+            kept = [_all_of(origin, run=not k and not prefixes[0]) for k, origin in enumerate(origins)]
+            spool = stack.enter_context(Spool(out.parent, {} if prefixes[0] else _records_of(origins[0], stack)))
+            facts = {name: dict(v) for name, v in origins[0].metadata.items() if is_fact(origins[0], name)}
+            _tell_clocks(origins, done)
+            _tell_runs(origins, prefixes, done)
+        done.firings = spool.calls
+        total = sum(int(mask.sum()) for masks in kept for mask in masks.values())
+        copy = stack.enter_context(Copy(out, origins[0], compression=compression, overwrite=overwrite))
         for name, values in facts.items():
             copy.writer.add_metadata(name, values)
         take_over(copy, origins, [p.rstrip("/") for p in prefixes], done, joined=one_run)
-        write_firings(copy, origins, records)
-        done.firings = sum(r.kind in CALLS for listed in records.values() for r in listed)
+        spool.write(copy, origins)
         before = 0
         for origin, masks, prefix in zip(origins, kept, prefixes, strict=True):
             topics = {c: prefix + origin.channels[c].topic for c in masks} if prefix else {}
@@ -94,24 +97,26 @@ def _further(watch: Watch, before: int, total: int) -> Watch:
     return lambda done, _: watch(before + done, total)
 
 
-def _records_of(origin: Origin) -> Records:
-    if not origin.of_kind(Kind.FIRINGS):
-        return {}
-    with Recording(origin.path) as recording:
-        log = FiringLog.read(recording)
-        return {operator: log.of(operator) for operator in sorted(log.operators)}
+def _records_of(origin: Origin, stack: ExitStack) -> Records:
+    """The firing records of a file, which stays open for them as long as `stack`."""
+    return as_stored(stack.enter_context(Recording(origin.path))) if origin.of_kind(Kind.FIRINGS) else {}
 
 
-def _joined_records(origins: Sequence[Origin]) -> Records:
-    with Recording(origins[0].path) as recording:
-        outputs = outputs_of(graph_of(recording))
-    logs = [_records_of(origin) for origin in origins]
-    names = sorted({name for log in logs for name in log})
-    return {name: joined([log.get(name, ()) for log in logs], outputs.get(name, ())) for name in names}
+def _joined_records(origins: Sequence[Origin], stack: ExitStack) -> Records:
+    """Those of all parts of a run, each once; the parts stay open for them as long as `stack`."""
+    recordings = [stack.enter_context(Recording(origin.path)) for origin in origins]
+    graph = graph_of(recordings[0])
+    logs = [FiringLog.read(recording) for recording in recordings]
+    makers = {name: maker for log in logs for name, maker in makers_of(graph, log).items()}
+    return {
+        name: Joined([Reading(partial(log.repeated, maker)) for log in logs], tuple(maker.outputs.values()))
+        for name, maker in sorted(makers.items())
+    }
 
 
-def _joined_metadata(origins: Sequence[Origin], records: Records, done: Edited) -> dict[str, dict[str, str]]:
-    """The run's metadata: streams end where they end in the last part; a part stays one unless all of it is there."""
+def _joined_metadata(origins: Sequence[Origin], done: Edited, *, left_out: bool) -> dict[str, dict[str, str]]:
+    """The run's metadata: streams end where they end in the last part; a part stays one unless all of it is there, and
+    no calls are `left_out`."""
     metadata = {n: dict(values) for o in origins for n, values in o.metadata.items() if is_fact(o, n)}
     metadata.pop(DIGESTS, None)
     ends: dict[str, dict[str, Any]] = {}
@@ -130,7 +135,6 @@ def _joined_metadata(origins: Sequence[Origin], records: Records, done: Edited) 
             done.notes.append(f"nothing is known of {format_stamp(one.end)} to {format_stamp(other.start)}")
     start = None if any(p.start is None for p in parts) else min(p.start for p in parts if p.start is not None)
     end_stamp = None if any(p.end is None for p in parts) else max(p.end for p in parts if p.end is not None)
-    left_out = any(taken_by(r) is not None for listed in records.values() for r in listed if r.kind == "cut")
     metadata.pop(CUT, None)
     if gaps or left_out or start is not None or end_stamp is not None:
         metadata[CUT] = Cut(parts[0].of, start, end_stamp).metadata()

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from dataflow.editing.key_frames import key_frames
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.editing.spans import RunRecords, Span, SpanRecords, Stamps
+from dataflow.editing.spool import Spool
 from dataflow.graph import GraphError
 from dataflow.graph.model import Graph, Node, OperatorImportError
 from dataflow.interop.bag import is_latched
@@ -22,8 +25,8 @@ from dataflow.recording.mcap.index import NO_END
 from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.streams.copying import RUN_KINDS, Copy, Mask, Origin, framing, places
 from dataflow.recording.streams.cutting import Cut, cut_of
-from dataflow.records.firing import CALLS, FiringRecord, consecutive, encode_batch
-from dataflow.records.reading import FiringLog
+from dataflow.records.firing import FiringRecord
+from dataflow.records.reading import FiringLog, Maker
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph, resolved_graph
 
 
@@ -52,23 +55,68 @@ class Part:
 
 
 class Firings:
-    """The firing records of a recording and its graph: read when they are needed, once for all parts written of it."""
+    """The firing records of a recording and its graph, for all parts written of it. A context manager: the records are
+    read whenever they are needed, until it ends."""
 
     def __init__(self, origin: Origin) -> None:
         self._origin = origin
+        self._stack = ExitStack()
 
     @cached_property
-    def read(self) -> tuple[Mapping[str, Sequence[FiringRecord]], Graph | None]:
-        """The records by operator, in memory, and the graph where it is available."""
-        with Recording(self._origin.path) as recording:
-            log = FiringLog.read(recording)
-            return {operator: log.of(operator) for operator in sorted(log.operators)}, graph_of(recording)
+    def _recording(self) -> Recording:
+        return self._stack.enter_context(Recording(self._origin.path))
+
+    @cached_property
+    def graph(self) -> Graph | None:
+        """The graph of the recording, where it is available."""
+        return graph_of(self._recording)
+
+    @cached_property
+    def all(self) -> Mapping[str, Iterable[FiringRecord]]:
+        """All records by operator, in the order of the file."""
+        return as_stored(self._recording)
 
     @cached_property
     def run(self) -> RunRecords:
         """The records, of which those of spans are chosen."""
-        records, graph = self.read
-        return RunRecords(records, outputs_of(graph))
+        log = FiringLog.read(self._recording)
+        makers = makers_of(self.graph, log)
+        return RunRecords({name: partial(log.since, maker) for name, maker in makers.items()}, outputs_of(self.graph))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Firing records that are read whenever they are iterated over."""
+
+    read: Callable[[], Iterator[FiringRecord]]
+
+    def __iter__(self) -> Iterator[FiringRecord]:
+        return self.read()
+
+
+class _Maker(NamedTuple):
+    """An operator of which no more is known than its name."""
+
+    name: str
+    outputs: Mapping[str, str]
+
+
+def as_stored(recording: Recording) -> dict[str, Iterable[FiringRecord]]:
+    """The firing records of a recording by operator, in the order of the file: read when they are iterated over."""
+    log = FiringLog.read(recording)
+    return {operator: Reading(partial(log.records, operator)) for operator in sorted(log.operators)}
+
+
+def makers_of(graph: Graph | None, log: FiringLog) -> dict[str, Maker]:
+    """The operators that left records, sorted by name."""
+    nodes = {} if graph is None else graph.nodes
+    return {name: nodes.get(name) or _Maker(name, {}) for name in sorted(log.operators)}
 
 
 def write_part(
@@ -82,9 +130,14 @@ def write_part(
     watch: Watch = unwatched,
 ) -> Edited:
     """Writes a part of `origin` into a separate file. `firings`: those of `origin`. Raises `RecordingError`."""
+    if firings is None:
+        with Firings(origin) as read:
+            return write_part(
+                origin, part, out, firings=read, compression=compression, overwrite=overwrite, watch=watch
+            )
     done = Edited(str(out))
     part = decodable([origin], part, done)
-    chosen = _chosen(origin, part, firings or Firings(origin), done)
+    chosen = _chosen(origin, part, firings, done)
     needed = {} if chosen is None else chosen.needed
     kept = masks_of(origin, part, needed)
     _describe(origin, kept, part, done)
@@ -93,9 +146,9 @@ def write_part(
             copy.writer.add_metadata(name, values)
         done.attachments = copy.attachments(origin)
         if chosen is not None:
-            write_firings(copy, [origin], chosen.records)
-            done.firings = sum(r.kind in CALLS for records in chosen.records.values() for r in records)
-            done.lead = chosen.lead
+            with Spool(out.parent, chosen.records) as spool:
+                spool.write(copy, [origin])
+            done.firings, done.lead = spool.calls, chosen.lead
         copy_messages(copy, origin, kept, watch)
         if origin.own:
             copy.frames(origin.namespace, framing(origin.path, kept_stamps(origin, kept)))
@@ -141,27 +194,6 @@ def copy_messages(
     watch(done, total)
 
 
-def write_firings(copy: Copy, origins: Sequence[Origin], records: Mapping[str, Sequence[FiringRecord]]) -> None:
-    """Writes firing records anew, those of all operators in the order of stamps."""
-    first = max(1, min((span[0] for origin in origins if (span := origin.span()) is not None), default=1))
-    batches = []
-    for operator, listed in records.items():
-        for part in consecutive(listed):
-            for at in range(0, len(part), BATCH):
-                batch = part[at : at + BATCH]
-                batches.append((max(batch[-1].stamp, first), operator, encode_batch(batch)))
-    channels = {operator: copy.firings_channel(origins[0].namespace, operator) for operator in records}
-    sequences: dict[str, int] = {}
-    for stamp, operator, data in sorted(batches, key=lambda b: (b[0], b[1])):
-        sequence = sequences.get(operator, 0)
-        copy.record(channels[operator], min(stamp, 2**63 - 1), sequence, data)
-        sequences[operator] = sequence + 1
-
-
-BATCH = 64
-"""Firing records that are written together."""
-
-
 def graph_of(recording: Recording) -> Graph | None:
     """The graph of a recording, its operators not imported where that can be avoided; None where it cannot be had."""
     graph = resolved_graph(recording)
@@ -193,9 +225,9 @@ def _chosen(origin: Origin, part: Part, firings: Firings, done: Edited) -> SpanR
     if part.bare:
         done.notes.append("without firing records: it replays with fresh operators, and cannot be verified")
         return None
-    records, graph = firings.read
     if not part.cuts:
-        return SpanRecords(records, {}, (), None)
+        return SpanRecords(firings.all, {}, (), None)
+    graph = firings.graph
     if graph is None:
         done.notes.append(
             "its graph is not in it, or its operators cannot be imported: firing records are left out, so it "

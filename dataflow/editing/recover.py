@@ -141,7 +141,7 @@ def _told(path: Path) -> dict[tuple[str, int], int]:
         log = FiringLog.read(recording)
         for operator in log.operators:
             streams = outputs.get(operator, ())
-            for record in log.of(operator):
+            for record in log.records(operator):
                 for stream, emission in zip(streams, record.outputs, strict=False):
                     if emission is not None and emission.seq != WITHHELD:
                         place = stream, record.incarnation

@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.editing.part import Part, copy_messages, decodable, kept_stamps, masks_of, outputs_of, write_firings
+from dataflow.editing.part import Part, copy_messages, decodable, kept_stamps, masks_of, outputs_of
 from dataflow.editing.report import Edited
-from dataflow.editing.spans import RunRecords
+from dataflow.editing.spans import RunRecords, listed
+from dataflow.editing.spool import Spool
 from dataflow.graph.model import Graph
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, OUTCOME, Kind
 from dataflow.recording.parts import OWNER_ONLY
 from dataflow.recording.streams.copying import Copy, Mask, Origin, framing
 from dataflow.recording.streams.cutting import Cut
 from dataflow.records.cuts import held_by
-from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.firing import FiringRecord
 
 Seen = dict[tuple[str, str, int], npt.NDArray[np.int64]]
 
@@ -43,7 +44,8 @@ def keep_span(
         origins = [stack.enter_context(Origin(file)) for file in files]
         part = decodable(origins, part, done)
         stored = {origin.stream(c) for origin in origins for c in origin.of_kind(Kind.STREAM).values()}
-        chosen = RunRecords(records, outputs_of(graph)).of_span(stored, part.start, part.end, part.span)
+        run = RunRecords({name: listed(known) for name, known in records.items()}, outputs_of(graph))
+        chosen = run.of_span(stored, part.start, part.end, part.span)
         told = _told(records, outputs_of(graph))
         kept = once(origins, [_until(origin, masks_of(origin, part, chosen.needed), told) for origin in origins])
         written = {name: dict(values) for origin in origins for name, values in origin.metadata.items()}
@@ -53,13 +55,13 @@ def keep_span(
         with Copy(out, origins[0], mode=mode) as copy:
             for name, values in {**written, **metadata}.items():
                 copy.writer.add_metadata(name, values)
-            write_firings(copy, origins, chosen.records)
+            with Spool(out.parent, chosen.records) as spool:
+                spool.write(copy, origins)
             for origin, masks in zip(origins, kept, strict=True):
                 copy_messages(copy, origin, masks)
             stamps = [(origin, kept_stamps(origin, masks)) for origin, masks in zip(origins, kept, strict=True)]
             copy.frames(graph.namespace, (m for origin, found in stamps for m in framing(origin.path, found)))
-    done.firings = sum(r.kind in CALLS for listed in chosen.records.values() for r in listed)
-    done.bytes, done.lead = out.stat().st_size, chosen.lead
+    done.firings, done.bytes, done.lead = spool.calls, out.stat().st_size, chosen.lead
     with Origin(out) as made:
         done.streams, done.span = {s: n for s, n in sorted(made.counts().items()) if n}, made.span()
     return done
@@ -70,8 +72,8 @@ def _told(
 ) -> dict[str, tuple[int, int]]:
     """By stream, the last incarnation that records tell of, and the last stamp in it."""
     told: dict[str, tuple[int, int]] = {}
-    for operator, listed in records.items():
-        for record in listed:
+    for operator, known in records.items():
+        for record in known:
             for stream, emission in zip(outputs.get(operator, ()), record.outputs, strict=False):
                 if emission is not None:
                     told[stream] = max(told.get(stream, (0, 0)), (record.incarnation, emission.stamp))

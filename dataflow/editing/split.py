@@ -41,9 +41,11 @@ def split(
     if not overwrite and (there := [name for name in names if name.exists()]):
         raise RecordingError(f"{there[0]} exists already; choose another folder or ask to overwrite it")
     folder.mkdir(parents=True, exist_ok=True)
-    firings = Firings(origin)
-    for name, part in zip(names, parts, strict=True):
-        yield write_part(origin, part, name, firings=firings, compression=compression, overwrite=overwrite, watch=watch)
+    with Firings(origin) as firings:
+        for name, part in zip(names, parts, strict=True):
+            yield write_part(
+                origin, part, name, firings=firings, compression=compression, overwrite=overwrite, watch=watch
+            )
 
 
 def _parts(origin: Origin, spans: list[tuple[int, int]]) -> list[Part]:

@@ -23,7 +23,7 @@ from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.execution.threads import limit_threads_again
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
-from dataflow.operator import Context, Operator, OutputError, Outputs, outputs_of
+from dataflow.operator import FINDING, Context, Operator, OutputError, Outputs, outputs_of
 from dataflow.sync import NEVER, Entry, Firing, InputValue
 
 Place = tuple[int, int]
@@ -175,9 +175,11 @@ class Calls:
 
 
 def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
-    """Returns what an operator sums up, as plain values. Raises `OperatorFailure`."""
+    """Returns what an operator sums up and its finding, if any, as plain values. Raises `OperatorFailure`."""
     try:
         found = dict(operator.summary())
+        if finding := operator.finding():
+            found[FINDING] = finding
         return {str(key): item if isinstance(item, str) else np.asarray(item).item() for key, item in found.items()}
     except Exception as error:
         raise OperatorFailure(name, "summary()", error) from error

@@ -10,10 +10,12 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from dataflow.execution.absent import without_absent
 from dataflow.execution.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
+from dataflow.execution.calls import Calls
 from dataflow.execution.earlier import EarlierCounts
 from dataflow.execution.event_time import EventTime
 from dataflow.execution.failure import RAISED, OperatorFailure
@@ -22,14 +24,19 @@ from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
 from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
-from dataflow.graph.model import Node
-from dataflow.operator import Operator
+from dataflow.graph.code import ReloadError, Replaced, digest_of
+from dataflow.graph.model import Node, OperatorImportError
+from dataflow.graph.sections import Snapshots
+from dataflow.operator import Operator, OperatorSpec
+from dataflow.records.firing import MAX_STATE_BYTES
 from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
 from dataflow.sync.single import make_aligner
 
 MOST_TRIED = 256
 """Messages and waits that are over, none of which decides a firing, in one step. A timer that falls behind drops its
 ticks one by one, while new ones come due: its process would never look at anything else."""
+
+KEPT_STATE = "kept"
 
 
 class LiveRunner(OperatorRunner):
@@ -50,7 +57,7 @@ class LiveRunner(OperatorRunner):
         seed: int = 0,
         paranoid: bool = False,
         operator: Operator | None = None,
-        snapshots: int | None = None,
+        snapshots: Snapshots | None = None,
         clock: Clock | None = None,
         event_clock: EventClock = time.time_ns,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
@@ -258,6 +265,61 @@ class LiveRunner(OperatorRunner):
                 raise
             self._on_failure(failure, self.restarts.due_in())
 
+    def reload(self) -> dict[str, Any]:
+        if self.ended:
+            raise ReloadError(f"{self.node.name!r} has ended")
+        began, failed = time.monotonic(), self.restarts.pending
+        stamp = max(self.done, NEVER + 1)
+        try:
+            state = None if failed else self.calls.snapshot((self.records.incarnation, stamp))
+            code = Replaced(self.node)
+        except (OperatorFailure, OperatorImportError) as error:
+            raise ReloadError(str(error)) from error
+        try:
+            if what := _declares_other_ports(self.spec, code.operator.spec):
+                raise ReloadError(f"its {what} are declared otherwise now: end the run and start it again")
+            started, calls, kept = self._set_up(code.operator, state, stamp)
+        except Exception as error:
+            code.put_back()
+            raise ReloadError(str(error)) from error
+        if failed:
+            self.restarts.begun()
+        close_quietly(self.operator)
+        self.operator, self.calls = calls.operator, calls
+        self._begin_incarnation()
+        replaced = {name: digest_of(text) for name, text in code.before.items()}
+        self.records.add_setup(self.operator, started, (None,) * len(self.ports.states), replaced)
+        if kept == KEPT_STATE:
+            shown = state if state is not None and len(state) <= MAX_STATE_BYTES else None
+            self.records.add("restore", stamp, started, detail={"state": shown, "before": stamp})
+        self.wake()
+        seconds, warning = time.monotonic() - began, ""
+        try:
+            code.store_before()
+        except OSError as error:
+            warning = f"the code before could not be stored, so verify will not have it: {error}"
+        return {"seconds": seconds, "state": kept, "warning": warning}
+
+    def _set_up(self, made: type[Operator], state: bytes | None, stamp: int) -> tuple[int, Calls, str]:
+        """An operator in the place of this one, as re-execution makes it, with its state if that fits. Returns when its
+        `setup()` began (ns), its calls, and what has become of the state."""
+        incarnation, kept = self.records.incarnation + 1, "none" if state is None else KEPT_STATE
+        while True:
+            calls = Calls(self.node, made(**self.node.params), self.calls.seed, effects=self.calls.effects)
+            for name, value in self._changed.items():
+                calls.parameter(name, value, (incarnation, NEVER))
+            started = time.time_ns()
+            try:
+                calls.setup()
+                if state is not None:
+                    calls.restore(state, (incarnation, stamp))
+                return started, calls, kept
+            except OperatorFailure as failure:
+                close_quietly(calls.operator)
+                if state is None or failure.when != "restore()":
+                    raise
+                state, kept = None, f"begun anew: {failure.summary}"
+
     def _change_again(self) -> None:
         for name, value in self._changed.items():
             self.calls.parameter(name, value, (self.records.incarnation, NEVER))
@@ -340,6 +402,15 @@ class LiveRunner(OperatorRunner):
                 self._timeouts[name] += 1
                 self._told = moved = True
         return moved
+
+
+def _declares_other_ports(before: OperatorSpec, now: OperatorSpec) -> str:
+    """Returns which ports differ in anything but their descriptions; empty where none do."""
+    for what in ("inputs", "outputs"):
+        a, b = ({n: replace(port, doc="") for n, port in getattr(spec, what).items()} for spec in (before, now))
+        if a != b:
+            return what
+    return "" if before.merge == now.merge else "inputs"
 
 
 def _producer(stream: str) -> str:

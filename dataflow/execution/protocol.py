@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from dataflow.execution.ports import Emitter, OutputPorts
 from dataflow.execution.work import Work
+from dataflow.graph.code import ReloadError
 from dataflow.graph.model import Node
 from dataflow.operator import Operator, OperatorSpec, ParameterError
 from dataflow.sync import NEVER, Entry, Firing
@@ -94,6 +95,14 @@ class Runner:
         Raises `ParameterError` for one that does not exist, cannot change while running, or is out of bounds.
         """
         raise ParameterError(f"the parameters of {self.node.name!r} cannot change here")
+
+    def reload(self) -> dict[str, Any]:
+        """Goes on with the operator's code as it is in its files now, between two firings; recorded as a restart.
+
+        Returns as plain values the seconds it took (`seconds`), what has become of the state (`state`) and what is to
+        be said (`warning`). Raises `ReloadError` where it cannot; the code is then as before.
+        """
+        raise ReloadError("only the operators of a live run are reloaded (run --live)")
 
     def close(self) -> None:
         """Closes the operator. Raises what that raises."""

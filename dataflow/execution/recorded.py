@@ -19,9 +19,10 @@ from dataflow.execution.memory import WATCHED, MemoryGuard
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
 from dataflow.execution.restarts import close_quietly
+from dataflow.graph.code import code_digests, stored_operator
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
-from dataflow.operator import ParameterError
+from dataflow.operator import Operator, ParameterError
 from dataflow.records.comparison import Verification
 from dataflow.records.cuts import is_known, parameters_at, taken_by
 from dataflow.records.firing import CALLS, FiringRecord
@@ -60,7 +61,8 @@ class RecordedRunner(Runner):
         watcher: Watcher | None = None,
         live_effects: bool = False,
     ) -> None:
-        super().__init__(node, node.make(), emitter)
+        operator, self._as_it_was = _with_code(node, repetition.code_of(0))
+        super().__init__(node, operator, emitter)
         self._guard, self._watched = guard or MemoryGuard(), FOREVER if guard is not None else WATCHED
         self._watcher = watcher or Watcher()
         self.effects = RecordedJournal(live=live_effects)
@@ -94,6 +96,7 @@ class RecordedRunner(Runner):
         statics = self.calls.setup()
         if (record := self._repetition.setup) is not None:
             self.judge.files(record, self.operator.files)
+            self._look_at_code(record)
             for name, message, seq in self.judge.outputs(record, statics):
                 self.ports.emit_as(name, message, seq, record.incarnation)
         self._take_up()
@@ -110,6 +113,7 @@ class RecordedRunner(Runner):
             statics = self._make_anew(again[-1].incarnation)
             if again[-1].kind == "setup":
                 self.judge.statics(again[-1], statics)
+                self._look_at_code(again[-1])
         self._change(changes, again[-1].incarnation if again else 0)
         if before and is_known(last := before[-1]):
             self.calls.restore(last.detail["state"], (last.incarnation, last.stamp))
@@ -201,11 +205,18 @@ class RecordedRunner(Runner):
     def _start_again(self, record: FiringRecord) -> None:
         """A new incarnation: a fresh operator, with the parameters as they were last set."""
         self.judge.statics(record, self._make_anew(record.incarnation))
+        self._look_at_code(record)
+
+    def _look_at_code(self, record: FiringRecord) -> None:
+        """Notes code that is not as it was, unless what a reload has replaced runs."""
+        if not self._as_it_was:
+            self.judge.code(record, code_digests(type(self.operator)))
 
     def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
         """A fresh operator, with the parameters as they were last set; its static messages."""
         close_quietly(self.operator)
-        self.operator = self.calls.operator = self.node.make()
+        self.operator, self._as_it_was = _with_code(self.node, self._repetition.code_of(incarnation))
+        self.calls.operator = self.operator
         self._change(self.changed, incarnation)
         return self.calls.setup()
 
@@ -305,3 +316,9 @@ class RecordedRunner(Runner):
             if (lost.incarnation, lost.seq) > self._latest.get(lost.stream, (-1, -1)):
                 self.result.beyond = self.result.unverifiable
         self.ports.end(None, "end of records")
+
+
+def _with_code(node: Node, digests: Mapping[str, str] | None) -> tuple[Operator, bool]:
+    """A new operator, of the code with these digests where a reload has stored it, and whether it is of that."""
+    found = None if digests is None else stored_operator(node, digests)
+    return (node.operator if found is None else found)(**node.params), found is not None

@@ -20,6 +20,7 @@ from dataflow.execution.memory import WATCHED, MemoryGuard
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
 from dataflow.graph.model import Node
+from dataflow.graph.sections import Snapshots
 from dataflow.messages.base import Message
 from dataflow.operator import Operator
 from dataflow.records.firing import MAX_STATE_BYTES, Emission, Kind
@@ -33,6 +34,9 @@ by a wrong stamp. A live run leaves ticks out instead, and counts them."""
 SHORT = 1_000_000
 """ns: an operator whose calls take less on average does not announce each one by a frontier below its stamp. Its
 messages imply the same frontier at once."""
+
+CPU_SPACING = 250_000_000
+"""ns of an operator's CPU time between two snapshots of its state, where they are spaced by that."""
 
 MOST_DROPPED = 10_000
 """Stamps that one step may drop before it returns to its driver, which has other work."""
@@ -54,7 +58,7 @@ class OperatorRunner(Runner):
         paranoid: bool = False,
         operator: Operator | None = None,
         lossy: bool = False,
-        snapshots: int | None = None,
+        snapshots: Snapshots | None = None,
     ) -> None:
         super().__init__(node, node.make() if operator is None else operator, emitter, lossy=lossy)
         self.paranoid, self.snapshots = paranoid, snapshots
@@ -208,13 +212,15 @@ class OperatorRunner(Runner):
         return messages
 
     def _snapshot_if_due(self, stamp: int) -> None:
-        """Records the operator's state, about every `snapshots` ns of event time; at the same firings in every run."""
+        """Records the operator's state, about every `snapshots` ns of event time, then at the same firings in every
+        run; or every `CPU_SPACING` ns of its CPU time."""
         assert self.snapshots is not None
+        at, spacing = (self.work.cpu_ns, CPU_SPACING) if self.snapshots == "cpu" else (stamp, self.snapshots)
         if self._next_snapshot is None:
-            self._next_snapshot = stamp + self.snapshots
-        if stamp < self._next_snapshot:
+            self._next_snapshot = at + spacing
+        if at < self._next_snapshot:
             return
-        self._next_snapshot = stamp + self.snapshots
+        self._next_snapshot = at + spacing
         started = time.time_ns()
         state = self.calls.snapshot((self.records.incarnation, stamp))
         if state is None:

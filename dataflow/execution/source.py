@@ -17,6 +17,7 @@ from dataflow.execution.generators.shared_generators import AT_WORK, SharedGener
 from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import Emitter, OutputPorts
 from dataflow.execution.work import Work
+from dataflow.graph.code import ReloadError
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import OutputError, Source, outputs_of
@@ -249,6 +250,10 @@ class SourceRunner:
         plain = self.operator.params.model_dump(mode="json")[name]
         self.records.add("param", max(self.last, NEVER + 1), started, detail={"name": name, "value": plain})
         return plain
+
+    def reload(self) -> dict[str, Any]:
+        """Raises `ReloadError`."""
+        raise ReloadError(f"{self.node.name!r} is a source, which holds its device: end the run and start it again")
 
     def finish(self, reason: str = "end of source") -> None:
         """Ends the streams; the source is done."""

@@ -25,19 +25,7 @@ from foxglove_schemas_protobuf.TextAnnotation_pb2 import TextAnnotation
 from foxglove_schemas_protobuf.Vector2_pb2 import Vector2
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
-from dataflow.messages import (
-    Boxes3D,
-    CompressedDepth,
-    Detections2D,
-    Keypoints2D,
-    Mesh,
-    Message,
-    OccupancyGrid,
-    RelativeDepth,
-    SceneGraph,
-    SegmentationMap,
-    Tracks,
-)
+import dataflow.messages as messages
 from dataflow.recording.streams.codecs import SchemaText, codec_for
 from dataflow.recording.streams.foxglove import file_descriptor_set
 from dataflow.recording.streams.foxglove.values import pose_of, timestamp_of
@@ -57,7 +45,7 @@ class Drawn:
     draw: Callable[[Any], Any]
 
 
-def boxes_over(m: Detections2D) -> ImageAnnotations:
+def boxes_over(m: messages.Detections2D) -> ImageAnnotations:
     """Boxes and labels over the image, and the rims of masks where there are any."""
     made = ImageAnnotations(timestamp=timestamp_of(m.stamp))
     for k in range(m.count):
@@ -69,7 +57,7 @@ def boxes_over(m: Detections2D) -> ImageAnnotations:
     return made
 
 
-def limbs_over(m: Keypoints2D) -> ImageAnnotations:
+def limbs_over(m: messages.Keypoints2D) -> ImageAnnotations:
     """Limbs between points that are likelier found than not."""
     made = ImageAnnotations(timestamp=timestamp_of(m.stamp))
     ends = [Point2(x=x, y=y) for x, y in m.limbs().reshape(-1, 2).tolist()]
@@ -100,7 +88,7 @@ def _rim(made: ImageAnnotations, mask: npt.NDArray[np.bool_]) -> PointsAnnotatio
     )
 
 
-def tracks_over(m: Tracks) -> ImageAnnotations:
+def tracks_over(m: messages.Tracks) -> ImageAnnotations:
     """Boxes of tracks over the image, with their numbers; one that is not in the image is left out."""
     made = ImageAnnotations(timestamp=timestamp_of(m.stamp))
     boxes = np.empty((0, 4)) if m.boxes is None else m.boxes
@@ -129,7 +117,7 @@ def _outline(made: ImageAnnotations, box: list[float], text: str) -> None:
     )
 
 
-def scene(m: Boxes3D) -> SceneUpdate:
+def scene(m: messages.Boxes3D) -> SceneUpdate:
     """Cubes with labels; each update replaces the one before."""
     made, entity = _scene(m.stamp, m.frame)
     for i, label in enumerate(m.labels()):
@@ -137,7 +125,7 @@ def scene(m: Boxes3D) -> SceneUpdate:
     return made
 
 
-def tracks(m: Tracks) -> SceneUpdate:
+def tracks(m: messages.Tracks) -> SceneUpdate:
     """Cubes with class and number, and an arrow's worth of a second's way; without positions, nothing."""
     made, entity = _scene(m.stamp, m.frame)
     positions = np.empty((0, 3)) if m.positions is None else m.positions
@@ -152,7 +140,7 @@ def tracks(m: Tracks) -> SceneUpdate:
     return made
 
 
-def scene_graph(m: SceneGraph) -> SceneUpdate:
+def scene_graph(m: messages.SceneGraph) -> SceneUpdate:
     """Cubes with names, and a line with its predicate for each relation."""
     made, entity = _scene(m.stamp, m.frame)
     classes = (m.class_names[c] if m.class_names else str(c) for c in m.class_ids.tolist())
@@ -169,7 +157,7 @@ def scene_graph(m: SceneGraph) -> SceneUpdate:
     return made
 
 
-def surface(m: Mesh) -> SceneUpdate:
+def surface(m: messages.Mesh) -> SceneUpdate:
     """Triangles."""
     made, entity = _scene(m.stamp, m.frame)
     triangles = entity.triangles.add(
@@ -207,7 +195,7 @@ def _segment(entity: SceneEntity, first: Any, second: Any) -> None:
     )
 
 
-def grid(m: OccupancyGrid) -> Grid:
+def grid(m: messages.OccupancyGrid) -> Grid:
     """Cells as int8, row 0 at the origin."""
     columns = m.cells.shape[1]
     turn = _UPRIGHT if m.orientation is None else m.orientation.tolist()
@@ -224,17 +212,17 @@ def grid(m: OccupancyGrid) -> Grid:
     )
 
 
-def compressed_depth(m: CompressedDepth) -> CompressedImageProto:
+def compressed_depth(m: messages.CompressedDepth) -> CompressedImageProto:
     """The 16-bit PNG as it is."""
     return CompressedImageProto(timestamp=timestamp_of(m.stamp), frame_id=m.frame, format="png", data=m.data.tobytes())
 
 
-def relative_depth(m: RelativeDepth) -> RawImage:
+def relative_depth(m: messages.RelativeDepth) -> RawImage:
     """Nearness as an image of floats."""
     return _image(m.stamp, m.frame, "32FC1", np.ascontiguousarray(m.data, "<f4"))
 
 
-def mask(m: SegmentationMap) -> RawImage:
+def mask(m: messages.SegmentationMap) -> RawImage:
     """The classes' own colours; black has no class."""
     from dataflow.view.colors import of_classes  # here, since the viewer's package takes long to import
 
@@ -259,28 +247,28 @@ def _image(stamp: int, frame: str, encoding: str, pixels: Any) -> RawImage:
     )
 
 
-DRAWN: dict[type[Message], Drawn] = {
-    Detections2D: Drawn(ImageAnnotations, boxes_over),
-    Keypoints2D: Drawn(ImageAnnotations, limbs_over),
-    Boxes3D: Drawn(SceneUpdate, scene),
-    SceneGraph: Drawn(SceneUpdate, scene_graph),
-    Mesh: Drawn(SceneUpdate, surface),
-    OccupancyGrid: Drawn(Grid, grid),
-    CompressedDepth: Drawn(CompressedImageProto, compressed_depth),
-    RelativeDepth: Drawn(RawImage, relative_depth),
-    SegmentationMap: Drawn(RawImage, mask),
+DRAWN: dict[type[messages.Message], Drawn] = {
+    messages.Detections2D: Drawn(ImageAnnotations, boxes_over),
+    messages.Keypoints2D: Drawn(ImageAnnotations, limbs_over),
+    messages.Boxes3D: Drawn(SceneUpdate, scene),
+    messages.SceneGraph: Drawn(SceneUpdate, scene_graph),
+    messages.Mesh: Drawn(SceneUpdate, surface),
+    messages.OccupancyGrid: Drawn(Grid, grid),
+    messages.CompressedDepth: Drawn(CompressedImageProto, compressed_depth),
+    messages.RelativeDepth: Drawn(RawImage, relative_depth),
+    messages.SegmentationMap: Drawn(RawImage, mask),
 }
 _TRACKS_OVER, _TRACKS = Drawn(ImageAnnotations, tracks_over), Drawn(SceneUpdate, tracks)
 
 
-def drawing_of(message: Message) -> Drawn | None:
+def drawing_of(message: messages.Message) -> Drawn | None:
     """Returns how a message is drawn; None for a type that is written by its own codec."""
-    if isinstance(message, Tracks):
+    if isinstance(message, messages.Tracks):
         return _TRACKS if message.positions is not None else _TRACKS_OVER
     return DRAWN.get(type(message))
 
 
-def schema_of(message: Message) -> tuple[SchemaText, str]:
+def schema_of(message: messages.Message) -> tuple[SchemaText, str]:
     """The schema of what `data_of` gives, and its message encoding."""
     drawn = drawing_of(message)
     if drawn is None:
@@ -289,7 +277,7 @@ def schema_of(message: Message) -> tuple[SchemaText, str]:
     return SchemaText(str(drawn.proto.DESCRIPTOR.full_name), "protobuf", file_descriptor_set(drawn.proto)), "protobuf"
 
 
-def data_of(message: Message) -> bytes:
+def data_of(message: messages.Message) -> bytes:
     """A message for Foxglove. Fields that its schema has no place for are left out."""
     drawn = drawing_of(message)
     if drawn is not None:

@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 from dataflow.extras import missing_extra
 from dataflow.foxglove.drawing import Drawn, data_of, drawing_of, schema_of
-from dataflow.foxglove.topics import Topics
 from dataflow.messages import Message
+from dataflow.recording.streams.frames import FrameTree
 
+FRAMES = "/frames"
 LOOPBACK = "127.0.0.1"
 BACKLOG = 256
 """Messages that wait for a client that is slow; then its oldest are dropped. Other clients do not wait."""
+
+
+class Topics:
+    """Names topics `/operator/port`, without the namespace, and derives the transforms that Foxglove cannot know."""
+
+    def __init__(self, namespace: str = "") -> None:
+        self._prefix = f"{namespace}/" if namespace else ""
+        self._frames = FrameTree()
+
+    def of(self, stream: str, message: Message) -> Iterator[tuple[str, Message]]:
+        """Yields what is shown for a message: topic and message, its own last."""
+        for transforms in self._frames.transforms(stream, message):
+            yield FRAMES, transforms
+        yield f"/{stream.removeprefix(self._prefix).lstrip('/')}", message
 
 
 class FoxgloveError(RuntimeError):

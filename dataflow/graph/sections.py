@@ -39,18 +39,22 @@ class Flight:
     disk: int | None = None
 
 
+Snapshots = int | Literal["cpu"]
+
+
 @dataclass(frozen=True, slots=True)
 class Record:
     """Choice of the streams that a recording holds. `thin`: not all of them; firing records are always written.
 
-    `snapshots`: nanoseconds of event time between two snapshots of an operator's state; None for none. `flight`: the
+    `snapshots`: nanoseconds of event time between two snapshots of an operator's state; "cpu": one per 0.25 s of the
+    operator's CPU time; None for none. `flight`: the
     flight recorder of runs that are not recorded whole; None for none. `on_failure`: whether a run goes on without a
     recorder that fails ("go_on") or ends ("end"); None: a live run goes on, any other ends.
     """
 
     streams: tuple[str, ...]
     thin: bool = False
-    snapshots: int | None = None
+    snapshots: Snapshots | None = None
     flight: Flight | None = None
     on_failure: Literal["go_on", "end"] | None = None
 

@@ -6,40 +6,15 @@ from collections import Counter
 from collections.abc import Iterator
 from itertools import islice, pairwise
 
+import dataflow.messages as messages
 from dataflow.lint.finding import Finding
 from dataflow.lint.material import Material
-from dataflow.messages import (
-    CameraInfo,
-    CompressedDepth,
-    CompressedImage,
-    CompressedVideo,
-    DepthImage,
-    Image,
-    Image16,
-    Imu,
-    LaserScan,
-    MagneticField,
-    Message,
-    NavSatFix,
-    Odometry,
-    PointCloud,
-)
 
-_DEVICES = (
-    CompressedDepth,
-    CompressedImage,
-    CompressedVideo,
-    DepthImage,
-    Image,
-    Image16,
-    Imu,
-    LaserScan,
-    MagneticField,
-    NavSatFix,
-    Odometry,
-    PointCloud,
-)
-_TYPES = {cls.SCHEMA for cls in (*_DEVICES, CameraInfo)}
+_TYPES = {cls.SCHEMA for cls in (
+    messages.CameraInfo, messages.CompressedDepth, messages.CompressedImage, messages.CompressedVideo,
+    messages.DepthImage, messages.Image, messages.Image16, messages.Imu, messages.LaserScan, messages.MagneticField,
+    messages.NavSatFix, messages.Odometry, messages.PointCloud,
+)}  # fmt: skip
 LOOKED_AT = 100
 """Messages of a stream that are looked at, from the first one."""
 TURNS = 4
@@ -59,15 +34,15 @@ def check_publishers(material: Material) -> Iterator[Finding]:
         yield Finding("publishers", name, "warning", text)
 
 
-def _device(message: Message) -> str:
+def _device(message: messages.Message) -> str:
     """What a device keeps from message to message, in words."""
     match message:
-        case CameraInfo():
+        case messages.CameraInfo():
             size = f"{message.width}x{message.height}"
             return f"frame {message.frame!r} of {size} with fx {message.fx:.6g}, cx {message.cx:.6g}"
-        case Image() | Image16() | DepthImage():
+        case messages.Image() | messages.Image16() | messages.DepthImage():
             return f"frame {message.frame!r} of {message.data.shape[1]}x{message.data.shape[0]}"
-        case Odometry():
+        case messages.Odometry():
             return f"frame {message.child_frame!r} in {message.frame!r}"
         case _:
             return f"frame {getattr(message, 'frame', '')!r}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataflow.messages.arrays import F32, F64, I32, I64
 from dataflow.messages.base import Message, MessageError, array, scalar
-from dataflow.messages.checks import parallel, table_indices, unique, unit_quaternions, within, within_length
+from dataflow.messages.checks import parallel, table_indices, together, unique, unit_quaternions, within, within_length
 
 
 class SceneGraph(Message):
@@ -30,6 +30,12 @@ class SceneGraph(Message):
     subjects: I32 = array("int32", "M", "subject of each relation, an index into the nodes")
     objects: I32 = array("int32", "M", "object of each relation, an index into the nodes")
     relation_scores: F32 | None = array("float32", "M", "confidence in each relation, [0, 1]", default=None)
+    tracks: I64 | None = array(
+        "int64", "T", "ids of tracks in images that are of nodes, by node, latest last", default=None, added=True
+    )
+    track_nodes: I32 | None = array(
+        "int32", "T", "node of each of these tracks, an index into the nodes", default=None, added=True
+    )
 
     def validate(self) -> None:
         nodes, relations = len(self.ids), len(self.subjects)
@@ -39,6 +45,8 @@ class SceneGraph(Message):
         parallel(self, "predicates", relations, "subjects")
         within_length(self, "subjects", nodes, f"index the {nodes} nodes")
         within_length(self, "objects", nodes, f"index the {nodes} nodes")
+        together(self, "tracks", "track_nodes")
+        within_length(self, "track_nodes", nodes, f"index the {nodes} nodes")
         within(self, 0.0, float("inf"), "sizes")
         within(self, 0.0, 1.0, "scores", "relation_scores")
         unit_quaternions(self, "orientations")
@@ -54,6 +62,12 @@ class SceneGraph(Message):
             return self.labels
         words = [self.class_names[c] if self.class_names else str(c) for c in self.class_ids.tolist()]
         return tuple(f"{word} {i}" for word, i in zip(words, self.ids.tolist(), strict=True))
+
+    def tracks_of(self, node: int) -> tuple[int, ...]:
+        """Returns the ids of the tracks that are of a node (an index), latest last."""
+        if self.tracks is None:
+            return ()
+        return tuple(self.tracks[self.track_nodes == node].tolist())
 
     def relations(self) -> tuple[tuple[int, str, int], ...]:
         """(subject, predicate, object) of every relation, as node indices."""

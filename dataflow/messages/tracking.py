@@ -70,6 +70,9 @@ class Tracks(Message):
     covariances: F64 | None = array(
         "float64", "N 6 6", "of (position, velocity), in `frame`", unit="m, m/s", default=None
     )
+    detections: I64 | None = array(
+        "int64", "N", "row of the detections that it was matched with now; -1 for none", default=None, added=True
+    )
 
     def validate(self) -> None:
         positive(self, "width", "height")

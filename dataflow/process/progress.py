@@ -46,6 +46,8 @@ class Progress:
         """The waits that were last reported."""
         self.behind: dict[str, list[float]] = {}
         """By how much sources were last reported to be behind the clock (s): when read, and when sent."""
+        self.found: dict[str, str] = {}
+        """The findings of operators when their counts were last reported."""
         self._dropped: dict[str, list[list[Any]]] = {}
         self._counted: dict[str, tuple[int, int]] = {}
         self._count_due = -COUNT_EVERY
@@ -86,6 +88,7 @@ class Progress:
         self._dropped |= drops
         waits = {name: found for name, found in _waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
+        self.found |= {r.node.name: r.operator.finding() for r in (*self._driver.sources, *changed)}
         self.behind = self._live.behind()
         news = {"done": done, "counts": counts, "drops": drops, "waits": waits, "behind": self.behind}
         self._channel.send("progress", **news, first=_first(self._driver))

@@ -70,7 +70,8 @@ class Requests:
     def answer_parameter(self, name: str, query: Any) -> None:
         """Answers a request to change a parameter with the value as validated, or with an error.
 
-        A request `{"get": true}` is answered with the values of all, and whether they can change now.
+        A request `{"get": true}` is answered with the values of all, and whether they can change now; with
+        `{"reload": true}` the operator goes on with its code as it is in its files now (`Runner.reload`).
         """
         with query:
             try:
@@ -143,8 +144,11 @@ class Requests:
         self._given[maker.node.name] = message.stamp
         return message.stamp
 
-    @staticmethod
-    def _value_asked(maker: Maker, asked: Any) -> Any:
+    def _value_asked(self, maker: Maker, asked: Any) -> Any:
+        if asked.get("reload"):
+            outcome = maker.reload()
+            self._channel.send("reloaded", operator=maker.node.name, **outcome)
+            return outcome
         if asked.get("get"):
             fields = maker.operator.spec.parameters.model_fields
             values = maker.operator.params.model_dump(mode="json")
@@ -162,6 +166,7 @@ class Requests:
                 "counts": self._progress.counted,
                 "waits": self._progress.waited,
                 "behind": self._progress.behind,
+                "found": {name: text for name, text in self._progress.found.items() if text},
                 "restarts": self._restarts(),
                 "ended": [maker.node.name for maker in self._driver.all if maker.ended],
             }

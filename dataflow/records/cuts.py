@@ -91,6 +91,8 @@ def parameters_at(records: Iterable[FiringRecord]) -> tuple[dict[str, Any], dict
 
 def is_known(record: FiringRecord) -> bool:
     """Returns whether a record holds the operator's state."""
+    if record.kind == "restore":
+        return record.detail["state"] is not None
     return record.kind in ("snapshot", "cut") and "state" in record.detail
 
 

@@ -7,6 +7,7 @@ how it ended. Records are gathered in batches of one operator and written to its
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -191,11 +192,13 @@ def _describe(operator: str, incarnation: int, names: tuple[str, ...], streams: 
 _MOST_DESCRIBED = 4096
 
 
-def consecutive(records: Iterable[FiringRecord]) -> Iterator[list[FiringRecord]]:
-    """Records of one operator, in order, in parts that can each be a batch."""
+def consecutive(records: Iterable[FiringRecord], most: int = sys.maxsize) -> Iterator[list[FiringRecord]]:
+    """Records of one operator, in order, in parts of at most so many that can each be a batch."""
     part: list[FiringRecord] = []
     for record in records:
-        if part and (record.incarnation, record.index) != (part[-1].incarnation, part[-1].index + 1):
+        if part and (
+            len(part) == most or (record.incarnation, record.index) != (part[-1].incarnation, part[-1].index + 1)
+        ):
             yield part
             part = []
         part.append(record)

@@ -8,9 +8,10 @@ few *runs*, each in order, which are merged: one is read once it is its turn.
 from __future__ import annotations
 
 import heapq
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from dataflow.records.cuts import held_by
@@ -18,6 +19,8 @@ from dataflow.records.firing import FiringRecord
 
 Place = tuple[int, int]
 """(incarnation, number) of a message in its stream, or (incarnation, index) of a record."""
+STEP = 64
+"""Batches between two at which reading can begin."""
 Read = Callable[[int, int | None], Iterator[FiringRecord]]
 """Reads the records of the batches from one number to before another."""
 
@@ -25,11 +28,17 @@ Read = Callable[[int, int | None], Iterator[FiringRecord]]
 @dataclass(frozen=True, slots=True)
 class Run:
     """The batches `begin` to `end` - 1 of an operator, whose records are in order; `first` is the place of the first of
-    them."""
+    them. `steps`: some of these batches with their first places, so that reading can begin on the way."""
 
     begin: int
     end: int
     first: Place
+    steps: tuple[tuple[Place, int], ...] = ()
+
+    def since(self, place: Place) -> Run:
+        """Returns the run without some of what lies before a place."""
+        at = bisect_right(self.steps, (place, self.end))
+        return replace(self, begin=self.steps[at - 1][1], first=self.steps[at - 1][0]) if at else self
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +67,7 @@ class Outliner:
         self._last: Place = (-1, -1)
         self._first: Place = (-1, -1)
         self._begin = self._end = 0
+        self._steps: list[tuple[Place, int]] = []
         self._repeats = False
         """The newest run has only what came before already, so far."""
         self._newest: dict[str, Place] = dict.fromkeys(outputs, (-1, -1))
@@ -73,10 +83,13 @@ class Outliner:
         place, last = (record.incarnation, record.index), self._last
         back = place <= last
         if back or (self._repeats and place > (last[0], last[1] + 1)):
-            self._runs.append(Run(self._begin, number, self._first))
+            self._runs.append(Run(self._begin, number, self._first, tuple(self._steps)))
             self._begin, self._first, self._repeats = number, place, back
+            self._steps.clear()
         elif last == (-1, -1):
             self._begin, self._first = number, place
+        elif number >= self._end and number >= (self._steps[-1][1] if self._steps else self._begin) + STEP:
+            self._steps.append((place, number))
         self._last, self._end = place, number + 1
         self._rise(record)
 
@@ -96,7 +109,7 @@ class Outliner:
     def done(self, read: Read) -> Outline:
         """Returns the outline. `read` is needed where there are several runs."""
         if self._end:
-            self._runs.append(Run(self._begin, self._end, self._first))
+            self._runs.append(Run(self._begin, self._end, self._first, tuple(self._steps)))
         if len(self._runs) > 1:
             self._newest = dict.fromkeys(self._outputs, (-1, -1))
             self._scattered = set()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import islice
+from itertools import dropwhile, islice
 from typing import Any, NamedTuple, Protocol
 
 from dataflow.recording import Recording, RecordingError
 from dataflow.records.firing import CALLS, KINDS, FiringRecord, FiringRecordError, Rows, decode_rows, unpack_batch
-from dataflow.records.order import Outline, Outliner, Place, emitted, in_order
+from dataflow.records.order import Outline, Outliner, Place, emitted, in_order, merged
 from dataflow.sync import InputRef, MessageRef
 
 _BEHIND = (2**63, 0)
@@ -52,7 +52,7 @@ class FiringLog:
     `kept`: batches in memory, by operator. Behind them come those of `recording`, all or those from `start` to
     `end` (ns; see `Recording.firings`). `begins`: by operator the index from which on there are all records, where
     those before were not read. `outlines`: how the records of operators lie in the file, where that is known; else a
-    pass finds it.
+    pass finds it. `remembers`: records stay in memory once they are decoded; for a few.
     """
 
     def __init__(
@@ -65,8 +65,10 @@ class FiringLog:
         end: int | None = None,
         begins: Mapping[str, int] | None = None,
         outlines: Mapping[str, Outline] | None = None,
+        remembers: bool = False,
     ) -> None:
         self._kept, self._origin, self._recording, self._start, self._end = kept, origin, recording, start, end
+        self._remembered: dict[bytes, tuple[FiringRecord, ...]] | None = {} if remembers else None
         self.resumed: FiringRecord | None = None
         """A state that was taken on the way: the records of its operator go on there behind the first `setup()`."""
         self.begins: Mapping[str, int] = begins or {}
@@ -112,7 +114,11 @@ class FiringLog:
     def decoded(self, operator: str, payload: bytes) -> tuple[FiringRecord, ...]:
         """The records of a batch that is filed under an operator. Raises `RecordingError`, with the file and the
         operator."""
-        return _decoded(payload, operator, self._origin)
+        if self._remembered is None:
+            return _decoded(payload, operator, self._origin)
+        if payload not in self._remembered:
+            self._remembered[payload] = _decoded(payload, operator, self._origin)
+        return self._remembered[payload]
 
     def headings(self, maker: Maker) -> Sequence[Heading]:
         """The headings of all records of `maker`, in order. Of records that lie in order no more is decoded."""
@@ -151,6 +157,16 @@ class FiringLog:
     def outlined(self, maker: Maker, found: Outliner) -> None:
         """Notes the outline that a pass over all of a maker's records has found."""
         self._outlines[maker.name] = found.done(partial(self.records, maker.name))
+
+    def since(self, maker: Maker, begin: Place) -> Iterator[FiringRecord]:
+        """The records of `maker` from a place (incarnation, index) on, in that order, each once."""
+        runs = [run.since(begin) for run in self.outline(maker).runs]
+        records = in_order(runs, partial(self.records, maker.name))
+        return dropwhile(lambda record: (record.incarnation, record.index) < begin, records)
+
+    def repeated(self, maker: Maker) -> Iterator[FiringRecord]:
+        """The records of `maker` by (incarnation, index); of several with one place, the first of the file first."""
+        return merged(self.outline(maker).runs, partial(self.records, maker.name))
 
     def ordered(self, maker: Maker) -> Iterator[FiringRecord]:
         """The records of `maker` by (incarnation, index), each once."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from dataflow.records.cuts import Knowledge, is_known
 from dataflow.records.firing import CALLS, FiringRecord
@@ -38,6 +38,13 @@ class Repetition:
         self.calls = self.lost = self.unknown = 0
         self.uses = Uses()
         self.needed: dict[str, tuple[int, int]] = {}
+        self._replaced: dict[int, Mapping[str, str]] = {}
+
+    def code_of(self, incarnation: int) -> Mapping[str, str] | None:
+        """Returns the digests, by module, of the code that an incarnation ran, where a reload has replaced it since;
+        else None."""
+        after = [at for at in self._replaced if at > incarnation]
+        return self._replaced[min(after)] if after else None
 
     def __iter__(self) -> Iterator[FiringRecord]:
         knowledge = Knowledge()
@@ -70,6 +77,8 @@ class Repetition:
                 self.began = "stateless" if self._stateless else "snapshot"
         knowledge = Knowledge()
         for number, record in self._numbered():
+            if "replaced" in record.detail:
+                self._replaced[record.incarnation] = record.detail["replaced"]
             if number is None:
                 self.lost += record.kind in CALLS
             elif number < 0:

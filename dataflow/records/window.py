@@ -33,20 +33,22 @@ def records_from(
     stateless: Collection[str],
     stateful: Collection[str],
     end: int | None = None,
+    reach: int | None = None,
 ) -> FiringLog:
     """Reads the records that repeating all operators from `stamp` (ns) on needs, up to about `end` (ns), or all of them
     where that is not known.
 
     It is known of recordings whose events tell of what happens to operators besides firings, if nothing did before. Of
     an operator with a state it takes one recorded at or before `stamp`. `makers`: the nodes of the graph, of which the
-    `stateless` and the `stateful` ones may be repeated. Raises `RecordingError`.
+    `stateless` and the `stateful` ones may be repeated. `reach`: the span (ns) before `stamp` in which they are looked
+    for at first, by default `FIRST_REACH`. Raises `RecordingError`.
     """
     firsts = [info.first for info in recording.streams.values() if info.first is not None and not info.static]
     told = PARAMETERS in recording.metadata.get(TOLD, {}).get("events", "").split()
     if told and firsts and cut_of(recording.metadata) is None and RECOVERED not in recording.metadata:
         history = min((e.stamp for e in recording.events() if e.name in HISTORY), default=None)
         heads = _heads(recording)
-        reach = FIRST_REACH
+        reach = reach or FIRST_REACH
         while stamp - reach > min(firsts) and (history is None or stamp - reach < 0):
             found = _window(recording, heads, makers, stamp - reach, end)
             if found is not None and _suffices(found, makers, stamp, stateless, stateful):
@@ -103,7 +105,11 @@ def _window(
             begins[operator] = first.index
         elif first.index == last.index + 1:
             kept[operator] = [head]
-    return FiringLog(kept, str(recording.path), recording, start=start, end=end, begins=begins)
+    if end is None:
+        return FiringLog(kept, str(recording.path), recording, start=start, begins=begins)
+    for name in firsts:
+        kept[name] += [payload for _, payload in recording.firings(name, start, end)]
+    return FiringLog(kept, str(recording.path), begins=begins, remembers=True)
 
 
 def _suffices(

@@ -76,8 +76,8 @@ def written(message: Message, type_: str, distro: Distro) -> tuple[str, str, byt
     make = OUTWARD.get(type(message))
     if make is None:
         raise RecordingError(f"{message.SCHEMA} has no counterpart in ROS")
-    usual, made = make(message)
-    kind = type_ or usual
+    made = make(message)
+    kind = type_ or made.__msgtype__
     store = store_of(distro)
     if kind not in store.fielddefs:
         raise RecordingError(f"{kind} is not a type of ROS 2 {distro} that is known here")

@@ -14,7 +14,7 @@ from dataflow.interop.conversions import convert
 from dataflow.interop.topics import TopicReader
 from dataflow.interop.transform_sets import joined, other_parents
 from dataflow.messages import Message, MessageError, Number, Transforms
-from dataflow.operator import FINDING, Duration, Out, Param, Source, SourceError
+from dataflow.operator import Duration, Out, Param, Source, SourceError
 from dataflow.recording.errors import RecordingError
 from dataflow.ros.definitions import CLOCK, Distro, clock_time, distros_of, reader_for, type_hash
 from dataflow.ros.losses import remember
@@ -220,9 +220,13 @@ class Subscriber(Place, Source, abstract=True):
         found = {"lost": mail.losses.lost, "overflow": mail.overflow, "late": order.late, **self._counts}
         more = {"repeated": order.repeated, "unnamed": mail.unnamed}
         more["unreadable"] = self._counts["unreadable"] + self._broken_clocks
-        findings = [text for text in (self._lacking(), self._late(), self._first_fault) if text]
-        told: dict[str, float | int | str] = {**found, **{name: n for name, n in more.items() if n}}
-        return told | ({FINDING: "; ".join(findings)} if findings else {})
+        return {**found, **{name: n for name, n in more.items() if n}}
+
+    def finding(self) -> str:
+        """Returns whose messages were lost, which came late, and the first fault."""
+        if not hasattr(self, "_mail"):
+            return ""
+        return "; ".join(text for text in (self._lacking(), self._late(), self._first_fault) if text)
 
     def _lacking(self) -> str:
         """Names the publishers whose messages were lost; empty for none."""

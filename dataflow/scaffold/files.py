@@ -5,18 +5,20 @@ from __future__ import annotations
 import keyword
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 from dataflow.scaffold import templates
 
-Kind = Literal["operator", "timer", "source"]
-KINDS: tuple[Kind, ...] = ("operator", "timer", "source")
+Kind = Literal["operator", "timer", "source", "program"]
+KINDS: tuple[Kind, ...] = ("operator", "timer", "source", "program")
+_HEADER = Path(__file__).parents[1] / "program" / "dataflow.hpp"
 _OPERATORS = {
     "operator": (templates.OPERATOR, templates.OPERATOR_TEST),
     "timer": (templates.TIMER, templates.TIMER_TEST),
     "source": (templates.SOURCE, templates.SOURCE_TEST),
+    "program": (templates.PROGRAM, templates.PROGRAM_TEST),
 }
 
 
@@ -41,15 +43,21 @@ def camel(name: str) -> str:
 
 
 def operator_files(name: str, kind: Kind = "operator", package: str = "") -> Mapping[Path, str]:
-    """An operator's module and its test. `package`: the package that the module is put into."""
+    """An operator's module and its test, with the source of a program. `package`: the package that the module is put
+    into."""
     module = snake(name)
     code, test = _OPERATORS[kind]
     words = {
         "Class": camel(name),
         "Title": camel(name),
         "module": f"{package}.{module}" if package else module,
+        "stem": module,
     }
-    return {Path(f"{module}.py"): code.substitute(words), Path(f"test_{module}.py"): test.substitute(words)}
+    files = {Path(f"{module}.py"): code.substitute(words), Path(f"test_{module}.py"): test.substitute(words)}
+    if kind == "program":
+        files[Path(f"{module}.cpp")] = templates.PROGRAM_SOURCE.substitute(words)
+        files[Path("dataflow.hpp")] = _HEADER.read_text(encoding="utf-8")
+    return files
 
 
 def graph_files(name: str) -> Mapping[Path, str]:
@@ -87,6 +95,35 @@ def project_files(name: str) -> Mapping[Path, str]:
         Path("tests", "test_brightness.py"): operator[Path("test_brightness.py")],
         Path("tests", "test_graphs.py"): templates.GRAPH_TEST.substitute(words),
     }
+
+
+def service_files(
+    name: str, command: Sequence[str], *, folder: Path, out: Path, user: str, days: int
+) -> Mapping[Path, str]:
+    """A unit of systemd that runs `command` in `folder` as `user`, and what deletes files in `out` after `days`.
+
+    Raises `NameFault` for a name that systemd does not take.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_.-]+", name):
+        raise NameFault(f"{name!r} cannot be the name of a service: write letters, digits, '_', '-' and '.'")
+    words = {
+        "name": name,
+        "user": user,
+        "folder": str(folder).replace("%", "%%"),
+        "command": " ".join(map(_systemd_word, command)),
+        "out": _systemd_word(str(out)),
+        "days": str(days),
+    }
+    return {
+        Path(f"{name}.service"): templates.SERVICE.substitute(words),
+        Path(f"{name}.conf"): templates.SERVICE_FILES.substitute(words),
+    }
+
+
+def _systemd_word(word: str) -> str:
+    """A word as a unit of systemd has it: '%' and '$' doubled, quoted where it has spaces or quotes."""
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    return f'"{escaped}"' if re.search(r"""[\s"']""", word) else escaped
 
 
 def _trimmed(text: str) -> str:

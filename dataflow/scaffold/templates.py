@@ -201,6 +201,88 @@ def test_every_reading_is_a_message(monkeypatch) -> None:
     assert device.closed
 ''')
 
+PROGRAM = Template('''\
+"""$Title: an operator whose calls are made by a program in C++."""
+
+from __future__ import annotations
+
+from dataflow.messages import Image, Number
+from dataflow.operator import In, Out, Param
+from dataflow.program import Program
+
+
+class $Class(Program):
+    """Measures how bright an image is."""
+
+    command = ("./$stem",)
+    stateless = True
+
+    image: In[Image] = In(doc="what the camera sees")
+    brightness: Out[Number] = Out(doc="mean of all pixels, 0 to 1")
+
+    scale: float = Param(1.0, gt=0, tunable=True, doc="factor on the result")
+''')
+
+PROGRAM_SOURCE = Template("""\
+// The calls of $Title. Build it: c++ -std=c++17 -O2 -o $stem $stem.cpp
+#include "dataflow.hpp"
+
+class $Class : public dataflow::Operator {
+  public:
+    std::vector<dataflow::Message> setup(const dataflow::Parameters &parameters) override {
+        parameter("scale", parameters.at("scale"));
+        return {};
+    }
+
+    void parameter(const std::string &, const std::string &value) override { scale_ = std::stod(value); }
+
+    std::vector<dataflow::Message> process(std::int64_t stamp, const std::vector<dataflow::Message> &inputs) override {
+        const auto &pixels = inputs.at(0).arrays.at(0)->bytes;
+        double sum = 0;
+        for (auto pixel : pixels) sum += pixel;
+        const double value = scale_ * sum / static_cast<double>(pixels.size()) / 255;
+        return {{"brightness", "Number", stamp, {value, std::string()}, {}}};
+    }
+
+  private:
+    double scale_ = 1;
+};
+
+int main() {
+    $Class program;
+    return dataflow::run(program);
+}
+""")
+
+PROGRAM_TEST = Template('''\
+"""Tests of $Title."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import $module
+from dataflow.messages import Image
+from dataflow.testing import play
+from $module import $Class
+
+FOLDER = Path($module.__file__).parent
+
+
+def test_the_mean_of_all_pixels() -> None:
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler is installed here")
+    command = [compiler, "-std=c++17", "-O2", "-o", "$stem", "$stem.cpp"]
+    subprocess.run(command, cwd=FOLDER, check=True, timeout=300)
+    images = [Image(stamp=stamp, frame="camera", data=np.full((4, 6), 51 * stamp, np.uint8)) for stamp in range(6)]
+    played = play($Class(scale=0.5), {"image": images})
+    assert [number.value for number in played["brightness"]] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
+''')
+
 GRAPH = Template("""\
 # $Title: $about
 #
@@ -322,3 +404,36 @@ __pycache__/
 *.egg-info/
 /out/
 """
+
+SERVICE = Template("""\
+# $name, started with the machine. To install it:
+#   sudo cp $name.service /etc/systemd/system/ && sudo cp $name.conf /etc/tmpfiles.d/
+#   sudo systemctl daemon-reload && sudo systemctl enable --now $name
+[Unit]
+Description=dataflow graph $name
+After=network.target
+StartLimitIntervalSec=0
+
+[Service]
+User=$user
+WorkingDirectory=$folder
+RuntimeDirectory=$name
+RuntimeDirectoryMode=0700
+Environment=XDG_RUNTIME_DIR=%t/$name
+ExecStart=$command
+# SIGTERM to the supervisor alone: it ends the others in order, and has up to 60 s to close its files
+KillMode=mixed
+TimeoutStopSec=75
+# a new run after a failure that the graph's restart policies do not cover
+Restart=on-failure
+RestartSec=2
+LimitNOFILE=8192
+
+[Install]
+WantedBy=multi-user.target
+""")
+
+SERVICE_FILES = Template("""\
+# systemd-tmpfiles: deletes recordings of $name older than $days days; a run itself bounds its files
+d $out - - - ${days}d
+""")

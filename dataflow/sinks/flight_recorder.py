@@ -63,7 +63,7 @@ class FlightSink:
         folder.mkdir(parents=True, exist_ok=True)
         self._ring.mkdir(0o700)
         self.length = max(flight.keep // PARTS, SHORTEST)
-        self.slack = 2 * (graph.record.snapshots or 0) + 2 * self.length
+        self.slack = 2 * (graph.record.snapshots if isinstance(graph.record.snapshots, int) else 0) + 2 * self.length
         """Returns how much more than what is to be kept is there: from a state of every operator on."""
         self._clock = 0
         self._first: int | None = None

@@ -19,7 +19,8 @@ class Boxes:
 
     def make(self, label: str) -> tuple[int, ...]:
         """Makes the box of a process that is about to start; nothing for one that needs none."""
-        if not self._live or self._processes[label].sink is not None:
+        process = self._processes.get(label)  # None: the link
+        if not self._live or process is None or process.sink is not None:
             return ()
         self._boxes[label] = make_black_box()
         return (self._boxes[label],)

@@ -19,7 +19,7 @@ def configurations(
 
     `endpoints` are those on which the processes listen.
     """
-    first = next(iter(processes))
+    first = next((label for label, process in processes.items() if process.machine is None), "")
     configs: dict[str, Config] = {}
     for label, process in processes.items():
         common = _common(plan, process, processes)
@@ -27,13 +27,18 @@ def configurations(
             configs[label] = _operators(plan, process, common, endpoints, label == first)
             pairs = pairs_of(plan.graph, processes)
             configs[label][1]["rings_out"] = [
-                (plan.live and processes[taker].sink is None, list(keys))
+                (may_drop(plan, processes, taker), list(keys))
                 for (maker, taker), keys in pairs.items()
                 if maker == label
             ]
         else:
             configs[label] = _sink(plan, process, common)
     return configs
+
+
+def may_drop(plan: RunPlan, processes: Mapping[str, ProcessPlan], taker: str) -> bool:
+    """Returns whether messages may be dropped for a process that takes nothing; a gate always takes."""
+    return plan.live and taker in processes and processes[taker].sink is None
 
 
 def _common(plan: RunPlan, process: ProcessPlan, processes: Mapping[str, ProcessPlan]) -> dict[str, Any]:

@@ -22,6 +22,8 @@ FLIGHT_SETTLES = 0.75
 """Seconds after which the firing records of what a flight recorder is to keep have come: batches wait a quarter of
 one."""
 VIEWER_FILE = "@view"
+LINK = "@link"
+"""The process that carries what passes between this machine and others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,14 @@ class LogPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class Meeting:
+    """The endpoint at which other machines join a run, and the folder of this machine's keys; see `machines.keys`."""
+
+    endpoint: str
+    keys: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class RunPlan:
     """One execution of a graph.
 
@@ -52,6 +62,7 @@ class RunPlan:
       into the recording; `storage`: how its files are split, kept, and who may read them.
     - `live`: time does not wait: every source is read on its own thread, at the pace of the clock, and the operators'
       `live:` policies apply.
+    - `machines`: where the machines that the graph names join; None: everything runs on this one.
     - `faults`: what is to go wrong on purpose, by time (live runs only).
     - `rate`: pace of event time against the clock (1.0 is real time); None: as fast as the graph goes.
     - `paused`: sources, or the recording in their place, wait at their beginning until they are let go on, or step
@@ -69,6 +80,7 @@ class RunPlan:
     view_file: Path | None = None
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     live: bool = False
+    machines: Meeting | None = None
     faults: Iterator[Fault] | None = None
     rate: float | None = None
     paused: bool = False
@@ -107,6 +119,8 @@ class ProcessPlan:
     streams: tuple[str, ...] = ()
     firings: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
+    machine: str | None = None
+    """The machine that it runs on; None: that of the supervisor."""
 
 
 def replaced_in(graph: Graph, log: LogPlan | None) -> set[str]:
@@ -132,8 +146,7 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
 
     streams = set(graph.streams)
     if plan.log is not None:
-        silent = {s for s in streams if graph.streams[s].node in replaced} - set(plan.log.streams)
-        streams -= silent
+        streams -= {s for s in streams if graph.streams[s].node in replaced} - set(plan.log.streams)
 
     made_in = {stream: labels[graph.streams[stream].node] for stream in streams}
     taken_in: dict[str, set[str]] = {stream: set() for stream in streams}
@@ -179,11 +192,23 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
             publish,
             subscribe,
             has_log=bool(replaced & set(nodes)),
+            machine=_machine_of(plan, label, nodes),
         )
     for label, (kind, taken, chosen) in sinks.items():
         process = ProcessPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
         plans[label] = replace(process, firings=firings) if kind == "record" else process
     return plans
+
+
+def _machine_of(plan: RunPlan, label: str, nodes: list[str]) -> str | None:
+    """Returns the machine of a process. Raises ValueError where the placement puts operators of two into it."""
+    if plan.machines is None:
+        return None
+    found = {plan.graph.nodes[node].machine for node in nodes}
+    if len(found) > 1:
+        named = ", ".join(sorted(machine or "this one" for machine in found))
+        raise ValueError(f"process {label!r} would be on several machines ({named}): place its operators apart")
+    return found.pop()
 
 
 def taken_keys(graph: Graph, process: ProcessPlan) -> set[str]:

@@ -58,6 +58,10 @@ def _make(
         sink = SinkConfig(**config)
         make_sink = _recorder if sink.kind == "record" else _viewer_file
         return (LiveSinkProcess if sink.live else SinkProcess)(sink, channel, inbox, make_sink)
+    if kind == "link":
+        from dataflow.machines.hub import Hub, HubConfig
+
+        return Hub(HubConfig(**config), channel, inbox, handed.outgoing)
     from dataflow.process.config import ProcessConfig
     from dataflow.process.operator_process import OperatorProcess
 

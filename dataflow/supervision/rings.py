@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 
 from dataflow.graph.model import Graph
-from dataflow.supervision.plan import ProcessPlan, taken_keys
+from dataflow.supervision.plan import LINK, ProcessPlan, taken_keys
 from dataflow.transport import make_board, make_ring
 
 Pairs = Mapping[tuple[str, str], tuple[str, ...]]
@@ -19,15 +19,28 @@ Pairs = Mapping[tuple[str, str], tuple[str, ...]]
 def pairs_of(graph: Graph, processes: Mapping[str, ProcessPlan]) -> dict[tuple[str, str], tuple[str, ...]]:
     """Returns which processes are linked: the recorder and the like first.
 
-    A process sends in this order: if it is killed between two sends, each message that another process has is recorded.
+    What passes between machines goes through the gates of both. A process sends in this order: if it is killed between
+    two sends, each message that another process has is recorded.
     """
-    found = {}
+    found: dict[tuple[str, str], set[str]] = {}
     for consumer, process in sorted(processes.items(), key=lambda each: each[1].sink is None):
         taken = taken_keys(graph, process)
         for producer, maker in processes.items():
             if producer != consumer and (keys := taken.intersection(maker.publish)):
-                found[producer, consumer] = tuple(sorted(keys))
-    return found
+                for pair in _hops(maker, process):
+                    found.setdefault(pair, set()).update(keys)
+    return {pair: tuple(sorted(keys)) for pair, keys in found.items()}
+
+
+def _hops(maker: ProcessPlan, taker: ProcessPlan) -> list[tuple[str, str]]:
+    if maker.machine == taker.machine:
+        return [(maker.label, taker.label)]
+    return [(maker.label, gate_of(maker.machine)), (gate_of(taker.machine), taker.label)]
+
+
+def gate_of(machine: str | None) -> str:
+    """Returns the label of the gate of a machine; None: that of the supervisor."""
+    return LINK if machine is None else f"{LINK} {machine}"
 
 
 class Rings:

@@ -17,7 +17,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.streams.facts import machine_facts
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
-from dataflow.supervision.core.report import RunReport, Watch
+from dataflow.supervision.core.report import RunFailed, RunReport, Watch
 from dataflow.supervision.early_nursery import EarlyNursery
 from dataflow.supervision.interrupts import interrupts
 from dataflow.supervision.plan import RunPlan
@@ -38,7 +38,14 @@ def run(
     **options: Any,
 ) -> RunReport:
     """Runs a graph's own sources. `controls` may pause and step them, unless the run is live. Further options are the
-    fields of `RunPlan`. Raises `RunFailed`."""
+    fields of `RunPlan`. Raises `RunFailed`; so does a graph that names machines without `machines` (None: all of it
+    runs here)."""
+    named = sorted({node.machine for node in graph.nodes.values() if node.machine is not None})
+    if named and "machines" not in options:
+        raise RunFailed(
+            f"operators are to run on machine {', '.join(named)}: say where machines join (--listen ENDPOINT --keys "
+            "FOLDER), or run all of it here (--here)"
+        )
     warn_of_gap(graph)
     return execute(RunPlan(graph, **options), mode="run", watch=watch, early=early, controls=controls)
 
@@ -100,6 +107,11 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         seeding.FACT: str(seeding.VERSION),
         "threads": str(plan.graph.threads),
         **{f"process of {node}": label for node, label in placed.items()},
+        **{
+            f"machine of {node.name}": node.machine
+            for node in plan.graph.nodes.values()
+            if plan.machines and node.machine
+        },
     }
     facts = machine_facts(environment(plan.graph.threads))
     return {**plan.metadata, **graph_metadata(plan.graph), "dataflow:run": run_facts, **facts}

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import selectors
-import signal
 import sys
 import time
 from collections import deque
@@ -18,26 +17,27 @@ from collections.abc import Callable
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.threads import environment
 from dataflow.process.awake import LONGEST_STEP, AwakeClock
-from dataflow.process.channel import ChannelClosed
 from dataflow.process.log_pipe import heard, shown
 from dataflow.supervision.black_boxes import Boxes
+from dataflow.supervision.children import Children
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.console import Console
 from dataflow.supervision.core import commands, events
 from dataflow.supervision.core.compose import core_of
 from dataflow.supervision.core.report import RunFailed, RunReport, Status
 from dataflow.supervision.early_nursery import EarlyNursery
-from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed, adopting
-from dataflow.supervision.plan import RunPlan, process_plans
-from dataflow.supervision.rings import Rings, pairs_of
+from dataflow.supervision.nursery import Nursery, adopting
+from dataflow.supervision.plan import LINK, RunPlan, process_plans
+from dataflow.supervision.remote import Remote
+from dataflow.supervision.rings import Pairs, Rings, pairs_of
 from dataflow.transport import registry, reserve_endpoints
 from dataflow.transport.log_file import LogFile
 
 TICK = 0.05
+PART_WITHIN = 4.0
+"""Seconds for which other machines are told that the run is over."""
 PAUSE = 1.0
 """Seconds for which the supervisor did not run, at once, that are worth saying."""
-NOT_READING_AFTER = 1.0
-"""Seconds for which a process may leave what was sent to it, before the core is notified."""
 
 
 class Supervisor:
@@ -53,16 +53,15 @@ class Supervisor:
         self.plan = plan
         self._early = early
         self._processes = process_plans(plan)
-        self._reserved = reserve_endpoints(len(self._processes))
-        self._endpoints = dict(zip(self._processes, self._reserved.endpoints, strict=True))
+        labels = [*self._processes, *([LINK] if any(p.machine for p in self._processes.values()) else ())]
+        self._reserved = reserve_endpoints(len(labels))
+        self._endpoints = dict(zip(labels, self._reserved.endpoints, strict=True))
         self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
         self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))
-        self._children: dict[str, Child] = {}
-        self._boxes = Boxes(plan.graph, self._processes, live=plan.live)
-        self._taken_at: dict[str, float] = {}  # label → when the process last took what was queued for it
         self._announced = contextlib.ExitStack()
         self._over: commands.Over | None = None
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._remote: Remote | None = None
         self._stops = 0
         self._asked: deque[events.PlaybackAsked | events.TriggerAsked] = deque()
 
@@ -91,9 +90,7 @@ class Supervisor:
 
     def pid_of(self, label: str) -> int:
         """Returns the process number of a process of the run that is there."""
-        pid = self._children[label].pid
-        assert pid is not None
-        return pid
+        return self._here.pid_of(label)
 
     def run(self) -> RunReport:
         """Runs to the end. Raises `RunFailed` with the first cause; no process is left in either case."""
@@ -101,23 +98,33 @@ class Supervisor:
             stack.callback(self._close_pipe)
             stack.callback(self._reserved.close)
             stack.enter_context(self._announced)
-            self._rings = self._make_rings()
-            stack.callback(self._rings.close)
+            pairs = pairs_of(self.plan.graph, self._processes)
+            here = [label for label in self._endpoints if label == LINK or self._processes[label].machine is None]
+            rings = self._make_rings(here, pairs)
+            stack.callback(rings.close)
             self._log_file = stack.enter_context(contextlib.closing(LogFile()))
             self._words = Console(self._on_output)
             stack.callback(self._words.close)
             self._selector = stack.enter_context(selectors.DefaultSelector())
-            self._nursery = self._start_nursery()
-            stack.callback(self._bury)
+            self._clock = AwakeClock()
+            boxes = Boxes(self.plan.graph, self._processes, live=self.plan.live)
+            self._here = Children(
+                self._start_nursery(), self._selector, rings, boxes, self._clock, self._feed_here, self._heard
+            )
+            stack.callback(self._here.bury)
+            self._selector.register(self._woken, selectors.EVENT_READ, None)
+            if LINK in self._endpoints:
+                self._meet(pairs)
+                stack.callback(self._part)
             over = self._loop()
         if over.failure is not None:
             raise over.failure
         assert over.report is not None
         return over.report
 
-    def _make_rings(self) -> Rings:
+    def _make_rings(self, here: list[str], pairs: Pairs) -> Rings:
         try:
-            return Rings(list(self._processes), pairs_of(self.plan.graph, self._processes))
+            return Rings(here, {pair: keys for pair, keys in pairs.items() if set(pair) <= set(here)})
         except OSError as error:
             raise RunFailed(f"cannot link the processes: {error}; raise the limit of open files (ulimit -n)") from error
 
@@ -130,10 +137,47 @@ class Supervisor:
         except OSError as error:
             raise RunFailed(f"cannot start a process: {error}") from error
 
+    def _meet(self, pairs: Pairs) -> None:
+        """Waits (bounded) until the other machines of the graph are there and have what they need."""
+        meeting = self.plan.machines
+        assert meeting is not None
+        self._remote = Remote(
+            self.plan,
+            meeting,
+            self._processes,
+            pairs,
+            self._endpoints,
+            self._here,
+            self._feed,
+            self._heard,
+            self.core.run.note,
+        )
+        self.core.run.note(f"waits for {', '.join(self._remote.waits_for)}; on each: {self._remote.advice()}")
+        deadline = self._clock() + self.plan.start_timeout
+        while self._remote.waits_for:
+            self.status.waiting = self._remote.waits_for
+            self._wait(TICK)
+            self._here.flush()
+            if self._stops:
+                raise RunFailed("stopped while other machines were awaited", interrupted=True)
+            if self._clock() > deadline:
+                raise self._remote.not_ready(self.plan.start_timeout)
+
+    def _part(self) -> None:
+        """Lets the other machines go (bounded)."""
+        if self._remote is None:
+            return
+        self._remote.close()
+        deadline = self._clock() + PART_WITHIN
+        while not self._remote.ended and self._clock() < deadline:
+            self._here.flush()
+            self._wait(TICK)
+
+    def _hand(self, label: str) -> Children | Remote:
+        """Returns what starts, reaches and ends a process."""
+        return self._remote if self._remote is not None and label in self._remote.machine_of else self._here
+
     def _loop(self) -> commands.Over:
-        self._clock = AwakeClock()
-        self._selector.register(self._woken, selectors.EVENT_READ, None)
-        self._selector.register(self._nursery, selectors.EVENT_READ, self._nursery)
         interrupted: BaseException | None = None
         seen_stops = 0
         self._feed(events.Begin())
@@ -149,7 +193,7 @@ class Supervisor:
                 if self._clock() >= due:
                     due = self._clock() + TICK
                     self._tick()
-                self._flush()
+                self._here.flush()
             except BaseException as error:  # Ctrl-C without a handler, or a fault of the core: end in order, once
                 if interrupted is not None:
                     raise
@@ -165,83 +209,31 @@ class Supervisor:
         for command in self.core.handle(event, events.Moment(self._clock(), time.time())):
             self._do(command)
 
+    def _feed_here(self, event: events.Event) -> None:
+        """Feeds an event of this machine's processes; the link's are about others."""
+        if self._remote is None or getattr(event, "label", "") != LINK:
+            self._feed(event)
+            return
+        try:
+            self._remote.take(event)
+        except RunFailed as failure:
+            if self.core.run.release is None and self._remote.waits_for:
+                raise
+            self._feed(events.Aborted(str(failure)))
+
     def _wait(self, timeout: float) -> None:
         """Waits for the next events and feeds them, at most one look at each process."""
         for key, mask in self._selector.select(timeout):
             if key.data is None:
                 with contextlib.suppress(BlockingIOError):
                     os.read(self._woken, 4096)
-            elif key.data is self._nursery:
-                self._hear_nursery()
             else:
-                label, what = key.data
-                if what == "words":
-                    self._read_words(label)
-                elif mask & selectors.EVENT_READ:
-                    self._read_channel(label)
-
-    def _hear_nursery(self) -> None:
-        try:
-            news = self._nursery.receive()
-        except NurseryFailed as failure:
-            self._selector.unregister(self._nursery)
-            self._feed(events.Aborted(str(failure)))
-            return
-        for each in news:
-            if isinstance(each, End):
-                self._ended(self._label(each.child), each.code)
-            else:
-                self._feed(events.LeftBehind(tuple(map(self._label, each.children)), each.processes))
-
-    def _label(self, process: Child) -> str:
-        return next(label for label, child in self._children.items() if child is process)
-
-    def _ended(self, label: str, code: int | None) -> None:
-        """A process has ended: what it has said and printed until then comes first."""
-        child = self._children[label]
-        with contextlib.suppress(ChannelClosed):
-            while self._read_messages(label, child):
-                pass
-        self._read_words(label)
-        self._unregister(child)
-        for line in child.close():
-            self._heard(label, line)
-        del self._children[label]
-        self._taken_at.pop(label, None)
-        if (remains := self._boxes.read(label)) is not None:
-            self._feed(events.Remained(label, remains))
-        self._feed(events.Died(label, code))
-
-    def _read_channel(self, label: str) -> None:
-        child = self._children.get(label)
-        if child is None:
-            return
-        try:
-            self._read_messages(label, child)
-        except ChannelClosed:
-            with contextlib.suppress(KeyError):
-                self._selector.unregister(child.channel)
-            self._feed(events.HungUp(label))
-
-    def _read_messages(self, label: str, child: Child) -> bool:
-        """Feeds what a process has said; False when there was nothing."""
-        any_read = False
-        for kind, fields in child.channel.receive():
-            any_read = True
-            self._feed(events.Said(label, kind, fields))
-        return any_read
-
-    def _read_words(self, label: str) -> None:
-        child = self._children.get(label)
-        if child is None or child.words is None:
-            return
-        descriptor = child.words
-        for line in child.lines():
-            self._heard(label, line)
-        if child.words is None:
-            self._selector.unregister(descriptor)
+                self._here.look(key, mask)
 
     def _heard(self, label: str, line: str) -> None:
+        if label == LINK:
+            self._words.put(label, line)
+            return
         said = heard(line, label, self._processes[label].nodes)
         self._log_file.add(said)
         first, *more = shown(said)
@@ -254,35 +246,23 @@ class Supervisor:
     def _tick(self) -> None:
         if (lost := self._clock.take_lost()) > PAUSE:
             self._feed(events.Paused(lost + LONGEST_STEP))
-        now, deserted = self._clock(), not self._nursery_lives
-        for label, child in list(self._children.items()):
-            stuck = now - self._taken_at.get(label, now)
-            if stuck > NOT_READING_AFTER or child.channel.overflowed:
-                waiting, overflowed = child.channel.waiting, child.channel.overflowed
-                self._feed(events.NotReading(label, stuck, waiting, overflowed))
-            if deserted and child.dead:
-                self._ended(label, child.bury())
+        self._here.tick()
         self._feed(events.Tick())
-
-    @property
-    def _nursery_lives(self) -> bool:
-        return self._nursery in {key.fileobj for key in self._selector.get_map().values()}
 
     # Commands
 
     def _do(self, command: commands.Command) -> None:
         match command:
             case commands.Send(label, kind, fields, replaces):
-                if (child := self._children.get(label)) is not None:
-                    child.channel.send(kind, dict(fields), replaces=replaces)
+                self._hand(label).send(label, kind, dict(fields), replaces=replaces)
             case commands.Spawn(label):
-                self._spawn(label)
+                self._hand(label).spawn(label)
             case commands.Signal(label, number):
-                if (child := self._children.get(label)) is not None:
-                    child.signal(number)
+                self._hand(label).signal(label, number)
             case commands.Announce(labels):
                 graph = self.plan.graph
-                endpoints = [self._endpoints[label] for label in labels]
+                reached = [LINK] if self._remote is not None else labels
+                endpoints = [self._endpoints[label] for label in reached]
                 self._announced.enter_context(
                     registry.register(graph.name, graph.namespace, endpoints, graph=graph.to_json())
                 )
@@ -291,58 +271,7 @@ class Supervisor:
             case commands.Over():
                 self._over = command
 
-    def _spawn(self, label: str) -> None:
-        try:
-            box = self._boxes.make(label)
-            child = self._nursery.spawn((*self._rings.handed(label), *box))
-        except (NurseryFailed, OSError) as failure:
-            self._feed(events.Aborted(str(failure)))
-            return
-        self._children[label] = child
-        self._taken_at[label] = self._clock()
-        self._selector.register(child.channel, selectors.EVENT_READ, (label, "channel"))
-        assert child.words is not None
-        self._selector.register(child.words, selectors.EVENT_READ, (label, "words"))
-
-    def _flush(self) -> None:
-        """Sends what processes take; who takes nothing is looked at again when it does."""
-        now = self._clock()
-        for label, child in self._children.items():
-            channel = child.channel
-            if not channel.waiting:
-                self._taken_at[label] = now
-                continue
-            try:
-                if channel.flush():
-                    self._taken_at[label] = now
-            except ChannelClosed:
-                continue  # its end is read, with its cause
-            self._watch_for_room(label, child)
-
-    def _watch_for_room(self, label: str, child: Child) -> None:
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if child.channel.waiting else 0)
-        key = self._selector.get_map().get(child.channel)
-        if key is not None and key.events != wanted:
-            self._selector.modify(child.channel, wanted, (label, "channel"))
-
     # End
-
-    def _unregister(self, child: Child) -> None:
-        for thing in (child.channel, child.words):
-            if thing is not None:
-                with contextlib.suppress(KeyError):
-                    self._selector.unregister(thing)
-
-    def _bury(self) -> None:
-        """Leaves no process behind, however the run has ended."""
-        for child in self._children.values():
-            child.signal(signal.SIGKILL)
-        self._nursery.close()
-        for child in self._children.values():
-            self._unregister(child)
-            child.close()
-        self._children.clear()
-        self._boxes.close()
 
     def _close_pipe(self) -> None:
         os.close(self._woken)

@@ -161,7 +161,7 @@ class Bus:
 
     def peers(self) -> tuple[str, ...]:
         """Returns the ids of the buses that this one is connected to now."""
-        return tuple(sorted(str(z) for z in self.session.info.peers_zid()))
+        return tuple(sorted(str(z) for z in (*self.session.info.peers_zid(), *self.session.info.routers_zid())))
 
     def counters(self) -> dict[str, int]:
         """Returns what was moved so far, by the names of `counters.NAMES`."""

@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ class RunningGraph:
     endpoints: tuple[str, ...]
     started: float
     graph: Mapping[str, Any]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of Zenoh by which a graph of another machine is reached; empty for one of this machine."""
 
 
 def registry_folder() -> Path:

@@ -12,25 +12,64 @@ import rerun as rr
 from dataflow.messages.geometry import split_matrix
 from dataflow.video.decoder import PacketDecoder
 from dataflow.view import colors
-from dataflow.view.frames import Attach, Change, Detach, FrameTree, NewRoot, Rank
+from dataflow.view.frames import Attach, Change, Detach, FrameTree, Matrix, NewRoot, Rank
 from dataflow.view.layout import Layout, is_truth
-from dataflow.view.unshown import Offer, Unshown
 from dataflow.view.viewpoint import Vector, Viewpoint
 
 SCENE = "/scene"
 """Entity of the drawing frame: the origin of the 3-D view."""
-
 FRAMES = "/frames"
 """Entities of the frames: `/frames/<name>`."""
-
 TIMELINE = "stamp"
 """The one timeline: event time."""
-
 VIEWER_LOG = "/viewer/log"
 """Entity of what the viewer itself has to say."""
-
 ASSUMPTION_GRACE = 1_000_000_000
 """Event time (ns) for which a frame may stay unplaced before the viewer reports it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """The place of a frame by a stream that is not shown: `T_parent_child` (4×4) in `parent`."""
+
+    parent: str
+    T_parent_child: Matrix
+    stream: str
+    rank: Rank
+    stamp: int
+    static: bool
+
+
+@dataclass(slots=True)
+class Unshown:
+    """The newest offer for each frame of streams that are not shown; an estimate goes before truth.
+
+    One is taken where something shown needs it and nothing shown gives it: a hidden stream must not take the frames of
+    what is shown with it, nor bring its frames into the picture or win one from a stream that is shown.
+    """
+
+    _offers: dict[str, Offer] = field(default_factory=dict)
+    _wanted: dict[str, int] = field(default_factory=dict)
+
+    def offer(self, child: str, offer: Offer) -> None:
+        held = self._offers.get(child)
+        if held is None or held.stream == offer.stream or offer.rank < held.rank:
+            self._offers[child] = offer
+
+    def needed(self, tree: FrameTree, child: str, stamp: int) -> Offer | None:
+        """Returns the offer that is to place `child` now, if any.
+
+        What moves is taken a message later than it is first wanted: what is shown and of the same stamp may place it.
+        """
+        offer = self._offers.get(child)
+        if offer is None or child not in tree:
+            return None
+        owner = tree.owner(child)
+        if owner == offer.stream:
+            return offer
+        if owner is not None:
+            return None
+        return offer if offer.static or self._wanted.setdefault(child, stamp) < stamp else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -295,7 +295,49 @@ def processes() -> str:
     return drawing.svg()
 
 
-PICTURES = {"time.svg": time, "arrival.svg": arrival, "firing.svg": firing, "processes.svg": processes}
+def machines() -> str:
+    drawing = Drawing(1000, 400)
+    drawing.text(20, 30, "One graph on two machines", size=17)
+    for x, width, name in ((20, 380, "robot: dataflow join"), (520, 460, "laptop: dataflow run")):
+        drawing.box(x, 50, width, 330, FAINT, dashes="6 4")
+        drawing.text(x + 16, 76, name, FAINT)
+    drawing.box(40, 100, 150, 50, INK, fill="#eef2fb")
+    drawing.text(115, 130, "agent", anchor="middle")
+    drawing.box(780, 100, 170, 50, INK, fill="#eef2fb")
+    drawing.text(865, 130, "supervisor", anchor="middle")
+    for x, y, name in ((40, 230, "camera"), (40, 310, "imu"), (780, 230, "odometry")):
+        drawing.box(x, y, 150, 46, BLUE)
+        drawing.text(x + 75, y + 28, name, BLUE, anchor="middle")
+    drawing.box(780, 310, 150, 46, GREEN)
+    drawing.text(855, 338, "@recorder", GREEN, anchor="middle")
+    for x, label in ((270, "gate"), (560, "@link")):
+        drawing.box(x, 100, 110, 256, VIOLET)
+        drawing.text(x + 55, 180, label, VIOLET, anchor="middle")
+    drawing.text(615, 200, "gate, keys", FAINT, size=12, anchor="middle")
+    drawing.line(190, 125, 270, 125, FAINT, dashes="5 4", arrow=True)
+    drawing.line(670, 125, 780, 125, FAINT, dashes="5 4", arrow=True)
+    drawing.line(115, 150, 115, 230, FAINT, dashes="5 4")
+    drawing.text(200, 116, "control", FAINT, size=12)
+    drawing.text(690, 116, "control", FAINT, size=12)
+    for y in (253, 333):
+        drawing.line(190, y, 270, y, arrow=True)
+        drawing.line(670, y, 780, y, arrow=True)
+    drawing.text(206, 245, "ring", size=12)
+    drawing.text(700, 245, "ring", size=12)
+    drawing.line(380, 230, 560, 230, VIOLET, width=5)
+    drawing.text(470, 216, "Zenoh, TLS", VIOLET, anchor="middle")
+    drawing.text(470, 252, "numbered frames,", FAINT, size=12, anchor="middle")
+    drawing.text(470, 268, "each stream once", FAINT, size=12, anchor="middle")
+    return drawing.svg()
+
+
+PICTURES = {
+    "time.svg": time,
+    "arrival.svg": arrival,
+    "firing.svg": firing,
+    "processes.svg": processes,
+    "machines.svg": machines,
+}
 
 if __name__ == "__main__":
     for name, draw in PICTURES.items():

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import FINDING, Counts, Duration, In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, Duration, In, Operator, Out, Param, Sampled
 from operators.cloud.vertical import Vertical, accelerated, find_vertical, held
 from operators.geometry.extrinsics import transform_between, with_transform
 from operators.status import counted_status
@@ -169,9 +169,12 @@ class CameraMount(Operator):
         return {"base_extrinsics": made, "status": counted_status("camera_mount", cloud.stamp, text, level, figures)}
 
     def summary(self) -> Mapping[str, float | int | str]:
-        """Returns counts and how the camera looked; and the finding, where the given base is wrong."""
-        found = {FINDING: self.state.finding} if self.state.finding else {}
-        return {**self.state.counts, **self.state.figures, **found}
+        """Returns counts and how the camera looked."""
+        return {**self.state.counts, **self.state.figures}
+
+    def finding(self) -> str:
+        """Returns by how much the given base is wrong."""
+        return self.state.finding
 
 
 def _digest(extrinsics: Transforms | None) -> bytes:

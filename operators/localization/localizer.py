@@ -27,20 +27,69 @@ from dataflow.messages import (
     Pose,
     Transforms,
 )
+from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
 from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.localization.dead_reckoning import DeadReckoning, vertical_rate
-from operators.localization.estimate import Estimate, flat, planar
+from operators.localization.estimate import Estimate, apart, flat, planar
 from operators.localization.likelihood_field import LikelihoodField
 from operators.localization.map_file import read_map
 from operators.localization.monte_carlo import CloudConfig
 from operators.localization.motion import DriveNoise
 from operators.localization.reading import MODALITIES, Surroundings, Unusable, observation
-from operators.localization.status import status_of
+from operators.localization.sensor_weights import CONSISTENT
 from operators.localization.weighted_cloud import WeightedCloud
+from operators.status import Row, status_of_rows
 
+_LEVELS = {
+    "localised": Level.OK,
+    "ambiguous": Level.WARN,
+    "searching": Level.WARN,
+    "waiting": Level.WARN,
+    "lost": Level.ERROR,
+}
 Array = NDArray[np.float64]
+
+
+def written(pose: Array) -> str:
+    """Returns a pose (3,) as text."""
+    x, y, yaw = pose
+    return f"{x:.3f} {y:.3f} {yaw:.3f}"
+
+
+def status_of(
+    stamp: int,
+    fused: Estimate,
+    filter: WeightedCloud,
+    modalities: Mapping[str, WeightedCloud],
+    ignored: Mapping[str, int],
+) -> Diagnostics:
+    """Returns a status for the filter, one for every sensor, and one for every modality beside the fused estimate."""
+    figures = {**filter.figures(), "share in one place": f"{fused.share:.2f}", "injected": str(filter.injected)}
+    if fused.other is not None:
+        figures |= {"other place": written(fused.other), "likelier than the other": f"{filter.competing.lead:.1f} nats"}
+    figures |= {f"ignored, {reason}": str(count) for reason, count in sorted(ignored.items())}
+    said = "ambiguous: another place explains as much" if fused.other is not None else fused.word
+    rows: list[Row] = [("filter", said, _LEVELS[fused.word], figures)]
+    counts = filter.sensor_weights.counts(stamp)
+    for sensor, fit in sorted(filter.fits().items()):
+        ratio, count = filter.sensor_weights.ratio(sensor), counts.get(sensor, 1.0)
+        text = "consistent" if ratio <= CONSISTENT else "innovations larger than usual"
+        if count < 1:
+            text = "disagrees with the others and counts less"
+        level = Level.OK if ratio <= CONSISTENT else Level.WARN
+        rows.append(
+            (sensor, text, level, {"counts": f"{count:.3f}", "innovations": f"{ratio:.2f}", "fit": f"{fit:.2f}"})
+        )
+    for name, vote in modalities.items():
+        if vote.begun:
+            own = vote.estimate()
+            off = apart(own, fused)
+            text = "contradicts the fused estimate" if off else own.word
+            places = {"pose": written(own.mean)} | ({} if own.other is None else {"other place": written(own.other)})
+            rows.append((f"{name} alone", text, Level.WARN if off else Level.OK, places))
+    return status_of_rows(stamp, rows)
 
 
 @dataclass(kw_only=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import cv2
@@ -11,7 +10,7 @@ import numpy as np
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Message, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
-from dataflow.operator import FINDING, Counts, Duration, In, Operator, Out, Param, Sampled
+from dataflow.operator import Counts, Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between, with_transform
 from operators.monitoring.edge_alignment import Array, Correction, EdgeAlignment, Shift, rims
@@ -116,13 +115,12 @@ class ColorDepthCheck(Operator):
         """The clock of a stream began anew."""
         self.state.next = 0
 
-    def summary(self) -> Mapping[str, int | str]:
-        """Returns the counts; and the finding, where a good part of the pairs did not fit or the extrinsics changed."""
-        often = self.state.counts["off"] >= max(_PAIRS, _OFTEN * self.state.counts["pairs"])
-        finding = self.state.finding if often else ""
+    def finding(self) -> str:
+        """Returns what would put the cameras right, where a good part of the pairs did not fit, or what was changed."""
         if self.state.counts["corrections"]:
-            finding = f"edges of colour and depth did not fit; {_moved(invert(self.state.change))}"
-        return {**self.state.counts, **({FINDING: finding} if finding else {})}
+            return f"edges of colour and depth did not fit; {_moved(invert(self.state.change))}"
+        often = self.state.counts["off"] >= max(_PAIRS, _OFTEN * self.state.counts["pairs"])
+        return self.state.finding if often else ""
 
     def _status(self, stamp: int, info: CameraInfo) -> Diagnostics:
         focal = float(info.K[0, 0])

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError
+from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError, read_image
 
 _TRAINING, _VALIDATION = ("train", "training"), ("val", "valid", "validation")
 _SHARE = 0.15
@@ -24,10 +23,7 @@ class LabelledImage:
 
     def read(self) -> NDArray[np.uint8]:
         """Pixels (H, W, 3), RGB. Raises DataError."""
-        found = cv2.imread(str(self.file), cv2.IMREAD_COLOR_RGB)
-        if found is None:
-            raise DataError(f"{self.file} cannot be read as an image")
-        return np.asarray(found, np.uint8)
+        return np.asarray(read_image(self.file), np.uint8)
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,9 @@ def show(
         str | None, typer.Option("--history", metavar="NODE", help="What happened to a node, such as 'mug 12', so far.")
     ] = None,
     stream: Annotated[str | None, typer.Option(help="The stream of the graph, where there are several.")] = None,
-    nodes: Annotated[bool, typer.Option("--nodes", help="List every node with position, size and relations.")] = False,
+    nodes: Annotated[
+        bool, typer.Option("--nodes", help="List nodes with position, size, tracks and relations.")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print nodes, relations and matches as JSON.")] = False,
     export: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Write it for Spark-DSG, which Hydra's tools open.")
@@ -236,7 +238,7 @@ def _show(graph: SceneGraph, since: float) -> None:
     out, names = Console(), graph.names()
     scores = graph.relation_scores
     table = Table(title=f"{graph.count} nodes at {since:.1f} s in {graph.frame}", title_justify="left")
-    for column in ("node", "score", "position, m", "size, m", "relations"):
+    for column in ("node", "score", "position, m", "size, m", "tracks", "relations"):
         table.add_column(column)
     for k in range(graph.count):
         held = [
@@ -246,5 +248,5 @@ def _show(graph: SceneGraph, since: float) -> None:
         ]
         place, size = (", ".join(f"{v:.2f}" for v in row) for row in (graph.positions[k], graph.sizes[k]))
         score = "" if graph.scores is None else f"{graph.scores[k]:.2f}"
-        table.add_row(names[k], score, place, size, "; ".join(held))
+        table.add_row(names[k], score, place, size, ", ".join(map(str, graph.tracks_of(k))), "; ".join(held))
     out.print(table)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError, origin_of, read_utf8
+from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError, origin_of, read_image, read_utf8
 
 VOID = 255
 _MASKS = ("masks", "annotations", "labels")
@@ -26,11 +25,11 @@ class MaskedImage:
 
     def pixels(self) -> NDArray[np.uint8]:
         """Pixels (H, W, 3), RGB. Raises DataError."""
-        return _read(self.image, cv2.IMREAD_COLOR_RGB)
+        return read_image(self.image)
 
     def read(self, classes: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Pixels (H, W, 3), RGB, and class ids (H, W). Raises DataError."""
-        pixels, mask = self.pixels(), _read(self.mask, cv2.IMREAD_UNCHANGED)
+        pixels, mask = self.pixels(), read_image(self.mask, cv2.IMREAD_UNCHANGED)
         if mask.ndim != 2 or mask.dtype != np.uint8:
             raise DataError(f"{self.mask} is {mask.dtype}{list(mask.shape)}; a mask is an 8-bit grey PNG of class ids")
         if mask.shape != pixels.shape[:2]:
@@ -76,13 +75,6 @@ def read_segmentation_data(folder: Path, seed: int = 0) -> SegmentationData:
     if not names or not pairs:
         raise DataError(f"{folder} has {len(names)} classes in classes.txt and {len(pairs)} images in images/")
     return _divided(folder, names, pairs, seed)
-
-
-def _read(file: Path, how: int) -> NDArray[Any]:
-    found = cv2.imread(str(file), how)
-    if found is None:
-        raise DataError(f"{file} cannot be read as an image")
-    return found
 
 
 def _mask(place: Path) -> Path:

@@ -13,24 +13,22 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from operators.learning.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
-from operators.learning.backbone import BACKBONES, Backbone, load_backbone
+from operators.learning.backbone import BACKBONES, load_backbone
 from operators.learning.export import export_network
+from operators.learning.image_task import ImageTask
 from operators.learning.network_weights import begin_with, fitting_facts, sample_images
 from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
 from operators.segmentation.network import WIDEST, DeployedSegmenter, ScoringSegmenter, SegmentationNetwork, enlarged
 from operators.segmentation.score import confusion, mean_iou
 from operators.segmentation.scores import MOST_CLASSES
-from operators.weights.network_file import TRAINED_ON
 
-KIND = "segmenter"
-MULTIPLE = 16
 _MEASURED = 4  # images
 
 
-class SegmenterTask:
+class SegmenterTask(ImageTask[SegmentationData]):
     """Trains a SegmentationNetwork of input `size` (width, height; multiples of 16) on images with masks."""
 
-    kind = KIND
+    kind, step = "segmenter", 16
 
     def __init__(
         self,
@@ -43,49 +41,29 @@ class SegmenterTask:
         architecture: str = "mobilenetv2",
         backbone: Path | None = None,
     ) -> None:
-        if any(extent % MULTIPLE or extent <= 0 for extent in size):
-            raise ValueError(f"the input's width and height must be multiples of {MULTIPLE}, got {size[0]}x{size[1]}")
-        torch.manual_seed(seed)
-        self.data, self.size, self.width, self.architecture = data, size, width, architecture
-        self.variation = Variation() if variation is None else variation
-        self.segmenter = SegmentationNetwork(len(data.classes), backbone=BACKBONES[architecture](width))
+        super().__init__(data, size, seed, variation)
+        self.width, self.architecture = width, architecture
+        self.network = SegmentationNetwork(len(data.classes), backbone=BACKBONES[architecture](width))
+        self.backbone = self.network.backbone
         self.class_weights = class_weights(data)
         if backbone is not None:
-            load_backbone(self.segmenter.backbone, backbone)
-
-    @property
-    def network(self) -> nn.Module:
-        return self.segmenter
-
-    @property
-    def backbone(self) -> Backbone:
-        return self.segmenter.backbone
-
-    @property
-    def samples(self) -> int:
-        return len(self.data.training)
+            load_backbone(self.backbone, backbone)
 
     def begin_with(self, file: Path) -> None:
         """Begins with the weights of a network file. Raises `TrainingFileError` where they do not fit."""
         self.check(file)
-        begin_with(self.segmenter, file, sample_images(self))
+        begin_with(self.network, file, sample_images(self))
 
     def check(self, file: Path) -> None:
         """Raises `TrainingFileError` for a network file of another kind, architecture, or of other classes."""
-        fitting_facts(file, kind=KIND, architecture=self._name, classes=list(self.data.classes))
+        fitting_facts(file, kind=self.kind, architecture=self._name, classes=list(self.data.classes))
 
     @property
     def _name(self) -> str:
         return f"{self.architecture}-{self.width:g} decoder"
 
     def description(self) -> dict[str, Any]:
-        return {
-            "classes": list(self.data.classes),
-            "size": list(self.size),
-            "width": self.width,
-            "architecture": self.architecture,
-            "images": self.samples,
-        }
+        return self._description(width=self.width, architecture=self.architecture)
 
     def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> tuple[Tensor, Tensor]:
         views = [self._view(self.data.training[k], rng) for k, rng in zip(samples, rngs, strict=True)]
@@ -94,7 +72,7 @@ class SegmenterTask:
 
     def loss(self, batch: tuple[Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
         images, masks = batch
-        return self.loss_of(self.segmenter(images.to(device).contiguous(memory_format=torch.channels_last)), masks)
+        return self.loss_of(self.network(images.to(device).contiguous(memory_format=torch.channels_last)), masks)
 
     def loss_of(self, scores: Tensor, masks: Tensor) -> dict[str, Tensor]:
         """The parts of the loss of what the network answered to images with these `masks` (N, H, W)."""
@@ -118,16 +96,7 @@ class SegmenterTask:
         return {"score": score, "miou": score}
 
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
-        described = {
-            "kind": KIND,
-            "architecture": self._name,
-            "classes": list(self.data.classes),
-            "width": self.size[0],
-            "height": self.size[1],
-            "training_images": self.samples,
-            **({TRAINED_ON: self.data.origin} if self.data.origin else {}),
-            **facts,
-        }
+        described = self._facts(self._name, facts, self.data.origin)
         if len(self.data.classes) <= MOST_CLASSES:
             step = self._step(network)
             export_network(

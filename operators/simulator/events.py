@@ -5,36 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from operators.simulator.settings import (
-    ColorCamera,
-    DepthCamera,
-    Gnss,
-    Inertial,
-    Landmarks,
-    Lidar,
-    Magnetometer,
-    Radar,
-    Sensor,
-    StereoRig,
-    Wheels,
-)
+from operators.simulator import settings
 
-SENSORS: dict[str, type[Sensor]] = {
-    "color_camera": ColorCamera,
-    "depth_camera": DepthCamera,
-    "stereo": StereoRig,
-    "lidar": Lidar,
-    "inertial": Inertial,
-    "magnetometer": Magnetometer,
-    "wheels": Wheels,
-    "radar": Radar,
-    "landmarks": Landmarks,
-    "gnss": Gnss,
-}
+SENSORS: dict[str, type[settings.Sensor]] = get_type_hints(settings.Sensors)
 
 FIXED = frozenset({
     "rate", "phase", "outages", "width", "height", "focal", "focal_error", "mount", "offset", "rotation", "baseline",
@@ -96,7 +73,7 @@ class Kidnap(_Event):
     ahead: float = Field(gt=0, lt=1, description="how far, as a share of the round")
 
 
-S = TypeVar("S", bound=Sensor)
+S = TypeVar("S", bound=settings.Sensor)
 
 
 class FaultPlan:
@@ -104,7 +81,7 @@ class FaultPlan:
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self._faults = [(fault, fault.values()) for fault in faults]
-        self._made: dict[tuple[str, tuple[int, ...]], Sensor] = {}
+        self._made: dict[tuple[str, tuple[int, ...]], settings.Sensor] = {}
 
     def at(self, name: str, sensor: S, t: float) -> S:
         """A sensor as it is at a time; where faults overlap, the later in the list decides."""

@@ -36,24 +36,9 @@ from dataflow.messages import (
     WheelTicks,
 )
 from dataflow.operator import Duration, Out, Param, Source
+from operators.simulator import settings
 from operators.simulator.events import SENSORS, Fault, FaultPlan, Kidnap, Lighting, changes, level_at
 from operators.simulator.sensors.schedule import Tick, generator, merged, ticks, ticks_at
-from operators.simulator.settings import (
-    ColorCamera,
-    DepthCamera,
-    Gnss,
-    Inertial,
-    Landmarks,
-    Lidar,
-    Magnetometer,
-    Motion,
-    Radar,
-    Sensor,
-    Sensors,
-    StereoRig,
-    Truth,
-    Wheels,
-)
 
 if TYPE_CHECKING:
     from operators.simulator.sensors.rig import Rig
@@ -124,21 +109,23 @@ class SimulatedRobot(Source):
     movers: bool = Param(True, doc="people, balls and robots move; otherwise there are none")
     people: int = Param(2, ge=2, le=4, doc="persons among the movers; beyond two, they choose among drinks and seats")
     threads: int = Param(1, ge=1, le=64, doc="threads that cast rays; results do not depend on it")
-    color_camera: ColorCamera = Param(ColorCamera(), doc="the colour camera")
-    depth_camera: DepthCamera = Param(DepthCamera(), doc="the depth camera")
-    stereo: StereoRig = Param(StereoRig(), doc="the stereo pair")
-    lidar: Lidar = Param(Lidar(), doc="the rotating laser scanner")
-    inertial: Inertial = Param(Inertial(), doc="the inertial measurement unit")
-    magnetometer: Magnetometer = Param(Magnetometer(), doc="the magnetometer")
-    wheels: Wheels = Param(Wheels(), doc="encoders and wheel odometry")
-    radar: Radar = Param(Radar(), doc="the radar")
-    landmarks: Landmarks = Param(Landmarks(), doc="the sensor that recognises landmarks")
-    gnss: Gnss = Param(Gnss(), doc="the satellite receiver")
-    motion: Motion = Param(Motion(), doc="how the body is shaken: bumps of the floor, the sway of a hand")
+    color_camera: settings.ColorCamera = Param(settings.ColorCamera(), doc="the colour camera")
+    depth_camera: settings.DepthCamera = Param(settings.DepthCamera(), doc="the depth camera")
+    stereo: settings.StereoRig = Param(settings.StereoRig(), doc="the stereo pair")
+    lidar: settings.Lidar = Param(settings.Lidar(), doc="the rotating laser scanner")
+    inertial: settings.Inertial = Param(settings.Inertial(), doc="the inertial measurement unit")
+    magnetometer: settings.Magnetometer = Param(settings.Magnetometer(), doc="the magnetometer")
+    wheels: settings.Wheels = Param(settings.Wheels(), doc="encoders and wheel odometry")
+    radar: settings.Radar = Param(settings.Radar(), doc="the radar")
+    landmarks: settings.Landmarks = Param(settings.Landmarks(), doc="the sensor that recognises landmarks")
+    gnss: settings.Gnss = Param(settings.Gnss(), doc="the satellite receiver")
+    motion: settings.Motion = Param(
+        settings.Motion(), doc="how the body is shaken: bumps of the floor, the sway of a hand"
+    )
     faults: tuple[Fault, ...] = Param((), doc="spans in which a sensor has other parameters: it fails or errs")
     lighting: tuple[Lighting, ...] = Param((), doc="spans in which the lamps are dimmed or off")
     kidnaps: tuple[Kidnap, ...] = Param((), doc="times at which the robot is carried to another place of its path")
-    truth: Truth = Param(Truth(), doc="the truth to emit")
+    truth: settings.Truth = Param(settings.Truth(), doc="the truth to emit")
     world_frame: str = Param("world", min_length=1, doc="frame of the truth")
     odometry_frame: str = Param("wheel_odom", min_length=1, doc="frame of the wheel odometry")
     base_frame: str = Param("base_link", min_length=1, doc="frame of the robot: on the floor, x forward")
@@ -187,8 +174,8 @@ class SimulatedRobot(Source):
         self._graph = TrueGraph(world, with_spatial=self.truth.spatial) if wants_graph else None
 
     @property
-    def _sensors(self) -> Sensors:
-        return Sensors(**{name: getattr(self, name) for name in SENSORS})
+    def _sensors(self) -> settings.Sensors:
+        return settings.Sensors(**{name: getattr(self, name) for name in SENSORS})
 
     def _new_rig(self) -> Rig:
         """The sensors as they are at the start: their biases walk and their counts grow from there."""
@@ -276,7 +263,7 @@ class SimulatedRobot(Source):
         """Returns what a sensor emits at a tick; truth about an image comes also where the image is missing."""
         rng = generator(self.seed, tick.sensor, tick.index)
         elapsed = (tick.stamp - self.first_stamp) * 1e-9
-        given: Sensor = getattr(self, parameter)
+        given: settings.Sensor = getattr(self, parameter)
         sensor = self._faults.at(parameter, given, elapsed)
         missing = rng.random() < sensor.dropout or any(a <= elapsed < b for a, b in sensor.outages)
         age = sensor.delay * 1e-9 + sensor.clock_drift * elapsed

@@ -44,7 +44,10 @@ class BoxTrackerSettings:
 
 @dataclass
 class BoxTrack:
-    """One object that is followed. Times in nanoseconds; `evidence` in log odds."""
+    """One object that is followed. Times in nanoseconds; `evidence` in log odds.
+
+    `row` is that of the detection that it was matched with now, -1 for none.
+    """
 
     id: int
     filter: BoxFilter
@@ -55,6 +58,7 @@ class BoxTrack:
     state: TrackState
     hits: int = 1
     feature: Array | None = None
+    row: int = -1
 
     @property
     def score(self) -> float:
@@ -111,13 +115,14 @@ class BoxTracker(Remembered):
         for i, k in taken.items():
             self._see(self.tracks[i], stamp, boxes[k], float(scores[k]), None if features is None else features[k])
         for i, track in enumerate(self.tracks):
+            track.row = taken.get(i, -1)
             if i not in taken:
                 self._miss(track, stamp, seconds, size)
         matched = set(taken.values())
         for k in strong:
             if k not in matched and scores[k] >= s.birth:
                 feature = None if features is None else features[k]
-                self._begin(stamp, boxes[k], float(scores[k]), int(class_ids[k]), feature)
+                self._begin(stamp, boxes[k], float(scores[k]), int(class_ids[k]), feature, k)
         result = list(self.tracks)
         self.tracks = [t for t in result if t.state != TrackState.ENDED]
         return result
@@ -176,11 +181,12 @@ class BoxTracker(Remembered):
         if ended:
             track.state = TrackState.ENDED
 
-    def _begin(self, stamp: int, box: Array, score: float, class_id: int, feature: Array | None) -> None:
+    def _begin(self, stamp: int, box: Array, score: float, class_id: int, feature: Array | None, row: int) -> None:
         evidence = _log_odds(score)
         state = TrackState.CONFIRMED if evidence >= self._settings.confirm else TrackState.TENTATIVE
         filter = self._settings.filter(box, score, self._settings.noise)
-        self.tracks.append(BoxTrack(self._next, filter, class_id, evidence, stamp, stamp, state, feature=feature))
+        track = BoxTrack(self._next, filter, class_id, evidence, stamp, stamp, state, feature=feature, row=row)
+        self.tracks.append(track)
         self._next += 1
 
 

@@ -106,7 +106,7 @@ class MultiObjectTracker(Operator):
             {"images": 1, "detections": detections.count, "unusable boxes": counts["unusable boxes"]}
         )
         self.state.counts["tracks ended"] += counts["ended"]
-        made = {"tracks": self._message(detections, tracks), "status": _status(detections.stamp, counts, resized)}
+        made = {"tracks": self._message(detections, tracks, rows), "status": _status(detections.stamp, counts, resized)}
         return made if vectors is None or features is None else made | {"looks": _looks(features, tracks)}
 
     def on_reset(self, input: str) -> None:
@@ -132,7 +132,7 @@ class MultiObjectTracker(Operator):
         vectors = features.vectors[rows].astype(np.float64)
         return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
-    def _message(self, detections: Detections2D, tracks: list[BoxTrack]) -> Tracks:
+    def _message(self, detections: Detections2D, tracks: list[BoxTrack], rows: NDArray[np.intp]) -> Tracks:
         now = detections.stamp
         return Tracks(
             stamp=now,
@@ -147,6 +147,7 @@ class MultiObjectTracker(Operator):
             ages=np.array([(now - t.born) * 1e-9 for t in tracks], np.float32),
             unseen=np.array([(now - t.seen) * 1e-9 for t in tracks], np.float32),
             boxes=boxes_of([t.filter for t in tracks]).astype(np.float32),
+            detections=np.array([rows[t.row] if t.row >= 0 else -1 for t in tracks], np.int64),
         )
 
 

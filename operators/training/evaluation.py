@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json as jsonlib
-from collections.abc import Sequence
-from typing import Annotated, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -13,7 +14,6 @@ from rich.table import Table
 from operators.training.console import Data, Json, SplitSeed, Weights, friendly, out_console, print_notes
 from operators.training.graph_evaluation import evaluate_graph
 
-Sample = TypeVar("Sample")
 Everything = Annotated[bool, typer.Option("--all", help="Score on all images, not only those for validation.")]
 
 evaluate = typer.Typer(
@@ -49,24 +49,10 @@ def evaluate_detector(
     with friendly():
         from operators.detection.custom.assessment import assess
         from operators.detection.custom.folder import read_detection_data
-        from operators.weights import training_seed
 
-        read = read_detection_data(data, training_seed(weights) if seed is None else seed)
-        chosen = every_image(read.training, read.validation) if everything else read.validation
-        print_notes(read.notes, json)
-        assessed = assess(weights, read.classes, chosen)
-    if json:
-        typer.echo(jsonlib.dumps(assessed))
-        return
-    images = scored(assessed["images"], len(every_image(read.training, read.validation)), everything)
-    out_console.print(f"{weights.name}: {images}, {assessed['objects']} objects", markup=False, soft_wrap=True)
-    table = Table("class", "AP50")
-    for name, value in assessed["per_class"].items():
-        table.add_row(escape(name), f"{value:.3f}")
-    table.add_section()
-    table.add_row("mean", f"{assessed['ap50']:.3f}")
-    out_console.print(table)
-    out_console.print(f"AP at 0.5 to 0.95: {assessed['ap']:.3f}; {assessed['ms']:.1f} ms an image")
+        assessed = _assessed(read_detection_data, assess, data, weights, everything, seed, json)
+    if not json:
+        _print(weights, assessed, "AP50", "ap50", f"AP at 0.5 to 0.95: {assessed['ap']:.3f}; ")
 
 
 @evaluate.command("segmenter")
@@ -86,31 +72,41 @@ def evaluate_segmenter(
     with friendly():
         from operators.segmentation.assessment import assess
         from operators.segmentation.dataset import read_segmentation_data
-        from operators.weights import training_seed
 
-        read = read_segmentation_data(data, training_seed(weights) if seed is None else seed)
-        chosen = every_image(read.training, read.validation) if everything else read.validation
-        print_notes(read.notes, json)
-        assessed = assess(weights, read.classes, chosen)
+        assessed = _assessed(read_segmentation_data, assess, data, weights, everything, seed, json)
+    if not json:
+        _print(weights, assessed, "IoU", "miou")
+
+
+def _assessed(
+    read: Callable[[Path, int], Any],
+    assess: Callable[[Path, Sequence[str], Sequence[Any]], dict[str, Any]],
+    data: Path,
+    weights: Path,
+    everything: bool,
+    seed: int | None,
+    json: bool,
+) -> dict[str, Any]:
+    """Scores a network file on data; prints the notes on these, or the scores as JSON."""
+    from operators.weights import training_seed
+
+    found = read(data, training_seed(weights) if seed is None else seed)
+    images = tuple(dict.fromkeys((*found.training, *found.validation)))
+    print_notes(found.notes, json)
+    assessed = assess(weights, found.classes, images if everything else found.validation)
     if json:
         typer.echo(jsonlib.dumps(assessed))
-        return
-    images = scored(assessed["images"], len(every_image(read.training, read.validation)), everything)
-    out_console.print(f"{weights.name}: {images}", markup=False, soft_wrap=True)
-    table = Table("class", "IoU")
+    chosen = "all" if everything else f"{assessed['images']} validation images of"
+    return {**assessed, "images": f"{chosen} {len(images)}{' images' if everything else ''}"}
+
+
+def _print(weights: Path, assessed: Mapping[str, Any], column: str, mean: str, further: str = "") -> None:
+    objects = f", {assessed['objects']} objects" if "objects" in assessed else ""
+    out_console.print(f"{weights.name}: {assessed['images']}{objects}", markup=False, soft_wrap=True)
+    table = Table("class", column)
     for name, value in assessed["per_class"].items():
         table.add_row(escape(name), f"{value:.3f}")
     table.add_section()
-    table.add_row("mean", f"{assessed['miou']:.3f}")
+    table.add_row("mean", f"{assessed[mean]:.3f}")
     out_console.print(table)
-    out_console.print(f"{assessed['ms']:.1f} ms an image")
-
-
-def every_image(training: Sequence[Sample], validation: Sequence[Sample]) -> tuple[Sample, ...]:
-    """All images of the data, each once."""
-    return tuple(dict.fromkeys((*training, *validation)))
-
-
-def scored(count: int, total: int, everything: bool) -> str:
-    """Tells which of the `total` images are scored on."""
-    return f"all {total} images" if everything else f"{count} validation images of {total}"
+    out_console.print(f"{further}{assessed['ms']:.1f} ms an image")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from operators.training.console import Json, err_console
 
@@ -64,6 +67,46 @@ Bfloat16 = Annotated[
 ]
 
 
+class TrainingBar:
+    """A progress bar over all steps; a line for each epoch stays on the screen. Use it as a context manager."""
+
+    def __init__(self, console: Console) -> None:
+        self._bar = Progress(
+            TextColumn("epoch {task.fields[epoch]}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[losses]}"),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+        )
+        self._mean: dict[str, float] = {}
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def begin(self, epochs: int, steps: int, done: int) -> None:
+        self._epochs = epochs
+        self._task = self._bar.add_task("", total=epochs * steps, completed=done * steps, epoch=done + 1, losses="")
+
+    def step(self, epoch: int, losses: Mapping[str, float]) -> None:
+        for name, value in losses.items():
+            self._mean[name] = 0.95 * self._mean.get(name, value) + 0.05 * value
+        text = " ".join(f"{name} {value:.3f}" for name, value in self._mean.items())
+        self._bar.update(self._task, advance=1, epoch=f"{epoch + 1}/{self._epochs}", losses=text)
+
+    def epoch(self, epoch: int, losses: Mapping[str, float], scores: Mapping[str, float] | None) -> None:
+        words = [f"{name} {value:.4f}" for name, value in losses.items()]
+        words += [f"[bold]{name} {value:.3f}[/bold]" for name, value in (scores or {}).items() if name != "score"]
+        self._bar.console.print(f"epoch {epoch + 1}/{self._epochs}  " + "  ".join(words), highlight=False)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Training:
     """The options of every training command."""
@@ -102,7 +145,6 @@ class Training:
     def run(self, task: Task, out: Path) -> Outcome:
         """Trains with a progress bar, or without one where output is for programs; writes the network to `out`."""
         from operators.learning.loop import train
-        from operators.training.progress import TrainingBar
 
         if self.json:
             return train(task, self.settings, out, resume=self.resume)

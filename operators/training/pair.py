@@ -75,20 +75,9 @@ class PairTask:
         if lacking:
             raise DataError(f"{len(lacking)} images have boxes and no mask, the first is {lacking[0]}")
         self.mask_of: list[MaskedImage] = [mask_of[image.file.name] for image in boxes.training]
-        self.size, self.variation = size, self.boxes.variation
-        self.pair = PairNetwork(self.boxes.backbone, self.boxes.detector.head, self.masks.segmenter.decoder)
-
-    @property
-    def network(self) -> nn.Module:
-        return self.pair
-
-    @property
-    def backbone(self) -> Backbone:
-        return self.pair.backbone
-
-    @property
-    def samples(self) -> int:
-        return self.boxes.samples
+        self.size, self.samples, self.variation = size, self.boxes.samples, self.boxes.variation
+        self.backbone = self.boxes.backbone
+        self.network = PairNetwork(self.backbone, self.boxes.network.head, self.masks.network.decoder)
 
     def begin_with(self, file: Path) -> None:
         """Begins with `detector.onnx` and the `segmenter.onnx` beside it, whose backbones were one; the detector's
@@ -97,8 +86,8 @@ class PairTask:
         self.boxes.take_anchors(file)
         self.masks.check(other)
         images = sample_images(self)
-        begin_with(nn.Sequential(self.pair.backbone, self.pair.decoder), other, images)
-        begin_with(nn.Sequential(self.pair.backbone, self.pair.grid), file, images)
+        begin_with(nn.Sequential(self.backbone, self.network.decoder), other, images)
+        begin_with(nn.Sequential(self.backbone, self.network.grid), file, images)
 
     def description(self) -> dict[str, Any]:
         return {"detector": self.boxes.description(), "segmenter": self.masks.description()}
@@ -117,7 +106,7 @@ class PairTask:
 
     def loss(self, batch: tuple[Tensor, Truth, Tensor], device: torch.device) -> dict[str, Tensor]:
         images, truth, masks = batch
-        maps, scores = self.pair(images.to(device).contiguous(memory_format=torch.channels_last))
+        maps, scores = self.network(images.to(device).contiguous(memory_format=torch.channels_last))
         return {**self.boxes.loss_of(maps, truth), **self.masks.loss_of(scores, masks)}
 
     def evaluate(self, network: nn.Module) -> dict[str, float]:

@@ -21,13 +21,11 @@ from numpy.typing import NDArray
 
 from operators.detection.custom.assessment import assess as assess_detector
 from operators.detection.custom.folder import read_detection_data
-from operators.detection.custom.training import KIND as DETECTOR
 from operators.learning.augmentation import fitted, tensor_of, warp
 from operators.learning.files import whole
 from operators.segmentation.assessment import assess as assess_segmenter
 from operators.segmentation.dataset import read_segmentation_data
 from operators.segmentation.scores import MOST_CLASSES
-from operators.segmentation.training import KIND as SEGMENTER
 from operators.weights.network_file import KEY, SECOND, NetworkFileError, read_facts, training_seed
 
 INT8 = "int8"
@@ -69,7 +67,7 @@ def quantize_network(file: Path, images: Iterable[Pixels], out: Path) -> None:
                 calibrate_method=CalibrationMethod.MinMax,
             )
         model = onnx.load(quantized)
-    if facts["kind"] == SEGMENTER and len(facts["classes"]) <= MOST_CLASSES:
+    if facts["kind"] == "segmenter" and len(facts["classes"]) <= MOST_CLASSES:
         model, facts["score_step"] = of_scores(model)
     model.producer_name = "dataflow"
     facts |= {"arithmetic": INT8, "calibration_images": reader.count}
@@ -90,7 +88,7 @@ def quantize_with(
     """
     score: Callable[[Path], dict[str, Any]]
     seed = training_seed(file) if seed is None else seed
-    if read_facts(file)["kind"] == DETECTOR:
+    if read_facts(file)["kind"] == "detector":
         boxes = read_detection_data(data, seed)
         seen = [image.read for image in boxes.training]
         score = partial(assess_detector, classes=boxes.classes, images=boxes.validation)

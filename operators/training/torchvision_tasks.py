@@ -30,26 +30,25 @@ _LEAST_SCORE = 0.01  # average precision asks for the whole curve
 class _TorchvisionTask:
     """Holds what both have in common: a model by name with as many outputs as the data have classes."""
 
-    def __init__(self, family: Family, model: str, classes: Sequence[str], size: tuple[int, int], seed: int) -> None:
+    def __init__(
+        self, family: Family, model: str, classes: Sequence[str], size: tuple[int, int], seed: int, samples: int
+    ) -> None:
         torch.manual_seed(seed)
+        self.samples = samples
         self.kind = f"torchvision {family}"
         self.model, self.classes, self.size = model, tuple(classes), size
-        self._network = new_model(family, model, len(self.classes))
-
-    @property
-    def network(self) -> nn.Module:
-        return self._network
+        self.network = new_model(family, model, len(self.classes))
 
     def begin_with(self, state: Mapping[str, Tensor]) -> tuple[int, int]:
         """Takes over the weights that fit, so all but the last layers where classes differ; how many of how many.
 
         Raises TrainingFileError where none fits.
         """
-        own = self._network.state_dict()
+        own = self.network.state_dict()
         fit = {name: value for name, value in state.items() if name in own and own[name].shape == value.shape}
         if not fit:
             raise TrainingFileError(f"none of the given weights fits {self.model}: are they of another model?")
-        self._network.load_state_dict({**own, **fit})
+        self.network.load_state_dict({**own, **fit})
         return len(fit), len(own)
 
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
@@ -58,8 +57,9 @@ class _TorchvisionTask:
         described = {"network": self.model, "size": list(self.size), **facts}
         save_atomically({"model": state, "classes": list(self.classes), "facts": described}, file)
 
-    def _described(self, images: int) -> dict[str, Any]:
-        return {"model": self.model, "classes": list(self.classes), "size": list(self.size), "images": images}
+    def description(self) -> dict[str, Any]:
+        """Returns what must be the same for a checkpoint to be resumed."""
+        return {"model": self.model, "classes": list(self.classes), "size": list(self.size), "images": self.samples}
 
 
 class TorchvisionDetectorTask(_TorchvisionTask):
@@ -71,15 +71,8 @@ class TorchvisionDetectorTask(_TorchvisionTask):
     def __init__(
         self, data: DetectionData, model: str, size: tuple[int, int], *, seed: int = 0, variation: Variation
     ) -> None:
-        super().__init__("detection", model, (BACKGROUND, *data.classes), size, seed)
+        super().__init__("detection", model, (BACKGROUND, *data.classes), size, seed, len(data.training))
         self.data, self.variation = data, variation
-
-    @property
-    def samples(self) -> int:
-        return len(self.data.training)
-
-    def description(self) -> dict[str, Any]:
-        return self._described(self.samples)
 
     def batch(
         self, samples: list[int], rngs: list[np.random.Generator]
@@ -94,7 +87,7 @@ class TorchvisionDetectorTask(_TorchvisionTask):
         images, targets, seed = batch
         torch.manual_seed(seed)  # some models choose among their proposals at random
         there = [{name: value.to(device) for name, value in target.items()} for target in targets]
-        losses: dict[str, Tensor] = self._network([image.to(device) for image in images], there)
+        losses: dict[str, Tensor] = self.network([image.to(device) for image in images], there)
         return losses
 
     def evaluate(self, network: nn.Module) -> dict[str, float]:
@@ -123,15 +116,8 @@ class TorchvisionSegmenterTask(_TorchvisionTask):
     def __init__(
         self, data: SegmentationData, model: str, size: tuple[int, int], *, seed: int = 0, variation: Variation
     ) -> None:
-        super().__init__("segmentation", model, data.classes, size, seed)
+        super().__init__("segmentation", model, data.classes, size, seed, len(data.training))
         self.data, self.variation = data, variation
-
-    @property
-    def samples(self) -> int:
-        return len(self.data.training)
-
-    def description(self) -> dict[str, Any]:
-        return self._described(self.samples)
 
     def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> tuple[Tensor, Tensor, int]:
         views = [self._view(self.data.training[k], rng) for k, rng in zip(samples, rngs, strict=True)]
@@ -141,7 +127,7 @@ class TorchvisionSegmenterTask(_TorchvisionTask):
     def loss(self, batch: tuple[Tensor, Tensor, int], device: torch.device) -> dict[str, Tensor]:
         images, masks, seed = batch
         torch.manual_seed(seed)  # of dropout
-        found, masks = self._network(images.to(device)), masks.to(device)
+        found, masks = self.network(images.to(device)), masks.to(device)
         entropy = {"entropy": functional.cross_entropy(found["out"].float(), masks, ignore_index=VOID)}
         if "aux" in found:
             entropy["auxiliary"] = 0.5 * functional.cross_entropy(found["aux"].float(), masks, ignore_index=VOID)

@@ -53,6 +53,7 @@ def test_what_runs_here_is_what_runs_in_processes(tmp_path: Path) -> None:
     assert here.summaries == there.summaries
 
 
+@pytest.mark.long
 def test_a_recording_made_here_replays_and_verifies_in_processes(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     run = watch().run(record=path)
@@ -79,6 +80,7 @@ def test_a_replay_goes_through_another_graph_and_only_to_its_end(tmp_path: Path)
         assert recording["brightness"]["value"].round(1).tolist() == [0, 40, 80]
 
 
+@pytest.mark.long
 def test_a_changed_operator_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.mcap"
     watch().run(record=path)

@@ -103,6 +103,7 @@ def test_a_parameter_is_changed_where_it_was(changed: Path, monkeypatch: pytest.
     read.check()
 
 
+@pytest.mark.long
 def test_changes_of_calls_that_are_left_out_are_made(changed: Path) -> None:
     made = captured(changed, "tuned", predicate=f"out.out.vectors[0, 0] == -1 and inp.x.vectors[0, 0] == {tuned.WRONG}")
 
@@ -122,6 +123,7 @@ def test_a_reset_is_made_where_it_was(changed: Path) -> None:
     assert outcome.outputs["out"].vectors[0, 0] == 3.0 * (tuned.WRONG - 1)  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_calls_that_give_something_else_apart_are_no_test(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dataflow.capture.capture._changes", lambda *_: {})
 
@@ -140,6 +142,7 @@ def test_a_silent_output_is_none_for_an_expression(changed: Path) -> None:
     replace(made, predicate="out.out.vectors[0, 0] > 3").check()  # raises: not true
 
 
+@pytest.mark.long
 def test_an_expression_that_raises_for_every_call_is_reported(changed: Path) -> None:
     with pytest.raises(DebugError, match=r"none for which out\.outt\.value > 3, which raises AttributeError: .*outt"):
         captured(changed, "rare", predicate="out.outt.value > 3")
@@ -159,6 +162,7 @@ def test_inputs_in_memory_are_bounded_by_bytes(changed: Path, monkeypatch: pytes
         captured(changed, "tuned")
 
 
+@pytest.mark.long
 def test_an_interrupt_ends_the_calls(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(operator: tuned.Tuned, x: object) -> None:
         raise KeyboardInterrupt

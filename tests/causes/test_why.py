@@ -32,6 +32,7 @@ def line_of(site: Any) -> str:
     return str(LINES[site["line"] - 1]).strip()
 
 
+@pytest.mark.long
 def test_the_command_names_two_causes_at_once_with_their_lines(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "Two")
 

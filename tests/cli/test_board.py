@@ -155,3 +155,11 @@ def test_lines_stand_under_their_heading() -> None:
         assert text[top.index("state") :].startswith(row.state)
         assert text[: top.index("Hz") + 2].endswith(f"{row.rate:.1f}")
         assert len(text) <= len(top)
+
+
+def test_what_an_operator_found_wrong_is_among_the_notes() -> None:
+    board = Board(graph_with("camera", "check"))
+    found = {"check": "edges of colour and depth did not fit"}
+    counts = dict.fromkeys(("camera", "check"), (1, 1, 0, 0, 10**9, 0))
+    sample = board.update([ProcessStatus("eyes", counts, dict.fromkeys(counts, 0), frozenset(), found=found)], 1.0)
+    assert "check: edges of colour and depth did not fit" in "\n".join(printed(sample, 80))

@@ -64,6 +64,7 @@ def test_a_graph_that_comes_with_dataflow_is_named_for_a_bag_too(dataflow, bag: 
     assert "which topics feed the graph must be said with --map" in " ".join(refused.split())
 
 
+@pytest.mark.long
 def test_a_star_within_a_part_stands_for_any_characters(dataflow, recorded, tmp_path: Path) -> None:
     told = dataflow("filter", recorded[0], "--stream", "left/*st", "-o", tmp_path / "part.mcap", "--json").stdout
 

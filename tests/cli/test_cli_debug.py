@@ -5,10 +5,21 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+import pytest
+
+from dataflow.cli.support.debug_shell import Shell
+from dataflow.debugging.debugger import Debugger
+from dataflow.messages.base import Message
+from dataflow.recording import Recording
+from dataflow.sync.entries import entries_of
+from dataflow.view import ViewerSink
 
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
 LIVE = KEPT / "live.mcap"
@@ -39,6 +50,7 @@ def test_a_call_is_shown_with_what_was_given_made_and_changed() -> None:
     assert "  vectors" in told
 
 
+@pytest.mark.long
 def test_the_hashes_and_threads_are_those_of_a_run() -> None:
     told = debug("busy", "--do", "goto 0", "--do", "print __import__('os').environ['PYTHONHASHSEED']")
 
@@ -55,6 +67,7 @@ def test_lines_of_standard_input_are_done_and_one_that_cannot_be_is_an_error() -
     assert "until ): no Python expression" in told
 
 
+@pytest.mark.long
 def test_pdb_stops_at_the_first_line_of_process() -> None:
     told = debug("smooth", lines="step\np type(x).__name__\nc\nquit\n")
 
@@ -63,6 +76,7 @@ def test_pdb_stops_at_the_first_line_of_process() -> None:
     assert told.count("as recorded") == 2
 
 
+@pytest.mark.long
 def test_pdb_that_is_left_leaves_the_call_as_it_was() -> None:
     told = debug("smooth", lines="step\nq\nquit\n")
 
@@ -70,6 +84,7 @@ def test_pdb_that_is_left_leaves_the_call_as_it_was() -> None:
     assert "BdbQuit" not in told
 
 
+@pytest.mark.long
 def test_calls_are_json() -> None:
     told = debug("tally", "--do", "next", "--do", "next", "--do", "diff", "--json")
 
@@ -79,11 +94,75 @@ def test_calls_are_json() -> None:
     assert last == "122 calls: all give what was recorded"
 
 
+def test_an_editor_is_served_until_it_leaves() -> None:
+    words = [sys.executable, "-m", "dataflow.cli.main", "debug", str(LIVE), "smooth@1", "--path", str(KEPT)]
+    with subprocess.Popen([*words, "--dap", "0"], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        host, port = server.stdout.readline().split()[5].split(":")
+        with socket.create_connection((host, int(port)), timeout=60) as editor, editor.makefile("rwb") as stream:
+            for seq, command in enumerate(("initialize", "launch", "configurationDone", "threads", "disconnect")):
+                data = json.dumps({"seq": seq, "type": "request", "command": command}).encode()
+                stream.write(b"Content-Length: %d\r\n\r\n%s" % (len(data), data))
+            stream.flush()
+            told = stream.read().decode()
+        assert server.wait(60) == 0
+    assert host == "127.0.0.1"
+    assert '"reason": "entry"' in told
+    assert '"name": "smooth call 29 of 42' in told
+    assert '"event": "terminated"' in told
+
+
+class Drawing:
+    """A viewer that only notes what it is given."""
+
+    def __init__(self) -> None:
+        self.drawn: list[tuple[str, int]] = []
+
+    def log(self, stream: str, message: Message) -> bool:
+        self.drawn.append((stream, message.stamp))
+        return True
+
+
+@pytest.fixture
+def prompt(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Shell, Drawing]]:
+    monkeypatch.syspath_prepend(str(KEPT))
+    with Recording(LIVE) as recording:
+        debugger, viewer = Debugger(recording, "smooth"), Drawing()
+        yield Shell(debugger, 0, viewer=cast(ViewerSink, viewer)), viewer
+        debugger.close()
+
+
+def test_the_viewer_is_given_what_calls_that_are_gone_to_were_given_and_made(prompt: tuple[Shell, Drawing]) -> None:
+    shell, viewer = prompt
+    shell.onecmd("goto 4")
+    shell.onecmd("goto 2")
+    fired = shell._debugger.at
+    assert fired is not None
+    given = [(entry.stream, entry.stamp) for value in fired.firing.inputs.values() for entry in entries_of(value)]  # type: ignore[union-attr]
+    made = [(each.stream, each.here.stamp) for each in fired.made if each.here is not None]
+    assert given
+    assert made
+    assert viewer.drawn[-len(given + made) :] == given + made
+    assert len(viewer.drawn) > len(given + made)
+
+
+def test_expressions_and_parts_of_the_state_are_completed(prompt: tuple[Shell, Drawing]) -> None:
+    shell, _ = prompt
+    assert shell.complete_print("out", "", 0, 0) == []
+    shell.onecmd("goto 4")
+    assert shell.complete_print("inp.", "", 0, 0) == [f"inp.{name}" for name in shell._debugger.node.inputs]
+    assert "out.mean.vectors" in shell.complete_until("out.mean.v", "", 0, 0)
+    before = shell._debugger.at.states()[0] if shell._debugger.at else None
+    assert shell.complete_state("", "", 0, 0) == sorted(before or ())
+
+
+@pytest.mark.long
 def test_what_cannot_begin_is_named() -> None:
     assert "there are: busy, look, smooth, tally" in debug("none", code=2)
     assert "expected the number of a call, or @SECONDS" in debug("busy@x", code=2)
 
 
+@pytest.mark.long
 def test_verify_prints_the_command_that_goes_to_the_difference(
     dataflow: Any, small: Path, recorded: tuple[Path, Any], tmp_path: Path
 ) -> None:

@@ -46,6 +46,7 @@ def test_a_cut_that_cannot_be_is_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_a_filter_keeps_what_it_is_told_to(dataflow, recorded: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "part.mcap"
 

@@ -197,6 +197,7 @@ def test_what_could_not_be_repeated_is_not_accepted_and_ends_with_1(
     dataflow(*words, "--only", "one", code=1)
 
 
+@pytest.mark.long
 def test_a_tolerance_passes_with_its_own_word_and_not_as_identical(dataflow, folder: Path, tmp_path: Path) -> None:
     changed = graph_of(tmp_path, "changed.yaml", NUDGED)
     one = folder / "recordings" / "first.mcap"
@@ -236,7 +237,7 @@ def test_recorded_operators_that_the_graph_does_not_have_are_named(dataflow, fol
     assert json.loads(gate(dataflow, folder, "--json", code=0).stdout)["recordings"][0]["not_in_graph"] == []
 
 
-@pytest.mark.parametrize("words", [[], ["--start", "0.05"]])
+@pytest.mark.parametrize("words", [[], pytest.param(["--start", "0.05"], marks=pytest.mark.long)])
 def test_a_recording_of_sources_alone_holds_nothing_to_verify(
     dataflow, folder: Path, tmp_path: Path, words: list[str]
 ) -> None:

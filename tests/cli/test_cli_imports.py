@@ -92,6 +92,7 @@ def test_a_file_where_one_stands_replaces_no_module(made: tuple[Path, Path], tmp
     assert "hijacked" not in told.stdout + told.stderr
 
 
+@pytest.mark.long
 def test_nor_where_the_command_is_called_as_a_module(made: tuple[Path, Path], tmp_path: Path) -> None:
     """Python puts the current folder first on the path then."""
     told = run(hijacking(tmp_path), "info", made[1], safe=())

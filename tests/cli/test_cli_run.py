@@ -42,6 +42,7 @@ def test_the_json_report_stands_alone_on_stdout(recorded) -> None:
     assert report["files"]["@recorder"]["path"] == str(path)
 
 
+@pytest.mark.long
 def test_a_replay_makes_the_same_digests_and_diff_agrees(dataflow, recorded, tmp_path: Path) -> None:
     path, report = recorded
     again = tmp_path / "again.mcap"
@@ -62,6 +63,7 @@ operators:
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("placement", ["--one-process", "--process-each"])
 def test_a_replay_that_leaves_out_an_external_sink_is_recorded_and_verified(
     dataflow, tmp_path: Path, placement: str
@@ -78,6 +80,7 @@ def test_a_replay_that_leaves_out_an_external_sink_is_recorded_and_verified(
     dataflow("verify", again, "-q")
 
 
+@pytest.mark.long
 def test_a_replay_of_a_part_takes_only_that_part(dataflow, recorded) -> None:
     path, _ = recorded
 
@@ -196,6 +199,7 @@ def damaged(recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("asked", ["0", "1"])
 def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_asked_for(
     damaged: Path, monkeypatch: pytest.MonkeyPatch, asked: str

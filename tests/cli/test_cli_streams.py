@@ -82,6 +82,7 @@ def test_a_closed_output_is_refused(small: Path, tmp_path: Path) -> None:
     assert not recording.exists()
 
 
+@pytest.mark.long
 def test_a_closed_error_output_does_not_keep_a_command_from_its_work(small: Path) -> None:
     told = shell('exec "$@" 2>&- <&-', "check", small)
 
@@ -90,7 +91,14 @@ def test_a_closed_error_output_does_not_keep_a_command_from_its_work(small: Path
     assert shell('exec "$@" 2>&-', "check", "nothing.yaml").returncode == 2
 
 
-@pytest.mark.parametrize("words", [("--version",), ("check", "{small}"), ("check", "{small}", "--json")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param(("--version",), marks=pytest.mark.long),
+        ("check", "{small}"),
+        pytest.param(("check", "{small}", "--json"), marks=pytest.mark.long),
+    ],
+)
 def test_a_full_disk_behind_the_output_is_one_line(small: Path, words: tuple[str, ...]) -> None:
     told = shell('exec "$@" >/dev/full', *(word.format(small=small) for word in words))
 
@@ -104,6 +112,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(recorded) -> None:
     assert told.stderr == ""
 
 
+@pytest.mark.long
 def test_a_command_works_where_the_current_folder_is_gone(recorded, tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()

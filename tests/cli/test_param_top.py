@@ -11,8 +11,10 @@ from typing import Any
 
 import psutil
 import pytest
+from prometheus_text import prometheus
 
 from dataflow.client.attach import find_running
+from dataflow.client.metrics import collect
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.records.reading import recorded_firings
@@ -232,6 +234,35 @@ def test_top_tells_the_latency_of_every_path_of_the_last_seconds(dataflow) -> No
     assert "costs most" in dataflow("top", "--once", "--every", "0.3").stdout
 
 
+@pytest.mark.usefixtures("running")
+def test_health_names_what_is_wrong_and_has_an_exit_code_for_it(dataflow, tmp_path: Path) -> None:
+    words = ["health", "--over", "0.5", "--free", "0", "--folder", tmp_path]
+    assert dataflow(*words, "--losses", "1").stdout == "tunable is healthy: 4 operators\n"
+
+    told = json.loads(dataflow(*words, "--rate", "left=1e6", "--free", "1e9", "--json", code=1).stdout)
+    assert (told["graph"], told["healthy"]) == ("tunable", False)
+    left, slow, disk = told["reasons"]
+    assert left.startswith("left: fires at ")
+    assert left.endswith(" Hz, less than 1e+06")
+    assert slow.startswith("slow: drops ")
+    assert disk.endswith("left, less than 1e+09 GB")
+    assert "did you mean 'left'?" in dataflow(*words, "--rate", "lef=3", code=2).stderr
+    assert "no graph 'other' runs here" in dataflow(*words, "--graph", "other", code=2).stderr
+
+
+@pytest.mark.usefixtures("running")
+def test_metrics_are_those_of_the_operators() -> None:
+    def firings() -> dict[str, float]:
+        read = prometheus(collect([find_running("tunable")], []))
+        return {labels["operator"]: value for labels, value in read["dataflow_firings_total"]}
+
+    first, second = firings(), firings()
+
+    assert list(first) == ["left", "tuned", "slow", "other"]
+    assert all(second[name] >= number > 0 for name, number in first.items())
+    assert second["left"] > first["left"]
+
+
 @pytest.mark.long
 def test_a_process_that_does_not_answer_is_shown_so_until_it_goes_on(dataflow, alone: Background) -> None:
     process = alone.process_of("tuned")
@@ -251,6 +282,7 @@ def test_a_process_that_does_not_answer_is_shown_so_until_it_goes_on(dataflow, a
     assert dataflow("param", "set", "tuned.factor", "7", "--timeout", "30").stdout == "tuned.factor = 7.0\n"
 
 
+@pytest.mark.long
 def test_the_changes_stand_in_the_recording_and_top_ends_with_the_graph(dataflow, alone: Background) -> None:
     for value in ("2.5", "3"):
         dataflow("param", "set", "tuned.factor", value)

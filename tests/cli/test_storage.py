@@ -59,6 +59,7 @@ def test_options_of_a_recording_need_one(option: str, capsys: pytest.CaptureFixt
     assert f"{option} is of a recording" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_run_is_split_kept_within_its_limit_and_private(dataflow, small: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     run = ("run", small, "--one-process", "-q", "--record", tmp_path / "out" / "{time}.mcap", "--split-every", "100ms")

@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+from source_trees import nodes_of
 
 from dataflow.cli.support.debug_shell import Shell
 
@@ -29,7 +31,7 @@ CALLED_BY_OTHERS = {
 }
 
 
-def definitions(nodes: list[ast.AST]) -> Iterator[str]:
+def definitions(nodes: Sequence[ast.AST]) -> Iterator[str]:
     """Yields the names of functions, classes and constants; those that a decorator hands on are called through it."""
     for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
@@ -45,7 +47,7 @@ def definitions(nodes: list[ast.AST]) -> Iterator[str]:
             yield from (target.id for target in node.targets if isinstance(target, ast.Name) and target.id != "__all__")
 
 
-def uses(nodes: list[ast.AST]) -> Iterator[str]:
+def uses(nodes: Sequence[ast.AST]) -> Iterator[str]:
     """Yields every name that is read, as a name, an attribute, a keyword or a word of a short text."""
     for node in nodes:
         kind: type = type(node)  # quicker than patterns, for a million nodes
@@ -63,7 +65,7 @@ def uses(nodes: list[ast.AST]) -> Iterator[str]:
 
 def test_everything_has_a_caller(repository: Path) -> None:
     trees = {
-        path: list(ast.walk(ast.parse(path.read_text())))
+        path: nodes_of(path)
         for root in ("dataflow", "operators", "tools", "benchmarks")
         for path in sorted((repository / root).rglob("*.py"))
     }

@@ -8,12 +8,14 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
+from source_trees import nodes_of
+
 OPENS_WITH_A_QUESTION = re.compile(r"(What|How|Where|Which|Whether)\b")
 
 
 def public_docstrings(path: Path) -> Iterator[tuple[int, str]]:
     """Yields line and first line of the docstrings of a module and of what it has that is public."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes_of(path):
         if isinstance(node, ast.Module):
             line, name = 1, ""
         elif isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):

@@ -6,9 +6,11 @@ import ast
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
+from source_trees import nodes_of
 
 MOST_ON_A_FLOOR = 25
 MOST_IN_A_FOLDER = 25
@@ -43,7 +45,7 @@ def allowed(repository: Path) -> dict[str, tuple[str, ...]]:
 
 def imports_of(file: Path) -> Iterator[str]:
     """The modules that a file imports, also inside functions."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes_of(file):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -93,13 +95,14 @@ def module_of(file: Path, repository: Path) -> str:
 
 def names_imported(file: Path) -> Iterator[str]:
     """What a file imports, also inside functions and for annotations alone; names too, since they may be modules."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes_of(file):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
+@cache
 def arrows(repository: Path) -> dict[str, set[str]]:
     """Module → the modules whose files it imports. Packages that only gather names of their modules do not count."""
     files = [file for package in ("dataflow", "operators") for file in (repository / package).rglob("*.py")]
@@ -115,7 +118,7 @@ def arrows(repository: Path) -> dict[str, set[str]]:
 
 
 def test_no_modules_import_each_other(repository: Path) -> None:
-    left = arrows(repository)
+    left = dict(arrows(repository))
     while free := [module for module, others in left.items() if not others & left.keys()]:
         for module in free:
             del left[module]
@@ -190,9 +193,7 @@ def test_functions_are_short(repository: Path) -> None:
         function: lines
         for package in ("dataflow", "operators")
         for file in files_of(repository, package)
-        for function, lines in lines_of_functions(
-            ast.parse(file.read_text(encoding="utf-8")), f"{module_of(file, repository)}:"
-        )
+        for function, lines in lines_of_functions(nodes_of(file)[0], f"{module_of(file, repository)}:")
         if lines > MOST_LINES
     }
     longer = {function: lines for function, lines in long.items() if lines > LONG.get(function, MOST_LINES)}

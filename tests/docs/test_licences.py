@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import re
 import sys
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import Distribution, distribution, packages_distributions
 from pathlib import Path
-from types import ModuleType
 
+import licences as tool
 import pytest
+from source_trees import nodes_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 OURS = ("dataflow", "operators")
 DISTRIBUTIONS = cache(packages_distributions)
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    """`tools/licences.py`."""
-    spec = importlib.util.spec_from_file_location("licences", REPOSITORY / "tools" / "licences.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +28,7 @@ def imported() -> frozenset[tuple[str, Path]]:
 def imports() -> Iterator[tuple[str, Path]]:
     for package in OURS:
         for file in sorted((REPOSITORY / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            for node in nodes_of(file):
                 names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
                 names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
                 names += dynamic(node)
@@ -63,7 +52,7 @@ def packages_of(module: str) -> set[str]:
     return {re.sub(r"[-_.]+", "-", d).lower() for d in DISTRIBUTIONS().get(module.partition(".")[0], ())}
 
 
-def test_every_import_is_a_declared_dependency(tool: ModuleType, imported: frozenset[tuple[str, Path]]) -> None:
+def test_every_import_is_a_declared_dependency(imported: frozenset[tuple[str, Path]]) -> None:
     requirements = [text for part in (*tool.PARTS, *tool.UNLISTED) for text in tool.declared(part)]
     declared = {re.split(r"[^a-z0-9-]", tool.canonical(re.match(r"[\w.-]+", text)[0]))[0] for text in requirements}
     for module, file in sorted(imported):
@@ -72,7 +61,7 @@ def test_every_import_is_a_declared_dependency(tool: ModuleType, imported: froze
             assert found & (declared | {"pydantic-core"}), f"{file} imports {module}, which {found} brings"
 
 
-def test_nothing_imported_is_under_the_gpl(tool: ModuleType, imported: frozenset[tuple[str, Path]]) -> None:
+def test_nothing_imported_is_under_the_gpl(imported: frozenset[tuple[str, Path]]) -> None:
     modules = {module for module, _ in imported}
     assert {"numpy", "zenoh", "rerun"} <= {m.partition(".")[0] for m in modules}
     assert "evo" not in {m.partition(".")[0] for m in modules}
@@ -83,7 +72,7 @@ def test_nothing_imported_is_under_the_gpl(tool: ModuleType, imported: frozenset
             assert not tool.COPYLEFT.search(words), f"{name} is under {words}"
 
 
-def test_the_page_has_every_package_with_its_licence(tool: ModuleType) -> None:
+def test_the_page_has_every_package_with_its_licence() -> None:
     page = (REPOSITORY / "docs" / "licences.md").read_text(encoding="utf-8")
     listed = dict(re.findall(r"^\| ([\w-]+) \| ([^|]+) \| ", page, re.MULTILINE))
     for name, found in tool.closure([*tool.declared(), *tool.declared("all"), *tool.declared("sim")]).items():
@@ -106,11 +95,11 @@ def test_the_page_has_every_package_with_its_licence(tool: ModuleType) -> None:
         ("Apache-2.0", False),
     ],
 )
-def test_the_gpl_is_told_from_the_lgpl(tool: ModuleType, words: str, copyleft: bool) -> None:
+def test_the_gpl_is_told_from_the_lgpl(words: str, copyleft: bool) -> None:
     assert bool(tool.COPYLEFT.search(words)) == copyleft
 
 
-def test_evo_would_be_found(tool: ModuleType) -> None:
+def test_evo_would_be_found() -> None:
     """The check is not blind: the one package under the GPL that the tests use is seen as such."""
     pytest.importorskip("evo", reason="evo (the [dev] extra) is not installed")
     found: Distribution = distribution("evo")

@@ -6,6 +6,8 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+from source_trees import nodes_of
+
 PACKAGES = ("execution", "process", "reexecution", "supervision", "verification")
 KINDS = {"LiveRunner", "OperatorRunner", "RecordedRunner", "LogFeed", "NoLoss", "LossTold", "LiveSinkProcess"}
 """Classes of which one run has this and another that."""
@@ -22,7 +24,7 @@ def functions(repository: Path) -> Iterator[tuple[str, str, ast.AST]]:
     """Yields the file, the name and the code of every function and of every module."""
     for package in PACKAGES:
         for path in sorted((repository / "dataflow" / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text())):
+            for node in nodes_of(path):
                 if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                     yield path.relative_to(repository).as_posix(), node.name, node
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from source_trees import nodes_of
 
 GAP = "\0"
 """Stands for what a message puts in."""
@@ -17,7 +18,7 @@ def texts_of(repository: Path) -> Iterator[str]:
     """Every text of the program, with a gap for each value that is put in."""
     for package in ("dataflow", "operators"):
         for file in sorted((repository / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            for node in nodes_of(file):
                 if isinstance(node, ast.JoinedStr):
                     yield "".join(str(part.value) if isinstance(part, ast.Constant) else GAP for part in node.values)
                 elif isinstance(node, ast.Constant) and isinstance(node.value, str):

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from tampering import tampered
 
 from dataflow.editing.part import Part, write_part
-from dataflow.editing.spans import RunRecords
+from dataflow.editing.spans import RunRecords, listed
 from dataflow.interop.opening import is_foreign
 from dataflow.recording import Recording
 from dataflow.recording.streams.copying import Origin
@@ -159,7 +159,8 @@ def test_every_message_that_a_kept_firing_takes_is_kept_or_accounted_for(
             taken.append(record("op", len(taken), "snapshot", stamp, detail={"state": b"x"}))
     end = start + length
 
-    part = RunRecords({"cam": made, "op": taken}, {"cam": ("s",)}).of_span({"s"}, start, end, lambda _: (start, end))
+    log = {"cam": listed(made), "op": listed(taken)}
+    part = RunRecords(log, {"cam": ("s",)}).of_span({"s"}, start, end, lambda _: (start, end))
 
     stored = {e.seq for r in made for e in r.outputs if e and start <= e.stamp <= end}
     extra = {e.seq for r in made for e in r.outputs if e and e.stamp in part.needed.get("s", {}).get(0, ())}

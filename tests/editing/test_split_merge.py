@@ -55,23 +55,31 @@ def test_the_merge_of_a_split_is_the_whole(recorded: Path, tmp_path: Path, how: 
     assert verify(tmp_path / "whole.mcap").identical
 
 
-def test_firing_records_are_read_once_for_all_parts(
+def test_of_firing_records_each_part_reads_little_more_than_its_own(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("dataflow.editing.spans.SEGMENT", 4)
+    monkeypatch.setattr("dataflow.records.order.STEP", 1)
     read: list[str] = []
-    of = FiringLog.of
+    decoded = FiringLog.decoded
 
-    def noting(log: FiringLog, operator: str) -> tuple[FiringRecord, ...]:
+    def noting(log: FiringLog, operator: str, payload: bytes) -> tuple[FiringRecord, ...]:
         read.append(operator)
-        return of(log, operator)
+        return decoded(log, operator, payload)
 
-    monkeypatch.setattr(FiringLog, "of", noting)
-    with Origin(recorded) as origin:
-        parts = list(split(origin, tmp_path / "parts", every=SECOND // 4))
+    monkeypatch.setattr(FiringLog, "decoded", noting)
+    with Recording(recorded) as recording:
+        batches = recording.firing_batches()["left"]
 
-    assert len(parts) > 2
-    assert "merge" in read
-    assert len(read) == len(set(read))
+    counts = []
+    for number in (2, 8):
+        with Origin(recorded) as origin:
+            parts = list(split(origin, tmp_path / f"{number}", every=SECOND // number))
+        assert len(parts) >= number - 1
+        counts.append(read.count("left"))
+        read.clear()
+    assert batches > 8
+    assert counts[1] < 2 * counts[0]
 
 
 def test_messages_are_decoded_for_the_part_that_they_are_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

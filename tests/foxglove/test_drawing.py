@@ -7,7 +7,7 @@ import pytest
 from example_messages import example
 
 from dataflow.foxglove.drawing import data_of, drawing_of, schema_of
-from dataflow.foxglove.topics import FRAMES, Topics
+from dataflow.foxglove.server import FRAMES, Topics
 from dataflow.messages import Detections2D, Keypoints2D, Mesh, Odometry, SceneGraph, SegmentationMap, Tracks, pack_masks
 from dataflow.messages.base import message_types
 

@@ -105,7 +105,8 @@ def test_message_goes_to_ros_and_comes_back_through_serialised_bytes(kind: type[
     if isinstance(message, Measurement):
         message = message.replace(unit="Pa")
 
-    name, made = OUTWARD[kind](message)
+    made = OUTWARD[kind](message)
+    name = made.__msgtype__
     again = store.deserialize_cdr(store.serialize_cdr(made, name), name)
     back = CONVERSIONS[name][1](again, START)
 

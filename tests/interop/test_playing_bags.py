@@ -103,6 +103,7 @@ def test_recorded_sources_cannot_be_run(graph: Path) -> None:
         dataflow.run(str(graph))
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_camera_bag_of_others_feeds_a_detector_and_verifies(data_dir: Path, tmp_path: Path) -> None:
     file = tmp_path / "graph.yaml"

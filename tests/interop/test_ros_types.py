@@ -253,10 +253,10 @@ def test_a_point_comes_in_and_goes_out() -> None:
     place = ros("geometry_msgs/Point", x=1.0, y=2.0, z=3.0)
     point = converted(ros("geometry_msgs/PointStamped", header=header(7, "map"), point=place))
 
-    name, back = OUTWARD[Point](point)
+    back = OUTWARD[Point](point)
 
     assert point == Point(stamp=point.stamp, frame="map", position=np.array([1.0, 2.0, 3.0]))
-    assert (name, back.header.frame_id, back.point.y) == ("geometry_msgs/msg/PointStamped", "map", 2.0)
+    assert (back.__msgtype__, back.header.frame_id, back.point.y) == ("geometry_msgs/msg/PointStamped", "map", 2.0)
     assert converted(place).position.tolist() == [1, 2, 3]
 
 

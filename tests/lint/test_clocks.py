@@ -108,6 +108,7 @@ def test_a_gyroscope_whose_clock_drifts_is_named_with_sign_and_rate() -> None:
     assert found["clock drift", "robot1/imu"]["drift_ms_per_s"] == pytest.approx(4.0, abs=0.2)
 
 
+@pytest.mark.long
 def test_the_sign_is_turned_where_the_contract_trusts_the_gyroscope() -> None:
     trusted = Contract.model_validate({"clocks": {"reference": "imu"}})
     found = clock_findings(report(trusted, inertial={"delay": "150ms"}))

@@ -32,6 +32,7 @@ def test_the_bundled_recording_is_sound_and_its_cameras_clock_is_told(demo: Path
     assert found["streams"]["robot1/robot/imu"]["hz"] == pytest.approx(100)
 
 
+@pytest.mark.long
 def test_a_proposed_contract_is_kept_and_a_stricter_one_is_not(demo: Path, tmp_path: Path) -> None:
     file = tmp_path / "robot.yaml"
     call("lint", demo, "--quick", "--write-contract", file)

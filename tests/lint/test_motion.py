@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ TURNS = Rotation.from_euler("zyx", np.column_stack([0.6 * TIMES, 0.3 * np.sin(TI
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
+@cache
 def rates() -> np.ndarray:
     """(N, 3) angular velocity in the body's axes, from the differences of its orientations."""
     turned = (TURNS[:-1].inv() * TURNS[1:]).as_rotvec() / 0.05

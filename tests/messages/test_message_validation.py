@@ -139,6 +139,8 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (boxes, {"class_ids": [1]}, r"Boxes3D\.class_ids\[0\] must index class_names"),
     (boxes, {"scores": [2]}, r"Boxes3D\.scores\[0\]"),
     (boxes, {"visible": [2]}, r"Boxes3D\.visible\[0\]"),
+    (scene, {"tracks": [7]}, r"SceneGraph\.tracks is given without track_nodes: they come together"),
+    (scene, {"tracks": [7], "track_nodes": [2]}, r"SceneGraph\.track_nodes\[0\] must index the 2 nodes, got 2"),
     (tracks, {"ids": [4, 4]}, r"Tracks\.ids must be unique, 4 occurs more than once"),
     (tracks, {"states": [0, 4]}, r"Tracks\.states\[1\] must be a TrackState: 0 tentative.*, got 4"),
     (tracks, {"ages": [-1, 0]}, r"Tracks\.ages\[0\]"),

@@ -137,6 +137,7 @@ def test_what_is_kept_replays_with_the_states_of_then(recorded: Path, graph: Gra
     assert made.items() <= was.items()
 
 
+@pytest.mark.long
 def test_the_disk_that_the_ring_takes_does_not_grow_with_the_run(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     sink, history = flown(recorded, graph, tmp_path)
     sink.close("complete")
@@ -161,6 +162,7 @@ def test_the_ring_keeps_less_time_where_it_may_take_less_of_the_disk(
     assert not verify(Path(one["path"])).culprits
 
 
+@pytest.mark.long
 def test_no_more_is_kept_than_the_graph_allows(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     sink, _ = flown(recorded, graph, tmp_path, asks=[4.0, 12.0, 20.0, 25.0], files=2)
     facts = sink.close("complete")
@@ -169,6 +171,7 @@ def test_no_more_is_kept_than_the_graph_allows(recorded: Path, graph: Graph, tmp
     assert facts["not_kept"] == 2
 
 
+@pytest.mark.long
 def test_triggers_that_come_together_keep_one_recording(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     sink, _ = flown(recorded, graph, tmp_path, asks=[12.0, 13.0])
     (one,) = sink.close("complete")["kept"]
@@ -178,6 +181,7 @@ def test_triggers_that_come_together_keep_one_recording(recorded: Path, graph: G
         assert max(m.stamp for m in kept.messages(["test/left/fast"])) >= 14.9 * SECOND
 
 
+@pytest.mark.long
 def test_a_field_of_a_stream_triggers_once_while_it_holds(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     above = Trigger("field", stream="test/left/fast", field="vectors", above=250.0)
     sink, _ = flown(recorded, graph, tmp_path, when=(above,))
@@ -276,6 +280,7 @@ def test_a_flight_recorder_that_cannot_be_is_refused_where_it_stands(tmp_path: P
         load_graph(tmp_path / "a.yaml")
 
 
+@pytest.mark.long
 def test_a_full_disk_is_outlived_and_what_comes_after_is_kept(
     recorded: Path, graph: Graph, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:

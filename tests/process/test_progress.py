@@ -20,8 +20,9 @@ class Reporting:
         ports = SimpleNamespace(emitted=0, states={})
         node = SimpleNamespace(name="last")
         self.operator = SimpleNamespace(
-            node=node, done=0, firings=0, drops={}, timeouts={}, late={}, ports=ports, work=Work()
-        )
+            node=node, done=0, firings=0, drops={}, timeouts={}, late={}, ports=ports, work=Work(),
+            operator=SimpleNamespace(finding=lambda: f"{self.operator.done} things lie askew"),
+        )  # fmt: skip
         self.channel, self.now = RecordedChannel(), 0.0
         driver = Driver()
         driver.operators.append(self.operator)  # type: ignore[arg-type]
@@ -47,6 +48,12 @@ def test_a_busy_process_reports_now_and_then() -> None:
 
     assert one.told == [10, 50]
     assert one.progress.next_due() is None
+
+
+def test_what_an_operator_found_is_kept_with_its_counts() -> None:
+    one = Reporting()
+    one.fires(idle=True)
+    assert one.progress.found == {"last": "10 things lie askew"}
 
 
 def test_an_idle_process_reports_at_once_or_wakes_up_to_do_so() -> None:

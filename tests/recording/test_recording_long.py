@@ -82,13 +82,16 @@ def long(monkeypatch: pytest.MonkeyPatch, step: int = 4) -> None:
     monkeypatch.setattr(chunk_indexes, "SEGMENT", 7 * step)
 
 
-@pytest.mark.parametrize("step", [1, 4, 1000])
+@pytest.mark.parametrize(
+    "step", [pytest.param(1, marks=pytest.mark.long), 4, pytest.param(1000, marks=pytest.mark.long)]
+)
 def test_a_long_recording_reads_as_a_short_one(path: Path, step: int, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = content(path)
     long(monkeypatch, step)
     assert content(path) == expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [1, 300, 2000])
 def test_so_does_one_of_many_messages_however_few_of_them_are_looked_up_together(
     path: Path, size: int, monkeypatch: pytest.MonkeyPatch

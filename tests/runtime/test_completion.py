@@ -90,6 +90,7 @@ def _recording_sensors_only(graph: Graph) -> Graph:
     return replace(graph, record=replace(graph.record, streams=SENSORS))
 
 
+@pytest.mark.long
 def test_code_that_changed_since_completes_nothing_and_says_where(live: Path, tmp_path: Path) -> None:
     graph = load_graph(HERE / "live.yaml", live=True)
     smooth = graph.nodes["smooth"]

@@ -38,7 +38,7 @@ def fails(graph: Graph, **options: object) -> RunFailed:
     return caught.value
 
 
-@pytest.mark.parametrize("placement", ["one_process", "process_each"])
+@pytest.mark.parametrize("placement", ["one_process", pytest.param("process_each", marks=pytest.mark.long)])
 def test_an_operator_that_raises_is_named_with_its_traceback(placement: str) -> None:
     failure = fails(broken("raise"), placement=placement)
 
@@ -51,7 +51,7 @@ def test_an_operator_that_raises_is_named_with_its_traceback(placement: str) -> 
     ("how", "words"),
     [
         ("stamp", "bad.y emitted stamp 1199999999; it must lie at or after the firing's 1200000000"),
-        ("type", "Broken returned a str; return a message, a mapping or None"),
+        pytest.param("type", "Broken returned a str; return a message, a mapping or None", marks=pytest.mark.long),
         ("mutate", "bad changed the memory of its input 'x' (FeatureVector at stamp 1200000000)"),
     ],
 )
@@ -81,6 +81,7 @@ def test_what_operators_start_ends_with_their_process_and_holds_nobody_up() -> N
         time.sleep(0.02)
 
 
+@pytest.mark.long
 def test_a_daemon_that_an_operator_leaves_is_named_and_ends_with_its_process() -> None:
     lines: list[str] = []
 
@@ -221,6 +222,7 @@ def test_after_a_failure_every_recorded_message_is_explained(live: bool, how: st
     assert not any(lost.values()), lost
 
 
+@pytest.mark.long
 def test_what_operators_print_reaches_the_user() -> None:
     said: list[tuple[str, str]] = []
 
@@ -286,6 +288,7 @@ def long_run(tmp_path: Path) -> Running:
     return running
 
 
+@pytest.mark.long
 def test_ctrl_c_drains_and_completes_the_recording(long_run: Running, tmp_path: Path) -> None:
     long_run.process.send_signal(signal.SIGINT)
     code, out, err = long_run.end()
@@ -310,7 +313,7 @@ def test_killing_the_supervisor_leaves_no_process_and_a_readable_recording(long_
         assert recording.streams["test/left/fast"].count > 0
 
 
-@pytest.mark.parametrize("victim", ["recorder", "operator"])
+@pytest.mark.parametrize("victim", [pytest.param("recorder", marks=pytest.mark.long), "operator"])
 def test_killing_a_process_ends_the_run_and_names_it(long_run: Running, tmp_path: Path, victim: str) -> None:
     time.sleep(1.2)
     recorder = [p for p in long_run.family if any(f.path.endswith("run.mcap") for f in p.open_files())]

@@ -132,6 +132,7 @@ def test_a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is(p
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_an_operator_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
     ran = Ran(robot(SMOOTH), path, {"kind": "raise", "operator": "smooth", "at": "300ms"})
 
@@ -168,6 +169,7 @@ def test_restarts_come_to_an_end_and_the_last_cause_is_named(path: Path) -> None
 HANGS = "bad: {{use: runtime_operators:Broken, params: {{how: hang}}, inputs: {{x: left/fast}}, live: {{{}}}}}"
 
 
+@pytest.mark.long
 def test_an_operator_that_hangs_is_killed_at_its_deadline_and_started_again(path: Path) -> None:
     ran = Ran(robot(HANGS.format(f"size: 1000, deadline: 200ms, {AGAIN}")), path)
 
@@ -390,6 +392,7 @@ def test_a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late
     assert together.digests() == apart.digests()
 
 
+@pytest.mark.long
 def test_a_clock_that_jumps_ahead_goes_on_there(path: Path) -> None:
     graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
 
@@ -448,6 +451,7 @@ def test_a_source_that_raises_is_made_anew_in_the_same_process(path: Path) -> No
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_without_a_policy_a_source_that_raises_ends_the_run(path: Path) -> None:
     graph = graph_of(
         "camera: {use: faulty_operators:Camera}", "resets: {use: faulty_operators:Resets, inputs: {x: camera/count}}"

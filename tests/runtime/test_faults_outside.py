@@ -181,6 +181,7 @@ operators:
 """
 
 
+@pytest.mark.long
 def test_a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted(
     tmp_path: Path,
 ) -> None:
@@ -261,6 +262,7 @@ def test_a_slow_subscriber_from_outside_costs_nobody_anything(tmp_path: Path) ->
     assert report.summaries["stopped"]["count"] + sum(n for *_, n in report.drops.get("stopped", ())) == 250
 
 
+@pytest.mark.long
 def test_nothing_is_published_while_nobody_listens(tmp_path: Path) -> None:
     report = run(load_graph(graph_file(tmp_path, count=20)), placement="process_each")
 

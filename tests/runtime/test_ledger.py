@@ -72,6 +72,7 @@ def of(report: VerifyReport, operator: str) -> Verification:
     return next(v for v in report.operators if v.operator == operator)
 
 
+@pytest.mark.long
 def test_a_rewritten_recording_is_as_good_as_the_one_it_was(recorded: Path, tmp_path: Path) -> None:
     assert verify(rewritten(recorded, tmp_path / "same.mcap"), jobs=1).identical
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 import dataflow
 from dataflow.graph import load_graph
 from dataflow.supervision.run import replay, run
@@ -17,6 +19,7 @@ operators:
 """
 
 
+@pytest.mark.long
 def test_what_is_left_out_is_filled_in_alike_in_every_placement(tmp_path: Path) -> None:
     file, path = tmp_path / "corner.yaml", tmp_path / "live.mcap"
     file.write_text(GRAPH, encoding="utf-8")

@@ -19,7 +19,7 @@ from dataflow.verification.verify import verify
 HERE = Path(__file__).resolve().parent
 
 
-@pytest.mark.parametrize("placement", ["one_process", "process_each"])
+@pytest.mark.parametrize("placement", ["one_process", pytest.param("process_each", marks=pytest.mark.long)])
 def test_a_live_run_with_drops_and_timeouts_is_verified_in_another_placement(placement: str, tmp_path: Path) -> None:
     path = tmp_path / "live.mcap"
     graph = load_graph(HERE / "live.yaml", live=True)

@@ -104,6 +104,7 @@ def test_the_terminal_is_shown_the_lines_with_levels_from_warnings_on(recorded) 
     assert not any("\x1e" in line or "{" in line for line in texts)
 
 
+@pytest.mark.long
 def test_a_replay_of_a_run_that_talks_is_the_same(recorded, tmp_path: Path) -> None:
     path, again = recorded[0], tmp_path / "again.mcap"
     replay(path, graph=graph(), record=again, placement="process_each")
@@ -125,6 +126,7 @@ def test_the_command_chooses_lines_of_a_recording(recorded) -> None:
     assert "about a running graph" in call("logs", path, "--follow", code=2).stderr
 
 
+@pytest.mark.long
 def test_lines_of_a_recording_are_drawn_with_the_rest(recorded, tmp_path: Path) -> None:
     saved = tmp_path / "talk.rrd"
     assert "could not" not in call("view", recorded[0], "--to", saved).stdout
@@ -145,6 +147,7 @@ def test_a_running_graph_shows_its_log_and_leaves_none_behind(tmp_path: Path, mo
     assert not [file.name for file in registry_folder().iterdir() if ".log" in file.name]
 
 
+@pytest.mark.long
 def test_the_least_level_is_chosen_with_the_run(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("DATAFLOW_LOG_LEVEL", "error")  # restored afterwards: the option sets it
     file, path = tmp_path / "talk.yaml", tmp_path / "talk.mcap"

@@ -58,6 +58,7 @@ def test_a_replay_from_the_middle_makes_what_the_whole_one_makes_there(recorded:
         assert len(found) < len(whole[stream])
 
 
+@pytest.mark.long
 def test_verification_from_the_middle_takes_up_recorded_states(recorded: Path) -> None:
     whole = {v.operator: v for v in verify(recorded, jobs=1).operators}
 

@@ -7,6 +7,7 @@ import random
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests_runtime_graphs import chain
@@ -68,12 +69,16 @@ def test_a_run_gives_the_same_digests_in_one_process_and_in_a_process_each(mixed
     assert together.drops == apart.drops
 
 
-def test_replay_gives_the_digests_of_the_run_in_every_placement(recording: tuple[Path, dict[str, str]]) -> None:
-    path, expected = recording
-    graph = load_graph(HERE / "mixed.yaml")
+EVERY = ["one_process", "process_each", *groupings(load_graph(HERE / "mixed.yaml"), 2, seed=7)]
 
-    for placement in ("one_process", "process_each", *groupings(graph, 2, seed=7)):
-        assert replay(path, placement=placement).digests() == expected, placement
+
+@pytest.mark.parametrize("placement", [EVERY[-1], *(pytest.param(each, marks=pytest.mark.long) for each in EVERY[:-1])])
+def test_replay_gives_the_digests_of_the_run_in_every_placement(
+    recording: tuple[Path, dict[str, str]], placement: Any
+) -> None:
+    path, expected = recording
+
+    assert replay(path, placement=placement).digests() == expected
 
 
 @pytest.mark.long

@@ -99,6 +99,7 @@ def test_messages_from_outside_are_taken_recorded_and_verified(tmp_path: Path) -
     assert verify(path, graph=load_text(GRAPH)).identical
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_registry_of_its_own")
 def test_a_run_that_is_not_live_has_no_clock_for_them() -> None:
     with pytest.raises(RunFailed, match="run it with --live"):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Number, Odometry
 from dataflow.operator import KEPT, In, Operator, Out, Param, Remembered
-from dataflow.state import StateError, plain, typed
+from dataflow.state import Counts, StateError, plain, state_hints, take_over, typed
 
 V = TypeVar("V")
 
@@ -201,6 +201,22 @@ def test_parts_with_settings_are_restored_where_they_are_and_made_by_their_owner
     assert lengths == [2, 5, 7]
     assert second.last is not None
     assert (second.last.length, other.state.by_name["a"].last) == (5, None)
+
+
+@dataclass
+class Counting(Counts):
+    empty: bool = False
+
+
+def test_a_count_that_was_begun_with_a_truth_value_comes_back() -> None:
+    counting = Counting()
+    counting.counts.update({"clouds without": True})
+    packed = pack_state(plain(counting))
+    later = Counting()
+    take_over(later, state_hints(later), unpack_state(packed), lambda kind: kind())
+
+    assert pack_state(plain(later)) == packed
+    assert later.counts["clouds without"] == 1
 
 
 def test_room_for_growth_is_not_part_of_a_snapshot() -> None:

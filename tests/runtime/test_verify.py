@@ -37,7 +37,7 @@ def verdicts(report: VerifyReport) -> dict[str, str]:
     return {v.operator: v.verdict for v in report.operators}
 
 
-@pytest.mark.parametrize("jobs", [1, 2, 9])
+@pytest.mark.parametrize("jobs", [2, *(pytest.param(jobs, marks=pytest.mark.long) for jobs in (1, 9))])
 def test_a_recorded_run_is_identical_with_any_number_of_workers(recorded: Path, jobs: int) -> None:
     report = verify(recorded, jobs=jobs)
 
@@ -83,6 +83,7 @@ def test_a_change_in_one_operator_names_it_and_the_firing_and_nobody_else(record
     assert first.expected == expected.digest().hex() != first.got
 
 
+@pytest.mark.long
 def test_where_inputs_were_not_recorded_others_are_downstream_of_the_culprit(thin: Path) -> None:
     report = verify(thin, graph=load_graph(HERE / "changed.yaml"))
 

@@ -113,6 +113,7 @@ def test_a_tolerance_that_is_none_is_refused(recorded: Path, tolerance: float) -
         verify(recorded, tolerance=tolerance)
 
 
+@pytest.mark.long
 def test_without_recorded_outputs_only_digests_are_compared_and_it_says_so(tmp_path: Path) -> None:
     graph = load_graph(HERE / "mixed.yaml", settings=SETTINGS)
     sensors = tuple(s for s, made in graph.streams.items() if graph.nodes[made.node].source)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import indent
 
 import pytest
 from typer.testing import CliRunner
 
 from dataflow.cli.main import app
 from dataflow.graph import load_graph
-from dataflow.scaffold.files import KINDS, NameFault, camel, snake
+from dataflow.scaffold.files import KINDS, NameFault, camel, operator_files, snake
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -48,7 +51,7 @@ def test_a_project_passes_its_own_tests(tmp_path: Path) -> None:
         call("new", "operator", f"Another{kind}", "--kind", kind, "--to", project / "my_robot")
     call("new", "graph", "second", "--to", project / "graphs")
     assert (project / "tests" / "test_anothersource.py").is_file()
-    assert "11 passed" in run_tests(project, tmp_path)
+    assert "12 passed" in run_tests(project, tmp_path)
 
 
 def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> None:
@@ -58,7 +61,10 @@ def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> N
         *(f"my_{kind}.py" for kind in KINDS),
         *(f"test_my_{kind}.py" for kind in KINDS),
     }
-    assert "5 passed" in run_tests(tmp_path, tmp_path)
+    call("new", "operator", "Second", "--kind", "program", "--to", tmp_path)
+    assert "7 passed" in run_tests(tmp_path, tmp_path)
+    (tmp_path / "dataflow.hpp").write_text("mine")
+    assert "is there already" in call("new", "operator", "x", "--kind", "program", "--to", tmp_path, code=2).stderr
 
 
 def test_what_is_written_is_in_the_projects_own_format(tmp_path: Path) -> None:
@@ -98,7 +104,9 @@ def test_a_name_that_python_has_already_is_refused(name: str, words: str) -> Non
     with pytest.raises(NameFault, match=words):
         snake(name)
     assert words in call("new", "operator", name, code=2).stderr
-    assert "expected one of operator, timer, source" in call("new", "operator", "x", "--kind", "y", code=2).stderr
+    assert (
+        "expected one of operator, timer, source, program" in call("new", "operator", "x", "--kind", "y", code=2).stderr
+    )
 
 
 @pytest.mark.parametrize(
@@ -112,3 +120,40 @@ def test_a_name_that_python_has_already_is_refused(name: str, words: str) -> Non
 )
 def test_names_of_modules_and_classes(name: str, module: str, kind: str) -> None:
     assert (snake(name), camel(name)) == (module, kind)
+
+
+GRAPH = "graph: patrol\noperators:\n  camera: {use: operators.sources:SyntheticRgbd}\n"
+
+
+@pytest.mark.parametrize("flight", [False, True])
+def test_a_service_is_a_unit_that_systemd_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flight: bool) -> None:
+    folder = tmp_path / "my robot 100%"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    (folder / "patrol.yaml").write_text(GRAPH + ("record: {keep: 60s, folder: kept}\n" if flight else ""))
+
+    call("new", "service", "patrol.yaml", "--user", "root", "--days", "3")
+
+    unit = (folder / "patrol.service").read_text()
+    assert ("--keep-disk 20GB" in unit) == (not flight)
+    kept = (folder / "patrol.conf").read_text().splitlines()[-1]
+    assert kept == f'd "{str(folder).replace("%", "%%")}/{"kept" if flight else "out"}" - - - 3d'
+    assert "is there already" in call("new", "service", "patrol.yaml", code=2).stderr
+    assert "cannot be the name" in call("new", "service", "patrol.yaml", "--name", "a b", code=2).stderr
+    if (analyze := shutil.which("systemd-analyze")) is not None:
+        monkeypatch.setenv("SYSTEMD_LOG_LEVEL", "warning")
+        done = subprocess.run(
+            [analyze, "verify", folder / "patrol.service"], capture_output=True, text=True, timeout=60
+        )
+        about = [line for line in done.stderr.splitlines() if "patrol" in line]
+        assert (done.returncode, about) == (0, [])
+
+
+def test_the_page_shows_what_is_written() -> None:
+    page = (REPOSITORY / "docs" / "other-languages.md").read_text(encoding="utf-8")
+    files = operator_files("Brightness", "program")
+    shown = re.search(r"```cpp\n(.*?)```", page, re.DOTALL)
+    assert shown is not None
+    assert indent(shown[1], "    ") in files[Path("brightness.cpp")]
+    declared = files[Path("brightness.py")].split("    stateless = True\n")[1]
+    assert declared.strip() in page

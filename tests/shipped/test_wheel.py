@@ -25,24 +25,25 @@ def build(what: str, source: Path, target: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def sdist(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def checkout(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the files that are built from."""
     setuptools = pytest.importorskip("setuptools", reason="setuptools is not installed, and nothing is downloaded")
     if int(setuptools.__version__.partition(".")[0]) < 77:
         pytest.skip(f"setuptools {setuptools.__version__} is older than the build needs (77)")
-    checkout = tmp_path_factory.mktemp("checkout") / "project"
+    copy = tmp_path_factory.mktemp("checkout") / "project"
     unwanted = shutil.ignore_patterns(".git", ".venv", "out", "build", "dist", "__pycache__", "*.egg-info", ".*_cache")
-    shutil.copytree(repository, checkout, ignore=unwanted)
+    shutil.copytree(repository, copy, ignore=unwanted)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def sdist(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build("build_sdist", checkout, tmp_path_factory.mktemp("sdist"))
 
 
 @pytest.fixture(scope="module")
-def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Made of the unpacked sdist, as pip does."""
-    folder = tmp_path_factory.mktemp("unpacked")
-    with tarfile.open(sdist) as archive:
-        safely = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # from Python 3.11.4 on
-        archive.extractall(folder, **safely)  # type: ignore[arg-type]
-    return build("build_wheel", next(folder.iterdir()), tmp_path_factory.mktemp("wheel"))
+def wheel(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build("build_wheel", checkout, tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.mark.long
@@ -71,6 +72,18 @@ def test_the_wheel_carries_the_packages_the_graphs_the_demo_and_the_licence(whee
     } <= names
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     assert not any("__pycache__" in name for name in names)
+
+
+@pytest.mark.long
+def test_the_wheel_of_the_unpacked_sdist_holds_the_same_as_pip_makes_it(
+    wheel: Path, sdist: Path, tmp_path: Path
+) -> None:
+    with tarfile.open(sdist) as archive:
+        safely = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # from Python 3.11.4 on
+        archive.extractall(tmp_path / "unpacked", **safely)  # type: ignore[arg-type]
+    again = build("build_wheel", next((tmp_path / "unpacked").iterdir()), tmp_path)
+    with zipfile.ZipFile(wheel) as one, zipfile.ZipFile(again) as other:
+        assert sorted(one.namelist()) == sorted(other.namelist())
 
 
 @pytest.mark.long

@@ -164,9 +164,11 @@ def test_a_frozen_process_is_not_waited_for_without_end(memory: Path) -> None:
 RESTARTED = "restart: {max: 5, backoff: 10ms}"
 
 
-@pytest.mark.parametrize("policy", ["", RESTARTED, f"deadline: 200ms, {RESTARTED}"])
+@pytest.mark.parametrize(
+    "policy", ["", pytest.param(RESTARTED, marks=pytest.mark.long), f"deadline: 200ms, {RESTARTED}"]
+)
 @pytest.mark.parametrize("target", ["*", "", "relay", "@recorder"])
-@pytest.mark.parametrize("span", [6.0, 40.0])
+@pytest.mark.parametrize("span", [pytest.param(6.0, marks=pytest.mark.long), 40.0])
 def test_a_pause_of_the_supervisor_and_others_kills_and_blames_nobody(
     target: str, span: float, policy: str, memory: Path
 ) -> None:
@@ -192,7 +194,7 @@ def test_a_process_that_stands_still_longer_than_the_pause_is_started_again(memo
     assert result.outcome.report.restarts == {"relay": 1}
 
 
-@pytest.mark.parametrize("first", [0, 25, *(pytest.param(at, marks=pytest.mark.long) for at in range(50, 200, 25))])
+@pytest.mark.parametrize("first", [0, *(pytest.param(at, marks=pytest.mark.long) for at in range(25, 200, 25))])
 def test_seeds(first: int, memory: Path) -> None:
     """No hang, no loss without a count, recordings that verify, replays that are equal."""
     for seed in range(first, first + 25):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from pathlib import Path
 
 import pytest
 from plays import LEFT, STEP, Play, asked_where, killed, sent, spawned
@@ -11,7 +12,7 @@ from dataflow.chaos.plan import Fault
 from dataflow.recording.parts import Storage
 from dataflow.records.firing import Emission, FiringRecord
 from dataflow.supervision.core.commands import Send, Signal, Spawn
-from dataflow.supervision.core.events import Begin, Died, NotReading, Said, Tick
+from dataflow.supervision.core.events import Begin, ClockMeasured, Died, LinkChanged, NotReading, Said, Tick
 from dataflow.sync import FOREVER
 
 AGAIN = "live: {restart: {max: 2, backoff: 100ms}}"
@@ -474,3 +475,41 @@ def test_news_of_processes_that_ended_crosses_other_news_without_harm() -> None:
     play.tell(Died("smooth", -9), play.progress("smooth", {"smooth": FOREVER}), play.ended("smooth"), Tick())
 
     assert play.over is None
+
+
+def test_processes_behind_a_link_that_is_down_are_neither_silent_nor_started_again() -> None:
+    restarting = SUM[:-1] + ", live: {restart: {max: 2, backoff: 10ms}}}"
+    play = Play(LEFT, restarting, live=True).starts()
+    play.tell(LinkChanged("robot", ("sum",), up=False))
+    play.beating = False
+
+    for _ in range(200):  # 10 s, in which the others are heard
+        play.tell(play.beat("left"))
+        play.wait(0.05)
+    play.tell(LinkChanged("robot", ("sum",), up=True))
+    play.wait(2.0)  # until its first beat has come
+    play.tell(play.beat("left"), play.beat("sum"))
+    play.wait(0.05)
+
+    assert not any(isinstance(command, Signal) for command in play.commands)
+    assert not play.core.status.restarts
+    assert [note for note in play.core.status.notes if "link" in note] == [
+        "the link to machine 'robot' is down: nothing of that machine is heard, and its operators go on",
+        "the link to machine 'robot' is back",
+    ]
+    play.beating = False
+    play.tell(play.beat("left"))
+    play.wait(4.0)
+    assert any(isinstance(command, Signal) and command.label == "sum" for command in play.commands)
+
+
+def test_the_clock_of_another_machine_is_stored_now_and_then_and_shown_once() -> None:
+    play = Play(LEFT, SUM, live=True, record=Path("run.mcap")).starts()
+    for _ in range(21):
+        play.tell(ClockMeasured("robot", 2_500_000, 400_000))
+        play.wait(1.0)
+
+    stored = [c.fields["data"] for c in play.commands if isinstance(c, Send) and c.fields.get("name") == "clock"]
+    text = "the clock of machine 'robot' is +2.500 ms ahead, ± 0.200 ms"
+    assert stored == [{"text": text, "machine": "robot", "offset": 2_500_000, "delay": 400_000}] * 3
+    assert play.core.status.notes.count(text) == 1

@@ -55,6 +55,7 @@ def test_processes_of_an_early_nursery_find_modules_and_variables_that_came_afte
     assert not runs(pid)
 
 
+@pytest.mark.long
 def test_a_graph_with_other_threads_gets_a_nursery_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[str] = []
     real = supervisor.Nursery

@@ -17,6 +17,7 @@ A comment above a block says that it is otherwise: `<!-- not run: REASON -->`, o
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
 import multiprocessing
@@ -33,7 +34,7 @@ from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-LANGUAGES = ("python", "yaml", "sh", "json", "toml", "text", "ini", "dockerfile")
+LANGUAGES = ("python", "yaml", "sh", "json", "toml", "text", "ini", "dockerfile", "cpp")
 OUTPUTS = ("output", "record", "view", "to", "complete", "out", "junit", "svg", "baseline", "write_contract")
 """Parameters of commands that name a file which the command may write."""
 QUICK = ("check", "show", "info", "operators", "graphs", "diff", "latency", "lint", "logs")
@@ -43,7 +44,21 @@ READERS_OWN = {
     *("tuned.yaml",),
 }
 """Names that stand for files of the reader."""
-PROGRAMS = ("python", "python3", "pip", "pytest", "rerun", "git", "cd", "mkdir", "export", "mkdocs", "bash", "ls")
+PROGRAMS = (
+    "python",
+    "python3",
+    "pip",
+    "pytest",
+    "rerun",
+    "git",
+    "cd",
+    "mkdir",
+    "export",
+    "mkdocs",
+    "c++",
+    "bash",
+    "ls",
+)
 """What else a line of a `sh` block may begin with."""
 MARK = re.compile(r"<!-- (not run: \S.*|run by (tests/\S+\.py)) -->$")
 FENCE = re.compile(r"```(\w*)")
@@ -351,8 +366,20 @@ def main(folder: Path, pages: list[str]) -> None:
     import dataflow
     import dataflow.cli.main
     import dataflow.testing
-    import operators.cloud
-    import operators.sources  # noqa: F401  (imported once, before the pages' processes are forked)
+    from dataflow.graph import load_graph
+
+    for name in (
+        "operators.cloud",
+        "operators.sources",
+        "pandas",
+        "scipy.ndimage",
+        "scipy.optimize",
+        "scipy.spatial",
+        "scipy.stats",
+        "rich.console",
+    ):
+        importlib.import_module(name)  # once, before the pages' processes are forked
+    load_graph(REPOSITORY / "graphs" / "perception.yaml")  # and its operators
 
     hypothesis.settings.register_profile(
         "pages", derandomize=True, deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck)

@@ -31,6 +31,7 @@ def test_half_a_point_is_found_in_pairs_and_not_between_means() -> None:
     assert unpaired <= 4
 
 
+@pytest.mark.long
 def test_equal_versions_differ_no_more_often_than_the_level_allows() -> None:
     rng = np.random.default_rng(2)
     alarms = sum(compared({"detector: precision": worlds(rng, 0.0)})[0].differs for _ in range(200))
@@ -76,6 +77,7 @@ def test_recordings_without_a_number_are_left_out_and_named() -> None:
     assert compared({"x: recall": {"a": (1.0, math.nan)}}) == []
 
 
+@pytest.mark.long
 def test_many_recordings_take_memory_for_a_few() -> None:
     pairs = {f"w{k}": (0.0, float(k % 3)) for k in range(20_000)}
     tracemalloc.start()

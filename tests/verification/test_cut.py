@@ -57,6 +57,7 @@ def chunk_ends(path: Path) -> list[int]:
     return ends
 
 
+@pytest.mark.long
 def test_a_recording_torn_at_any_chunk_is_cut_and_else_as_it_was(kept: Path, tmp_path: Path) -> None:
     whole = in_chunks(kept, tmp_path / "whole.mcap")
     assert verify(whole).identical

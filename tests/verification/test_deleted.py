@@ -73,6 +73,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_class_that_is_gone_is_named_and_the_rest_is_identical(folder: Path) -> None:
     path = recorded(folder, "**")
     (folder / "goes_away.py").write_text(MODULE.replace("class Same", "class Renamed"))
@@ -97,6 +98,7 @@ def test_the_command_names_it_and_ends_with_2(folder: Path) -> None:
     assert "not wholly verified" in told.output
 
 
+@pytest.mark.long
 def test_it_cannot_be_verified_alone(folder: Path) -> None:
     path = recorded(folder, "**")
     delete(folder / "goes_away.py")

@@ -108,6 +108,7 @@ def test_the_debugger_goes_to_a_miss_and_asks_on_demand(asked: Path) -> None:
         assert "URLError" in made.here.text  # type: ignore[union-attr]
 
 
+@pytest.mark.long
 def test_parts_of_a_recording_keep_the_answers(asked: Path, tmp_path: Path) -> None:
     cut, parts, merged = tmp_path / "cut.mcap", tmp_path / "parts", tmp_path / "merged.mcap"
     invoke("cut", asked, "--from", "0.55", "--to", "0.95", "--out", cut, "--quiet")
@@ -141,6 +142,7 @@ def test_a_replay_asks_the_service(asked: Path, tmp_path: Path) -> None:
     assert verify(path).identical
 
 
+@pytest.mark.long
 def test_a_replay_that_begins_in_the_middle_has_the_recorded_answers_before(asked: Path, tmp_path: Path) -> None:
     path = tmp_path / "replayed.mcap"
     invoke("replay", asked, "--start", "0.75", "--one-process", "--record", path, "--quiet")
@@ -150,6 +152,7 @@ def test_a_replay_that_begins_in_the_middle_has_the_recorded_answers_before(aske
     assert verify(path).identical
 
 
+@pytest.mark.long
 def test_repeated_verification_gives_the_odds(asked: Path) -> None:
     told = invoke("verify", asked, "--repeat", "3", "--quiet")
     as_json = json.loads(invoke("verify", asked, "--repeat", "2", "--quiet", "--json"))

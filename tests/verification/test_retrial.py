@@ -33,6 +33,7 @@ def verdicts(report: VerifyReport) -> dict[str, str]:
     return {v.operator: v.verdict for v in report.operators}
 
 
+@pytest.mark.long
 def test_operators_that_share_a_module_are_identical_when_they_ran_apart(tmp_path: Path) -> None:
     report = verify(recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count"), jobs=1)
 

@@ -96,6 +96,7 @@ def test_every_call_is_in_one_slice(calls: list[tuple[int, int]], amounts: list[
     assert places == sorted(set(places))
 
 
+@pytest.mark.long
 def test_a_divided_operator_gets_the_verdict_and_the_digests_of_one_that_is_not(
     kept: Path, divided: list[dict[str, Any]]
 ) -> None:

@@ -142,7 +142,7 @@ def test_firing_records_that_are_lost_are_noticed_of_sources_as_of_operators(
         assert verdicts(one)[operator] == "unverifiable"
 
 
-@pytest.mark.parametrize("last", [3, -1], ids=["first", "none"])
+@pytest.mark.parametrize("last", [pytest.param(3, marks=pytest.mark.long), -1], ids=["first", "none"])
 def test_records_of_a_source_that_nobody_takes_are_missed_too(tmp_path: Path, last: int) -> None:
     text = """\
 graph: two

@@ -12,6 +12,7 @@ from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
 
 
+@pytest.mark.long
 def test_hard_operators_in_one_process_get_the_right_verdicts(tmp_path: Path) -> None:
     cage = CAGES["each for itself"]
     with pytest.raises(RunFailed, match="it does not close"):

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dataflow.messages import Message, Odometry, PointCloud
-from dataflow.view.keeping import KeptPoints, Points
 from dataflow.view.layout import layout
+from dataflow.view.visualizers.clouds import KeptPoints, Points
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     import rerun as rr

@@ -22,18 +22,23 @@ from dataflow.cli.support.arguments import (
     existing_recording,
     find_modules_in,
     graph_file,
+    number,
     output_file,
     span,
 )
 from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, size
 from dataflow.cli.support.run_options import LiveEffects
 
+EDITOR_COMES = 3600.0
+"""Seconds that --dap waits for an editor."""
 MOST_BYTES = 1_000_000
 """Of a captured call, which is to lie beside tests under version control."""
 
 if TYPE_CHECKING:
     from dataflow.cli.support.debug_shell import Shell
+    from dataflow.debugging.debugger import Debugger
     from dataflow.graph import Graph
+    from dataflow.view import ViewerSink
 
 
 def debug(
@@ -53,6 +58,23 @@ def debug(
     settings: Settings = None,
     path: ModuleFolders = None,
     live_effects: LiveEffects = False,
+    view: Annotated[
+        str | None,
+        typer.Option(
+            "--view",
+            metavar="TARGET",
+            help="Draw what calls were given and made: spawn, serve, rerun+http://HOST:PORT/proxy or FILE.rrd.",
+        ),
+    ] = None,
+    dap: Annotated[
+        float | None,
+        typer.Option(
+            "--dap",
+            metavar="PORT",
+            parser=number(0, 65535, "a port"),
+            help="Serve an editor's debugger there, on this machine only, in place of a prompt; 0: any free port.",
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Go to any recorded call of an operator: what it was given, what it made, its state before and after.
@@ -75,17 +97,20 @@ def debug(
       dataflow debug run.mcap odometry@12.3
       dataflow debug run.mcap odometry --do diff --do state
       dataflow debug run.mcap tracker --do "until len(out.tracks.ids) > 3"
+      dataflow debug run.mcap tracker@12.3 --dap 4711
     """
     with friendly_errors():
         recording = existing_recording(recording)
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
+        if dap is not None and (do or json or view):
+            raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
         find_modules_in(path)
         take_environment(recording)
         from dataflow.graph import load_graph
 
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-        _debug(recording, operator, loaded, do, live_effects=live_effects, json=json)
+        _debug(recording, operator, loaded, do, live_effects=live_effects, view=view, dap=dap, json=json)
 
 
 def capture(
@@ -195,7 +220,15 @@ def _capture(
 
 
 def _debug(
-    recording: Path, operator: str, graph: Graph | None, do: list[str] | None, *, live_effects: bool, json: bool
+    recording: Path,
+    operator: str,
+    graph: Graph | None,
+    do: list[str] | None,
+    *,
+    live_effects: bool,
+    view: str | None,
+    dap: float | None,
+    json: bool,
 ) -> None:
     from dataflow.cli.support.debug_shell import Shell, WrongCommand
     from dataflow.debugging.debugger import Debugger
@@ -205,15 +238,58 @@ def _debug(
     with Recording(recording) as opened:
         debugger = Debugger(opened, name, graph, live_effects=live_effects)
         begin, _ = span(opened, opened.streams) or (0, 0)
-        shell = Shell(debugger, begin, json=json)
+        viewer = None if view is None else _viewer(debugger, view)
+        shell = Shell(debugger, begin, json=json, viewer=viewer)
         try:
             first = shell.number(f"@{when}") if when else 0
+            if dap is not None:
+                _serve(debugger, int(dap), first, shell)
+                return
             begun = [f"goto {first}"] if when or do is None else []
             _converse(shell, [*begun, *(do or ())], interactive=do is None)
         except WrongCommand as error:
             raise fail(str(error)) from None
         finally:
             debugger.close()
+            if viewer is not None:
+                viewer.close()
+
+
+def _viewer(debugger: Debugger, target: str) -> ViewerSink:
+    """Opens a viewer for what an operator is given and makes, hidden in the graph or not."""
+    from dataflow.cli.support.drawing import open_sink
+    from dataflow.view import Save, ViewerError, parse_target
+
+    streams = [*debugger.node.taken, *debugger.node.outputs.values()]
+    try:
+        parsed = parse_target(target)
+        viewer = open_sink(parsed, every=0 if isinstance(parsed, Save) else None)
+        types = {stream: debugger.graph.message_types(stream)[0] for stream in streams}
+        viewer.open(types, static=[stream for stream in streams if stream in debugger.graph.static])
+    except ViewerError as error:
+        raise fail(f"--view {target}: {error}") from None
+    return viewer
+
+
+def _serve(debugger: Debugger, port: int, first: int, shell: Shell) -> None:
+    """Serves one editor, until it leaves."""
+    from dataflow.debugging.dap.session import Session, listen
+
+    try:
+        listening = listen(port)
+    except OSError as error:
+        raise fail(f"--dap {port}: {error}") from None
+    with listening:
+        listening.settimeout(EDITOR_COMES)
+        host, port = listening.getsockname()
+        out.print(f'waits for an editor on {host}:{port} (launch.json: "debugServer": {port})', soft_wrap=True)
+        try:
+            connection, _ = listening.accept()
+        except TimeoutError:
+            raise fail(f"no editor came to port {port} within {EDITOR_COMES:.0f} s") from None
+    with connection:
+        connection.settimeout(None)
+        Session(connection, debugger, first, shell.number).serve()
 
 
 def _converse(shell: Shell, lines: list[str], *, interactive: bool) -> None:

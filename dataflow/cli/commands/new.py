@@ -1,4 +1,4 @@
-"""`dataflow new operator`, `new graph`, `new project`."""
+"""`dataflow new operator`, `new graph`, `new project`, `new service`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, TypeVar
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.arguments import Json
+from dataflow.cli.support.arguments import GraphFile, Json, find_modules_in
 from dataflow.cli.support.output import fail, out, print_json
 
 HERE = Path()
@@ -26,7 +26,8 @@ def operator(
         typer.Option(
             "--kind",
             metavar="KIND",
-            help="operator: fires for each message; timer: at each tick of event time; source: reads a device.",
+            help="operator: fires for each message; timer: at each tick of event time; source: reads a device; "
+            "program: is written in C++.",
         ),
     ] = "operator",
     to: To = HERE,
@@ -41,6 +42,7 @@ def operator(
       dataflow new operator NearestObstacle
       dataflow new operator Thermometer --kind source
       dataflow new operator Watchdog --kind timer --to my_robot
+      dataflow new operator Edges --kind program
     """
     from dataflow.scaffold.files import KINDS, operator_files, snake
 
@@ -97,6 +99,54 @@ def project(
     _write({folder / file: text for file, text in made.items()}, hints, json=json)
 
 
+def service(
+    graph: GraphFile,
+    name: Annotated[
+        str | None, typer.Option("--name", metavar="NAME", help="Of the service; by default that of the graph.")
+    ] = None,
+    user: Annotated[str | None, typer.Option("--user", metavar="USER", help="Who runs it; by default you.")] = None,
+    keep_disk: Annotated[
+        str, typer.Option("--keep-disk", metavar="SIZE", help="Bytes of recordings that a run keeps.")
+    ] = "20GB",
+    days: Annotated[
+        int, typer.Option("--days", metavar="N", help="Days after which recordings are deleted.", min=1)
+    ] = 14,
+    to: To = HERE,
+    json: Json = False,
+) -> None:
+    """Write a systemd unit that runs a graph live from the start of the machine, in this folder and installation.
+
+    A graph with a flight recorder keeps what that keeps; any other is recorded into out/, in files of ten minutes, the
+    oldest of which are deleted beyond `--keep-disk`. The second file deletes the recordings of earlier runs.
+
+    Examples:
+
+      dataflow new service robot.yaml
+      dataflow new service robot.yaml --user robot --keep-disk 50GB --to deploy
+    """
+    import getpass
+    import sys
+
+    from dataflow.cli.support.arguments import graph_file
+    from dataflow.cli.support.output import friendly_errors
+    from dataflow.graph import load_graph
+    from dataflow.scaffold.files import service_files
+
+    file = graph_file(graph)
+    find_modules_in(None)
+    with friendly_errors():
+        loaded = load_graph(file, live=True)
+    flight, folder = loaded.record.flight, Path.cwd()
+    command = [str(Path(sys.prefix, "bin", "dataflow")), "run", str(file.resolve()), "--live", "--quiet"]
+    if flight is None:
+        command += ["--record", "out/{time}.mcap", "--split-every", "10min", "--keep-disk", keep_disk]
+    kept = folder / (flight.folder if flight is not None else "out")
+    wanted, who = name or loaded.name, user or getpass.getuser()
+    files = _named(lambda: service_files(wanted, command, folder=folder, out=kept, user=who, days=days))
+    hints = (f"check it: systemd-analyze verify {_shown(to / f'{wanted}.service')}", "install it as its head describes")
+    _write({to / made: text for made, text in files.items()}, hints, json=json)
+
+
 def _named(make: Callable[[], Made]) -> Made:
     """Ends the command where a name cannot be."""
     from dataflow.scaffold.files import NameFault
@@ -117,8 +167,8 @@ def _package(folder: Path) -> str:
 
 
 def _write(files: Mapping[Path, str], hints: tuple[str, ...], *, json: bool) -> None:
-    """Writes all files or none: one that is there already is never replaced."""
-    present = [file for file in files if file.exists()]
+    """Writes all files or none: one that is there already with another content is never replaced."""
+    present = [file for file, text in files.items() if file.exists() and file.read_bytes() != text.encode()]
     if present:
         raise fail(f"{present[0]} is there already; choose another name or folder")
     for file, text in files.items():

@@ -22,7 +22,10 @@ from dataflow.cli.support.execution import checked_outputs, execute, plan_option
 from dataflow.cli.support.output import fail, friendly_errors
 from dataflow.cli.support.run_options import (
     Compression,
+    Here,
     Json,
+    Keys,
+    Listen,
     Live,
     LogLevel,
     OneProcess,
@@ -38,6 +41,7 @@ from dataflow.cli.support.run_options import (
     Timeout,
     Verbose,
     View,
+    machines_of,
 )
 from dataflow.cli.support.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
 
@@ -48,6 +52,9 @@ def run(
     graph: GraphFile,
     settings: Settings = None,
     path: ModuleFolders = None,
+    listen: Listen = None,
+    keys_folder: Keys = None,
+    here: Here = False,
     rate: Rate = None,
     step: Step = False,
     timeout: Timeout = 120.0,
@@ -84,8 +91,7 @@ def run(
     everything on its way is finished, files are closed; a second Ctrl-C ends it at once.
 
     In a terminal, space pauses a run that is not live and lets it go on, the right arrow or n makes one step, + and -
-    double and halve its speed, q ends it; `dataflow playback` does the same from elsewhere. Results do not depend on
-    that.
+    double and halve its speed, q ends it; `dataflow playback` does the same from elsewhere, with the same results.
 
     A graph with `record: {keep: 60s}` has a flight recorder, unless --record keeps everything: what was is kept on a
     trigger, with `dataflow trigger`, or by the key k.
@@ -94,12 +100,10 @@ def run(
 
       dataflow run graphs/synthetic_rgbd.yaml
       dataflow run graphs/synthetic_rgbd.yaml --record run.mcap --view spawn
-      dataflow run graphs/synthetic_rgbd.yaml --record run.mcap --compression lz4
       dataflow run graphs/rgbd_perception.yaml --set data=FOLDER
-      dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
       dataflow run graphs/synthetic_rgbd.yaml --process-each --rate 1 --json
       dataflow run graphs/simulated_robot.yaml --rate 1 --step --view spawn
-      dataflow run graphs/simulated_robot.yaml --live --record live.mcap
+      dataflow run two_machines.yaml --live --listen tls/192.168.1.2:7447 --keys laptop
       dataflow run robot.yaml --live --record "out/{time}.mcap" --keep-disk 20GB
       dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """
@@ -128,7 +132,7 @@ def run(
         outputs = checked_outputs(record, view, open_view, overwrite, storage)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         controls = keys(quiet or json, live=live, flight=flight)
-        options |= {"live": live, "paused": step, "controls": controls}
+        options |= {"live": live, "paused": step, "controls": controls, **machines_of(listen, keys_folder, here=here)}
         if compression is not None:
             if record is None and not flight:
                 raise fail("--compression is of a recording: name one with --record")

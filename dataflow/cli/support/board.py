@@ -19,7 +19,7 @@ from dataflow.supervision.core.watchers.lateness import LATE, held_up_by
 from dataflow.sync import FOREVER, NEVER
 
 if TYPE_CHECKING:
-    from dataflow.client.processes import ProcessStatus
+    from dataflow.client.processes import MachineStatus, ProcessStatus
     from dataflow.transport.registry import RunningGraph
 
 PATHS = 10
@@ -64,12 +64,13 @@ class Row:
 @dataclass(frozen=True, slots=True)
 class Sample:
     """The graph at one moment: its operators, the sources behind the clock with who holds each up, the notes of
-    operators, the latencies of its paths."""
+    operators, the latencies of its paths, the other machines."""
 
     rows: Sequence[Row]
     behind: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
     paths: Sequence[PathLatency] = ()
+    machines: Mapping[str, MachineStatus] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -98,7 +99,8 @@ class Board:
         lags = _lags(counts)
         rows = [_row(health, told.get(health.operator), lags, health.operator in answered) for health in healths]
         paths = batch_latencies(self.graph, (batch for status in statuses for batch in status.firings))
-        return Sample(rows, _late_sources(rows, told), _notes(rows), paths)
+        found = {name: text for status in told.values() for name, text in status.found.items()}
+        return Sample(rows, _late_sources(rows, told), _notes(rows, found), paths)
 
 
 def _row(health: Health, status: ProcessStatus | None, lags: Mapping[str, float | None], answered: bool) -> Row:
@@ -144,8 +146,9 @@ def _late_sources(rows: Sequence[Row], told: Mapping[str, ProcessStatus]) -> dic
     return said
 
 
-def _notes(rows: Sequence[Row]) -> list[str]:
-    return [f"{row.operator}: {row.note}" for row in rows if row.note]
+def _notes(rows: Sequence[Row], found: Mapping[str, str]) -> list[str]:
+    notes = [f"{row.operator}: {row.note}" for row in rows if row.note]
+    return notes + [f"{row.operator}: {found[row.operator]}" for row in rows if row.operator in found]
 
 
 def as_json(sample: Sample) -> dict[str, Any]:
@@ -153,6 +156,7 @@ def as_json(sample: Sample) -> dict[str, Any]:
         "operators": [asdict(row) for row in sample.rows],
         "notes": [*sample.behind.values(), *sample.notes],
         "latencies": [path.as_json() for path in sample.paths],
+        "machines": {name: asdict(state) for name, state in sample.machines.items()},
     }
 
 
@@ -163,9 +167,17 @@ def shown(sample: Sample, found: RunningGraph) -> RenderableType:
     """The operators, the notes, and the slowest paths."""
     parts: list[RenderableType] = [operators_table(sample.rows, title(found.name, found.started))]
     parts += [Text(note, style="yellow") for note in (*sample.behind.values(), *sample.notes)]
+    parts += [Text(machine_line(name, state)) for name, state in sample.machines.items()]
     if sample.paths:
         parts += [Text(), paths_table(sample.paths)]
     return Group(*parts)
+
+
+def machine_line(name: str, state: MachineStatus) -> str:
+    """Returns such as "machine robot: link up, clock +1.250 ms ± 0.300 ms"."""
+    dropped = f", {state.dropped} messages dropped" if state.dropped else ""
+    clock = f"clock {state.offset / 1e6:+.3f} ms ± {state.delay / 2e6:.3f} ms"
+    return f"machine {name}: link {'up' if state.up else 'down'}, {clock}{dropped}"
 
 
 def title(name: str, started: float) -> Text:

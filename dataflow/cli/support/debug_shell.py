@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import cmd
 from collections.abc import Iterator, Mapping
+from itertools import chain, count, takewhile
+from rlcompleter import Completer
 from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
@@ -14,10 +16,12 @@ from dataflow.cli.support.verdicts import difference_text
 from dataflow.execution.snapshots import changes
 from dataflow.messages.base import Message
 from dataflow.messages.display.text import field_text
+from dataflow.sync.entries import entries_of
 
 if TYPE_CHECKING:
     from dataflow.debugging.debugger import Debugger
     from dataflow.debugging.fired import Fired
+    from dataflow.view import ViewerSink
 
 MOST_FIELDS = 8
 """Fields that are shown of an output that differs."""
@@ -30,15 +34,18 @@ class WrongCommand(ValueError):
 class Shell(cmd.Cmd):
     """Reads lines, goes there, and prints what is there.
 
-    `origin`: the stamp of 0 s, ns; `json`: calls are printed as one JSON object a line.
+    `origin`: the stamp of 0 s, ns; `json`: calls are printed as one JSON object a line; `viewer`: draws what the calls
+    that are gone to were given and made.
     """
 
     prompt = "(dataflow) "
     doc_header = "Commands (help COMMAND shows more)"
 
-    def __init__(self, debugger: Debugger, origin: int, *, json: bool = False) -> None:
+    def __init__(
+        self, debugger: Debugger, origin: int, *, json: bool = False, viewer: ViewerSink | None = None
+    ) -> None:
         super().__init__()
-        self._debugger, self._origin, self._json = debugger, origin, json
+        self._debugger, self._origin, self._json, self._viewer = debugger, origin, json, viewer
         self.failed = False
         """True when the last line could not be done."""
 
@@ -178,7 +185,18 @@ class Shell(cmd.Cmd):
     def _complete_output(self, text: str, *ignored: Any) -> list[str]:
         return [n for n in self._debugger.node.outputs if n.startswith(text)]
 
-    complete_inputs, complete_outputs = _complete_input, _complete_output
+    def _complete_part(self, text: str, *ignored: Any) -> list[str]:
+        states = (None, None) if self._debugger.at is None else self._debugger.at.states()
+        return sorted(n for n in {*(states[0] or ()), *(states[1] or ())} if n.startswith(text))
+
+    def _complete_expression(self, text: str, *ignored: Any) -> list[str]:
+        names = {} if self._debugger.at is None else self._debugger.at.names() | dict.fromkeys(("before", "after"))
+        completer = Completer(names)
+        found = takewhile(bool, (completer.complete(text, n) for n in count()))
+        return [word for word in found if word is not None and (text or word in names)]
+
+    complete_inputs, complete_outputs, complete_state = _complete_input, _complete_output, _complete_part
+    complete_until = complete_print = complete_p = _complete_expression
 
     def _words(self) -> list[str]:
         names = (name.removeprefix("do_") for name in self.get_names() if name.startswith("do_"))
@@ -205,7 +223,13 @@ class Shell(cmd.Cmd):
         if self._json:
             print_json_line(self.values(fired))
         else:
-            out.print(Text("\n").join(self.lines(fired)), soft_wrap=True)
+            for line in self.lines(fired):  # the state may take a moment longer than the rest
+                out.print(line, soft_wrap=True)
+        if self._viewer is not None and fired.firing is not None:
+            given = (entry for value in fired.firing.inputs.values() for entry in entries_of(value))
+            made = ((made.stream, made.here) for made in fired.made if made.here is not None)
+            for stream, message in chain(((entry.stream, entry.value) for entry in given), made):
+                self._viewer.log(stream, message)
 
     def values(self, fired: Fired) -> dict[str, Any]:
         """A call as JSON values."""

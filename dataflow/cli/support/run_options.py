@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from dataflow.cli.support.arguments import FLAG, number
+from dataflow.cli.support.output import fail
 
 PLACEMENT, OUTPUT = "Placement", "Results"
 
@@ -83,6 +84,25 @@ Rate = Annotated[
 Step = Annotated[
     bool, typer.Option("--step", metavar=FLAG, help="Begin paused: → or n makes a step, space lets it go on.")
 ]
+Listen = Annotated[
+    str | None,
+    typer.Option(
+        "--listen",
+        metavar="ENDPOINT",
+        rich_help_panel=PLACEMENT,
+        help="Where other machines join, and tools with keys: tls/ADDRESS:PORT, with --keys.",
+    ),
+]
+Keys = Annotated[
+    Path | None,
+    typer.Option("--keys", metavar="FOLDER", rich_help_panel=PLACEMENT, help="This machine's keys (`dataflow keys`)."),
+]
+Here = Annotated[
+    bool,
+    typer.Option(
+        "--here", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run everything here, without regard to `machine:`."
+    ),
+]
 Timeout = Annotated[
     float,
     typer.Option(
@@ -127,3 +147,14 @@ Verbose = Annotated[
     typer.Option("--verbose", "-v", metavar=FLAG, help="Report every operator, every figure, every loss."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]
+
+
+def machines_of(listen: str | None, keys: Path | None, *, here: bool) -> dict[str, Any]:
+    """Returns the field of a `RunPlan` for other machines, if an option is about them."""
+    from dataflow.supervision.plan import Meeting
+
+    if here and listen is not None:
+        raise fail("--here runs everything on this machine; --listen is for others")
+    if keys is not None and listen is None:
+        raise fail("--keys is for --listen: where do other machines join?")
+    return {"machines": Meeting(listen, keys)} if listen is not None else {"machines": None} if here else {}

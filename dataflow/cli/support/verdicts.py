@@ -190,6 +190,8 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
     yield from _left_out(v)
     for file in v.files_changed:
         yield f"{v.operator}: file {file} is not the one that was read then"
+    if v.code_changed:
+        yield f"{v.operator}: its code is not what it was: {', '.join(v.code_changed)}"
 
 
 def _cut(report: VerifyReport) -> str:

@@ -6,15 +6,17 @@ What comes out names operators by their full names and still has inputs as key e
 from __future__ import annotations
 
 import posixpath
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
+
+import pydantic
 
 from dataflow.graph.drafts import Absence, Alias, Choice, Draft, Expansion, GraphInput, Pattern, Scope
-from dataflow.graph.expansion.conditions import failed
 from dataflow.graph.expansion.graph_parameters import GraphParameters
-from dataflow.graph.expansion.operator_parameters import operator_parameters
 from dataflow.graph.expansion.settings import Setting, overridden, read_settings
-from dataflow.graph.expansion.wiring import Wiring
+from dataflow.graph.expansion.wiring import OR, Wiring
 from dataflow.graph.keys import NAME_RULE, has_wildcard, key_fault, name_fault
 from dataflow.graph.lookup import NotFound, find_operator
 from dataflow.graph.model import current_path
@@ -23,10 +25,11 @@ from dataflow.graph.yaml import document
 from dataflow.graph.yaml.fields import Fields
 from dataflow.graph.yaml.limits import MAX_DEPTH, MAX_OPERATORS, Budget
 from dataflow.graph.yaml.references import substitute
-from dataflow.graph.yaml.tree import Entry, Items, Leaf, Table, Tree
+from dataflow.graph.yaml.tree import UNKNOWN, Entry, Items, Leaf, Table, Tree, at, describe, plain, unknown
 from dataflow.messages.base import Message, message_types
 from dataflow.operator import Operator
 
+NOT = "not "
 TOP_KEYS = (
     "graph", "namespace", "params", "inputs", "operators", "outputs", "record", "view", "seed", "threads", "network",
 )  # fmt: skip
@@ -36,6 +39,91 @@ OPTIONAL = "?"
 """Ends the type of an input of a nested graph that need not be given."""
 ReadFile = Callable[[str], str]
 """Text of a graph file by its path relative to the root file's folder; raises OSError or UnicodeDecodeError."""
+
+
+def operator_parameters(
+    full: str, cls: type[Operator], given: Table, place: Place, problems: Problems
+) -> dict[str, Any]:
+    """Returns the values of an operator's parameters as plain values; faults go to `problems`.
+
+    `full`: the operator's name; `place`: where a parameter that is missing is reported.
+    """
+    known = {key: e for key, e in given.entries.items() if not unknown(e.value)}
+    reported = given.entries.keys() - known.keys()
+    try:
+        values = cls.spec.parameters(**plain(Table(known, given.place)))
+    except pydantic.ValidationError as error:
+        for fault in error.errors():
+            if fault["loc"][:1] not in {(name,) for name in reported}:
+                _report(full, cls, fault, given, place, problems)
+        return {}
+    except Exception as error:  # a parameter type's own validator may raise anything
+        problems.add(given.place, f"{full}: {type(error).__name__}: {error}")
+        return {}
+    return values.model_dump(mode="json")
+
+
+def _report(full: str, cls: type[Operator], fault: Any, given: Table, place: Place, problems: Problems) -> None:
+    fields = cls.spec.parameters.model_fields
+    path = tuple(fault["loc"])
+    name = ".".join(map(str, path))
+    match fault["type"]:
+        case "extra_forbidden" if len(path) == 1 and name in given.entries:
+            hint = did_you_mean(name, fields, f"parameters of {cls.__name__}")
+            key = given.entries[name].key.place
+            problems.add(key, f"{full}: {cls.__name__} has no parameter {name!r}", hint)
+        case "missing" if len(path) == 1:
+            doc = fields[name].description or ""
+            problems.add(place, f"{full}: parameter {name!r} must be given", f"{name}: {doc}")
+        case _:
+            value = at(given, path)
+            message = str(fault["msg"]).removeprefix("Value error, ")
+            message = message[:1].lower() + message[1:]
+            if fault["type"].endswith("_parsing") or fault["type"] == "int_from_float":
+                message = message.partition(", ")[0]  # what it got stands behind it anyway
+            hint = f"{path[0]}: {fields[str(path[0])].description}" if path and str(path[0]) in fields else ""
+            if fault["type"] == "string_type" and isinstance(value, Leaf) and not isinstance(value.value, str):
+                hint = f"write '{value.raw}' in quotes"
+            elif fault["type"] in ("literal_error", "enum") and isinstance(value, Leaf):
+                near = nearest(str(value.value), re.findall(r"'([^']*)'", message))
+                hint = f"did you mean {near!r}?" if near else hint
+            said = value.raw if isinstance(value, Leaf) else describe(value)
+            problems.add(value.place, f"{full}: parameter {name!r}: {message}, got {said}", hint)
+
+
+def failed(tree: Tree | None, inputs: Mapping[str, GraphInput], problems: Problems) -> str | None:
+    """The condition that does not hold, as it is written, or None where all do; reports what is none."""
+    if tree is None:
+        return None
+    for leaf in tree.items if isinstance(tree, Items) else (tree,):
+        if isinstance(leaf, Leaf) and (leaf.value is True or leaf.value is UNKNOWN):
+            continue
+        if isinstance(leaf, Leaf) and leaf.value is False:
+            return "false"
+        if not (isinstance(leaf, Leaf) and isinstance(leaf.value, str)):
+            what = f"when must be true, false or inputs of this graph, not {describe(leaf)}"
+            problems.add(leaf.place, what, "such as 'imu', 'not imu' or 'imu | wheels', or a list of these")
+        else:
+            words = [_holds(word.strip(), leaf, inputs, problems) for word in leaf.value.split(OR)]
+            if not any(words):
+                return leaf.value
+    return None
+
+
+def _holds(word: str, leaf: Leaf, inputs: Mapping[str, GraphInput], problems: Problems) -> bool:
+    name = word.removeprefix(NOT).strip()
+    if name not in inputs:
+        hint = did_you_mean(name, inputs, "its inputs") if inputs else "this graph has no inputs"
+        problems.add(leaf.place, f"when: {name!r} is no input of this graph", hint)
+        return True
+    return any(given(choice) for choice in inputs[name].choices) != word.startswith(NOT)
+
+
+def given(entry: Choice | Pattern) -> bool:
+    """Tells whether an outer graph has given something, whatever becomes of what makes it."""
+    if isinstance(entry, Pattern):
+        return True
+    return any(given(inner) for way in entry.ways for inner in way)
 
 
 class Expander:

@@ -15,7 +15,7 @@ from dataflow.graph.resolution.order import fed_by_devices, in_order, refuse_stu
 from dataflow.graph.resolution.policies import live_policy, sync_every, sync_tolerance
 from dataflow.graph.resolution.presence import said
 from dataflow.graph.resolution.streams import Streams
-from dataflow.graph.sections import ON_FAILURE, PANELS, Record, View
+from dataflow.graph.sections import ON_FAILURE, PANELS, Record, Snapshots, View
 from dataflow.graph.yaml.fields import Fields
 from dataflow.graph.yaml.tree import Leaf, Tree
 from dataflow.operator import InputPort, is_source
@@ -237,10 +237,15 @@ class Resolver:
         kept -= set(self.topics(table.get("exclude"), "exclude"))
         external = {d.name for d in drafts if d.cls.external}
         kept |= {name for name, stream in self.streams.items() if stream.node in external}
-        snapshots = self.fields.duration(table.get("snapshots"), "snapshots")
-        if snapshots == 0:
-            self.problems.add(table.get("snapshots").place, "snapshots must be further apart than 0")  # type: ignore[union-attr]
+        spacing = table.get("snapshots")
+        by_cpu = isinstance(spacing, Leaf) and spacing.value == "cpu"
+        snapshots: Snapshots | None = "cpu" if by_cpu else self.fields.duration(spacing, "snapshots")
         flight = read_flight(table, self.fields, [draft.name for draft in drafts], self.topics)
+        if spacing is not None and snapshots == 0:
+            self.problems.add(spacing.place, "snapshots must be further apart than 0")
+        if spacing is not None and by_cpu and flight is not None:
+            problem = "snapshots: cpu may be far apart in event time; a flight recorder needs a duration, such as 10s"
+            self.problems.add(spacing.place, problem)
         if flight is not None and snapshots is None:
             snapshots = max(flight.keep // 6, 1_000_000_000)
         on_failure = self.fields.choice(table.get("on_failure"), "on_failure", ON_FAILURE)

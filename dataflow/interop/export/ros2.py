@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -13,7 +14,7 @@ from dataflow.interop.bag import Topic
 from dataflow.interop.export.extras import ROSBAG2, carry
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
-from dataflow.interop.ros.made import Made, typestore
+from dataflow.interop.ros.made import typestore
 from dataflow.interop.ros.outward import OUTWARD
 from dataflow.interop.topics import UNIT
 from dataflow.interop.typestores import RosType, ros_type
@@ -210,10 +211,11 @@ def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exp
         static = material.streams[name].static
         topic = _topic_of(material, name)
         try:
-            kind_of, message = _made(material.streams[name].metadata.get("type", ""), recorded.message)
+            message = _made(material.streams[name].metadata.get("type", ""), recorded.message)
         except RecordingError as error:
             done.lose(topic, str(error))
             continue
+        kind_of = message.__msgtype__
         if kind_of not in schemas:
             schemas[kind_of] = SchemaText(kind_of, "ros2msg", store.generate_msgdef(kind_of, ros_version=2)[0].encode())
         stamp = begin if static else recorded.stamp
@@ -236,13 +238,11 @@ def _topic_of(material: Material, name: str) -> str:
     return _ros_name(material.names[name])
 
 
-def _made(recorded_as: str, message: Message) -> Made:
+def _made(recorded_as: str, message: Message) -> Any:
     """The ROS message; a single transform as one where the topic held such."""
-    if isinstance(message, Transforms) and ros_type(recorded_as) == "geometry_msgs/msg/TransformStamped":
-        rows = OUTWARD[Transforms](message)[1].transforms
-        if len(rows) == 1:
-            return "geometry_msgs/msg/TransformStamped", rows[0]
-    return OUTWARD[type(message)](message)
+    made = OUTWARD[type(message)](message)
+    single = isinstance(message, Transforms) and ros_type(recorded_as) == "geometry_msgs/msg/TransformStamped"
+    return made.transforms[0] if single and len(made.transforms) == 1 else made
 
 
 _NO_PLACE: dict[type[Message], tuple[str, ...]] = {

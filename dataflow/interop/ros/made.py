@@ -11,9 +11,6 @@ from rosbags.typesys.store import Typestore
 
 from dataflow.recording.errors import RecordingError
 
-Made = tuple[str, Any]
-"""(ROS type, ROS message)"""
-
 _VISION = {
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
     "vision_msgs/msg/ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\n"
@@ -73,6 +70,11 @@ def time(stamp: int) -> Any:
 def header_of(stamp: int, frame: str) -> Any:
     """A std_msgs/Header."""
     return make("std_msgs/Header", stamp=time(stamp), frame_id=frame)
+
+
+def stamped(kind: str, message: Any, /, **fields: Any) -> Any:
+    """A ROS message whose header has the stamp and the frame of a message."""
+    return make(kind, header=header_of(message.stamp, message.frame), **fields)
 
 
 def vector(values: Any) -> Any:

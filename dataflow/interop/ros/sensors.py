@@ -6,23 +6,9 @@ from typing import Any
 
 import numpy as np
 
+import dataflow.messages as messages
 from dataflow.interop.ros.values import covariance, optional, orientation, vector
 from dataflow.interop.seen import lose
-from dataflow.messages import (
-    Alarm,
-    Diagnostics,
-    Imu,
-    JointState,
-    LaserScan,
-    MagneticField,
-    Measurement,
-    NavSatFix,
-    Number,
-    OccupancyGrid,
-    RangeReading,
-    Switch,
-    Text,
-)
 from dataflow.messages.poses import COVARIANCE_TYPES
 from dataflow.recording.errors import RecordingError
 
@@ -32,7 +18,7 @@ _LEVELS = {1: "debug", 2: "info", 4: "warning", 8: "error", 16: "fatal"}
 _ABSENT = -1.0
 
 
-def imu(message: Any, stamp: int) -> Imu:
+def imu(message: Any, stamp: int) -> messages.Imu:
     """sensor_msgs/Imu; without an orientation where its covariance begins with -1 (REP 145), or it is all zeros or
     no number."""
     turned = message.orientation
@@ -40,7 +26,7 @@ def imu(message: Any, stamp: int) -> Imu:
     known = message.orientation_covariance[0] != _ABSENT and bool(values.any() and np.isfinite(values).all())
     if not known and message.orientation_covariance[0] != _ABSENT and values.any():
         lose(message, "an orientation of NaN")
-    return Imu(
+    return messages.Imu(
         stamp=stamp,
         frame=message.header.frame_id,
         angular_velocity=vector(message.angular_velocity),
@@ -56,9 +42,9 @@ def _known(values: Any) -> Any:
     return None if values[0] == _ABSENT else covariance(values, 3)
 
 
-def magnetic_field(message: Any, stamp: int) -> MagneticField:
+def magnetic_field(message: Any, stamp: int) -> messages.MagneticField:
     """sensor_msgs/MagneticField."""
-    return MagneticField(
+    return messages.MagneticField(
         stamp=stamp,
         frame=message.header.frame_id,
         field=vector(message.magnetic_field),
@@ -66,13 +52,13 @@ def magnetic_field(message: Any, stamp: int) -> MagneticField:
     )
 
 
-def laser_scan(message: Any, stamp: int) -> LaserScan:
+def laser_scan(message: Any, stamp: int) -> messages.LaserScan:
     """sensor_msgs/LaserScan; the last beam's angle follows from the increment, as does the duration of a scan where
     beams have times."""
     count = len(message.ranges)
     intensities = optional(message.intensities, "<f4")
     step = float(message.time_increment)
-    return LaserScan(
+    return messages.LaserScan(
         stamp=stamp,
         frame=message.header.frame_id,
         angle_min=float(message.angle_min),
@@ -85,7 +71,7 @@ def laser_scan(message: Any, stamp: int) -> LaserScan:
     )
 
 
-def nav_sat_fix(message: Any, stamp: int) -> NavSatFix:
+def nav_sat_fix(message: Any, stamp: int) -> messages.NavSatFix:
     """sensor_msgs/NavSatFix; no fix where it has no position."""
     kind = int(message.position_covariance_type)
     placed = bool(np.isfinite([message.latitude, message.longitude]).all())
@@ -96,7 +82,7 @@ def nav_sat_fix(message: Any, stamp: int) -> NavSatFix:
     if not placed and int(message.status.status) >= 0:
         lose(message, "a status of a fix without a position")
     errors = covariance(message.position_covariance, 3) if kind else None
-    return NavSatFix(
+    return messages.NavSatFix(
         stamp=stamp,
         frame=message.header.frame_id,
         status=_FIX.get(int(message.status.status), "no_fix") if placed else "no_fix",
@@ -108,7 +94,7 @@ def nav_sat_fix(message: Any, stamp: int) -> NavSatFix:
     )
 
 
-def joint_state(message: Any, stamp: int) -> JointState:
+def joint_state(message: Any, stamp: int) -> messages.JointState:
     """sensor_msgs/JointState. Joints without names are numbered; values of another number than the joints are not
     known."""
     values = {name: optional(getattr(message, name), "<f8") for name in ("position", "velocity", "effort")}
@@ -119,7 +105,7 @@ def joint_state(message: Any, stamp: int) -> JointState:
         if found is not None and len(found) != len(names):
             lose(message, f"{name}, of {len(found)} joints where {len(names)} are named")
             values[name] = None
-    return JointState(
+    return messages.JointState(
         stamp=stamp,
         names=names,
         positions=values["position"],
@@ -128,10 +114,10 @@ def joint_state(message: Any, stamp: int) -> JointState:
     )
 
 
-def occupancy_grid(message: Any, stamp: int) -> OccupancyGrid:
+def occupancy_grid(message: Any, stamp: int) -> messages.OccupancyGrid:
     """nav_msgs/OccupancyGrid."""
     info = message.info
-    return OccupancyGrid(
+    return messages.OccupancyGrid(
         stamp=stamp,
         frame=message.header.frame_id,
         resolution=float(info.resolution),
@@ -141,10 +127,10 @@ def occupancy_grid(message: Any, stamp: int) -> OccupancyGrid:
     )
 
 
-def diagnostics(message: Any, stamp: int) -> Diagnostics:
+def diagnostics(message: Any, stamp: int) -> messages.Diagnostics:
     """diagnostic_msgs/DiagnosticArray."""
     pairs = [(i, pair) for i, status in enumerate(message.status) for pair in status.values]
-    return Diagnostics(
+    return messages.Diagnostics(
         stamp=stamp,
         names=tuple(status.name for status in message.status),
         messages=tuple(status.message for status in message.status),
@@ -156,10 +142,10 @@ def diagnostics(message: Any, stamp: int) -> Diagnostics:
     )
 
 
-def log(message: Any, stamp: int) -> Alarm:
+def log(message: Any, stamp: int) -> messages.Alarm:
     """rosgraph_msgs/Log and rcl_interfaces/Log."""
     level = int(message.level)
-    return Alarm(
+    return messages.Alarm(
         stamp=stamp,
         level=_LEVELS.get(level)
         or {10: "debug", 20: "info", 30: "warning", 40: "error", 50: "fatal"}.get(level, "info"),
@@ -168,23 +154,23 @@ def log(message: Any, stamp: int) -> Alarm:
     )
 
 
-def number(message: Any, stamp: int, unit: str = "") -> Number:
+def number(message: Any, stamp: int, unit: str = "") -> messages.Number:
     """std_msgs numbers."""
     value = float(message.data)
     if isinstance(message.data, int) and int(value) != message.data:
         lose(message, "digits beyond 53 bits")
-    return Number(stamp=stamp, value=value, unit=unit)
+    return messages.Number(stamp=stamp, value=value, unit=unit)
 
 
 UNITS = {"temperature": "°C", "fluid_pressure": "Pa", "illuminance": "lx", "relative_humidity": ""}
 """By the field that holds the value."""
 
 
-def measurement(message: Any, stamp: int) -> Measurement:
+def measurement(message: Any, stamp: int) -> messages.Measurement:
     """sensor_msgs/Temperature, FluidPressure, Illuminance and RelativeHumidity."""
     name = next(name for name in UNITS if hasattr(message, name))
     variance = float(message.variance)
-    return Measurement(
+    return messages.Measurement(
         stamp=stamp,
         frame=message.header.frame_id,
         value=float(getattr(message, name)),
@@ -193,10 +179,10 @@ def measurement(message: Any, stamp: int) -> Measurement:
     )
 
 
-def range_reading(message: Any, stamp: int) -> RangeReading:
+def range_reading(message: Any, stamp: int) -> messages.RangeReading:
     """sensor_msgs/Range, with the variance that it has since Jazzy."""
     variance = float(getattr(message, "variance", 0.0))
-    return RangeReading(
+    return messages.RangeReading(
         stamp=stamp,
         frame=message.header.frame_id,
         range=float(message.range),
@@ -208,11 +194,11 @@ def range_reading(message: Any, stamp: int) -> RangeReading:
     )
 
 
-def text(message: Any, stamp: int) -> Text:
+def text(message: Any, stamp: int) -> messages.Text:
     """std_msgs/String."""
-    return Text(stamp=stamp, text=message.data)
+    return messages.Text(stamp=stamp, text=message.data)
 
 
-def switch(message: Any, stamp: int) -> Switch:
+def switch(message: Any, stamp: int) -> messages.Switch:
     """std_msgs/Bool."""
-    return Switch(stamp=stamp, on=bool(message.data))
+    return messages.Switch(stamp=stamp, on=bool(message.data))

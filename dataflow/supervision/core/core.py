@@ -16,10 +16,12 @@ from dataflow.supervision.core.commands import Announce, Command, Over, Withdraw
 from dataflow.supervision.core.events import (
     Aborted,
     Begin,
+    ClockMeasured,
     Died,
     Event,
     HungUp,
     LeftBehind,
+    LinkChanged,
     Moment,
     NotReading,
     Paused,
@@ -110,6 +112,10 @@ class Core:
             case Remained(label, remains):
                 for part in self._parts:
                     part.remained(self.run.processes[label], remains)
+            case LinkChanged(machine, labels, up):
+                self.run.link_changed(machine, labels, up=up)
+            case ClockMeasured(machine, offset, delay):
+                self.run.clock_measured(machine, offset, delay)
             case Died(label, code):
                 self._died(self.run.processes[label], code)
 

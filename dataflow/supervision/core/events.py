@@ -127,6 +127,24 @@ class Died:
     code: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class LinkChanged:
+    """The link to another machine, on which these processes run, went down or came up again."""
+
+    machine: str
+    labels: tuple[str, ...]
+    up: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ClockMeasured:
+    """The clock of another machine is ahead of this one's by `offset` ns, which is at most half of `delay` ns wrong."""
+
+    machine: str
+    offset: int
+    delay: int
+
+
 Event = (
     Begin
     | Tick
@@ -142,4 +160,6 @@ Event = (
     | LeftBehind
     | Remained
     | Died
+    | LinkChanged
+    | ClockMeasured
 )

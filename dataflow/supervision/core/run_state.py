@@ -17,6 +17,9 @@ from dataflow.supervision.core.stack_traces import shortened
 from dataflow.supervision.core.supervised import Supervised
 from dataflow.supervision.plan import ProcessPlan, RunPlan, taken_keys
 
+CLOCK_EVERY = 10.0
+"""Seconds between two events that store the offset of a machine's clock."""
+
 
 class Phase(Enum):
     """Phases of a run, which only goes forward."""
@@ -48,6 +51,9 @@ class RunState:
         self.status = Status()
         self.now = Moment(0.0, 0.0)
         self.release: Release | None = None
+        self._clocks: dict[str, float] = {}
+        self.unreachable: set[str] = set()
+        """The processes on machines of which nothing is heard."""
         self._phase = Phase.STARTING
         self._commands: list[Command] = []
         for label, process in self.processes.items():
@@ -149,6 +155,26 @@ class RunState:
     def note(self, text: str) -> None:
         """Shows a message to the user, at once and in the report."""
         self.status.notes.append(text)
+
+    def link_changed(self, machine: str, labels: Collection[str], *, up: bool) -> None:
+        """Notes that processes on another machine are out of reach, or no longer: none of them need have ended."""
+        if up:
+            self.unreachable -= set(labels)
+        else:
+            self.unreachable |= set(labels)
+        what = "is back" if up else "is down: nothing of that machine is heard, and its operators go on"
+        self.event("link", f"the link to machine {machine!r} {what}", machine=machine, up=up)
+
+    def clock_measured(self, machine: str, offset: int, delay: int) -> None:
+        """Stores by how much the clock of another machine is ahead (ns), now and then, and shows it the first time."""
+        if self.release is None or self.steady - self._clocks.get(machine, -CLOCK_EVERY) < CLOCK_EVERY:
+            return
+        text = f"the clock of machine {machine!r} is {offset / 1e6:+.3f} ms ahead, ± {delay / 2e6:.3f} ms"
+        if machine not in self._clocks:
+            self.note(text)
+        self._clocks[machine] = self.steady
+        data = {"text": text, "machine": machine, "offset": offset, "delay": delay}
+        self.tell_recorder("event", name="clock", stamp=self.event_time(), data=data)
 
     def tell_recorder(self, kind: str, /, **fields: Any) -> None:
         for process in self.processes.values():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,9 +37,7 @@ class LabelledImage:
 
     def read(self) -> NDArray[np.uint8]:
         """The pixels (H, W, 3), RGB. Raises DataError where the file is no image or not of the labelled size."""
-        pixels = cv2.imread(str(self.file), cv2.IMREAD_COLOR_RGB)
-        if pixels is None:
-            raise DataError(f"{self.file} cannot be read as an image")
+        pixels = read_image(self.file)
         size = (pixels.shape[1], pixels.shape[0])
         if self.size is not None and self.size != size:
             raise DataError(
@@ -84,6 +83,14 @@ class DetectionData:
             training=tuple(map(chosen, self.training)),
             validation=tuple(map(chosen, self.validation)),
         )
+
+
+def read_image(file: Path, how: int = cv2.IMREAD_COLOR_RGB) -> NDArray[Any]:
+    """The pixels (H, W, 3), RGB, of an image file, or as OpenCV's flag `how` says. Raises DataError."""
+    found = cv2.imread(str(file), how)
+    if found is None:
+        raise DataError(f"{file} cannot be read as an image")
+    return found
 
 
 def origin_of(folder: Path) -> str:

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from operators.detection.custom.anchors import fit_anchors, mean_best_iou
 from operators.detection.custom.augmentation import DetectionSample, moved_boxes, view
 from operators.detection.custom.dataset import DetectionData, LabelledImage
 from operators.detection.custom.decode import find_boxes
@@ -19,20 +18,62 @@ from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.custom.loss import Truth, detection_loss
 from operators.detection.custom.network import ANCHORS_PER_CELL, STRIDES, GridDetector
 from operators.learning.augmentation import Variation, fitted, tensor_of, warp
-from operators.learning.backbone import BACKBONES, Backbone, load_backbone
+from operators.learning.backbone import BACKBONES, load_backbone
 from operators.learning.export import export_network
+from operators.learning.image_task import ImageTask
 from operators.learning.network_weights import begin_with, fitting_facts, sample_images
-from operators.weights.network_file import TRAINED_ON
 
-KIND = "detector"
-STEP = 16
+Sizes = NDArray[np.float32]
+"""(N, 2) widths and heights in pixels."""
 _SCORING = (0.01, 0.5, 100)  # least score, overlap for suppression, most boxes
 
 
-class DetectorTask:
+def size_iou(sizes: Sizes, anchors: Sizes) -> NDArray[np.float32]:
+    """IoU (N, K) of boxes that share their centre."""
+    intersection = np.minimum(sizes[:, None], anchors[None]).prod(axis=2)
+    union = sizes.prod(axis=1)[:, None] + anchors.prod(axis=1)[None] - intersection
+    iou: NDArray[np.float32] = (intersection / np.maximum(union, 1e-9)).astype(np.float32)
+    return iou
+
+
+def fit_anchors(sizes: Sizes, count: int, seed: int, rounds: int = 50) -> Sizes:
+    """`count` anchors (count, 2) by growing area, for objects of these sizes in the network's input: k-means by IoU.
+
+    Where there are fewer distinct sizes than anchors, the rest are scaled copies of the found ones. Raises ValueError
+    without any size.
+    """
+    sizes = np.maximum(np.asarray(sizes, np.float32).reshape(-1, 2), 1)
+    if not len(sizes):
+        raise ValueError("anchors need at least one object")
+    distinct = np.unique(sizes, axis=0)
+    start = np.random.default_rng(seed).permutation(len(distinct))[:count]
+    anchors = distinct[np.sort(start)]
+    for _ in range(rounds):
+        nearest = size_iou(sizes, anchors).argmax(axis=1)
+        moved = np.stack(
+            [
+                np.median(sizes[nearest == k], axis=0) if (nearest == k).any() else anchors[k]
+                for k in range(len(anchors))
+            ]
+        ).astype(np.float32)
+        if np.array_equal(moved, anchors):
+            break
+        anchors = moved
+    scales = 2.0 ** np.array([0, 1, -1, 2, -2, 3, -3, 0.5, -0.5, 1.5, -1.5, 2.5])
+    copies = np.concatenate([anchors * s for s in scales]) if len(anchors) < count else anchors
+    chosen = copies[:count].astype(np.float32)
+    return chosen[np.lexsort((chosen[:, 0], chosen.prod(axis=1)))]
+
+
+def mean_best_iou(sizes: Sizes, anchors: Sizes) -> float:
+    """Tells how well the anchors cover the sizes: the mean over objects of the best anchor's IoU."""
+    return float(size_iou(np.asarray(sizes, np.float32), anchors).max(axis=1).mean())
+
+
+class DetectorTask(ImageTask[DetectionData]):
     """Trains a GridDetector of input `size` (width, height; multiples of 16) on labelled images."""
 
-    kind = KIND
+    kind, step = "detector", 16
 
     def __init__(
         self,
@@ -47,42 +88,27 @@ class DetectorTask:
         channels: int = 96,
         backbone: Path | None = None,
     ) -> None:
-        if any(extent % STEP or extent <= 0 for extent in size):
-            raise ValueError(f"the input's width and height must be multiples of {STEP}, got {size[0]}x{size[1]}")
-        torch.manual_seed(seed)
-        self.data, self.size = data, size
-        self.variation = Variation() if variation is None else variation
+        super().__init__(data, size, seed, variation)
         sizes = object_sizes(data.training, size)
         anchors = fit_anchors(sizes, len(strides) * ANCHORS_PER_CELL, seed)
         self.anchor_fit = mean_best_iou(sizes, anchors)
         self.anchors = anchors.reshape(len(strides), ANCHORS_PER_CELL, 2)
         self.width, self.architecture, self.strides = width, architecture, tuple(strides)
         made = BACKBONES[architecture](width)
-        self.detector = GridDetector(len(data.classes), channels=channels, backbone=made, strides=strides)
+        self.network = GridDetector(len(data.classes), channels=channels, backbone=made, strides=strides)
+        self.backbone = self.network.backbone
         if backbone is not None:
-            load_backbone(self.detector.backbone, backbone)
-
-    @property
-    def network(self) -> nn.Module:
-        return self.detector
-
-    @property
-    def backbone(self) -> Backbone:
-        return self.detector.backbone
-
-    @property
-    def samples(self) -> int:
-        return len(self.data.training)
+            load_backbone(self.backbone, backbone)
 
     def begin_with(self, file: Path) -> None:
         """Begins with weights and anchors of a network file. Raises `TrainingFileError` where they do not fit."""
         self.take_anchors(file)
-        begin_with(self.detector, file, sample_images(self))
+        begin_with(self.network, file, sample_images(self))
 
     def take_anchors(self, file: Path) -> None:
         """Takes the anchors of a network file of this kind, scaled to this input."""
         facts = fitting_facts(
-            file, kind=KIND, architecture=self._name, classes=list(self.data.classes), strides=list(self.strides)
+            file, kind=self.kind, architecture=self._name, classes=list(self.data.classes), strides=list(self.strides)
         )
         scale = np.array(self.size, np.float32) / (facts["width"], facts["height"])
         self.anchors = np.asarray(facts["anchors"], np.float32) * scale.astype(np.float32)
@@ -92,15 +118,12 @@ class DetectorTask:
         return f"{self.architecture}-{self.width:g} fpn grid"
 
     def description(self) -> dict[str, Any]:
-        return {
-            "classes": list(self.data.classes),
-            "size": list(self.size),
-            "width": self.width,
-            "architecture": self.architecture,
-            "strides": list(self.strides),
-            "anchors": np.round(self.anchors, 3).tolist(),
-            "images": self.samples,
-        }
+        return self._description(
+            width=self.width,
+            architecture=self.architecture,
+            strides=list(self.strides),
+            anchors=np.round(self.anchors, 3).tolist(),
+        )
 
     def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> tuple[Tensor, Truth]:
         views = [
@@ -110,7 +133,7 @@ class DetectorTask:
 
     def loss(self, batch: tuple[Tensor, Truth], device: torch.device) -> dict[str, Tensor]:
         images, truth = batch
-        return self.loss_of(self.detector(images.to(device).contiguous(memory_format=torch.channels_last)), truth)
+        return self.loss_of(self.network(images.to(device).contiguous(memory_format=torch.channels_last)), truth)
 
     def loss_of(self, maps: Sequence[Tensor], truth: Truth) -> dict[str, Tensor]:
         """The parts of the loss of what the network answered."""
@@ -139,18 +162,8 @@ class DetectorTask:
         return {"score": score.ap50, "ap50": score.ap50, "ap": score.ap}
 
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
-        described = {
-            "kind": KIND,
-            "architecture": self._name,
-            "classes": list(self.data.classes),
-            "width": self.size[0],
-            "height": self.size[1],
-            "strides": list(self.strides),
-            "anchors": np.round(self.anchors.astype(float), 4).tolist(),
-            "training_images": self.samples,
-            **({TRAINED_ON: self.data.origin} if self.data.origin else {}),
-            **facts,
-        }
+        own = {"strides": list(self.strides), "anchors": np.round(self.anchors.astype(float), 4).tolist()}
+        described = self._facts(self._name, facts, self.data.origin, **own)
         export_network(network, self.size, [f"stride{s}" for s in self.strides], described, file)
 
 

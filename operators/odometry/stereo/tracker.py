@@ -7,6 +7,7 @@ its sightings. Now and then a pair is kept, for a camera that was lost to find i
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,15 +21,53 @@ from operators.odometry.mono.pose import solved
 from operators.odometry.motion import Motion
 from operators.odometry.stereo.adjustment import Offset, Sightings, StereoRig, adjust
 from operators.odometry.stereo.map import StereoMap
-from operators.odometry.stereo.pair import StereoPair, Watches, observe
 from operators.odometry.stereo.relocalizer import TYPICAL, FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 
+Watches = tuple[Watch, Watch]
 # Variances are this much larger than residuals say: neighbouring tracks err together (calibrated against truth).
 SYSTEMATIC = 500.0
 GATE = 2.0  # pixels by which a corner may be off the pose
 TOP_SPEED = 3.0  # m/s beyond the last speed that a pose which is recognised in the same map may ask of the camera
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPair:
+    """A rectified pair in grey at a stamp; `flaw` is the reason if it is not used."""
+
+    stamp: int
+    left: Gray
+    right: Gray
+    flaw: str | None
+    watches: Watches  # to compare the next pair with
+
+
+def observe(left: NDArray[np.uint8], right: NDArray[np.uint8], stamp: int, last: Watches) -> StereoPair:
+    """Looks for flaws of two (H, W) or (H, W, 3) RGB uint8 images, such as repeating those last watched.
+
+    Raises ValueError for a wrong shape or type.
+    """
+    for name, image in (("left", left), ("right", right)):
+        if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+            raise ValueError(f"{name} must be (H, W) or (H, W, 3) uint8, got {image.shape} {image.dtype}")
+        if min(image.shape[:2]) < 32:
+            raise ValueError(f"{name} must be at least 32 x 32 pixels, got {image.shape}")
+    if left.shape[:2] != right.shape[:2]:
+        raise ValueError(f"left and right differ in size: {left.shape[:2]} and {right.shape[:2]}")
+    grays = _gray(left), _gray(right)
+    none, flaws = np.zeros((1, 1), np.float32), list[str]()
+    watches = Watch().seen(grays[0], none), Watch().seen(grays[1], none)
+    for name, gray, watch, before in zip(("left", "right"), grays, watches, last, strict=True):
+        flaw = watch.image_flaw(before, gray)
+        if flaw is not None:
+            flaws.append(f"{name} image {flaw}")
+    return StereoPair(stamp, *grays, "; ".join(flaws) or None, watches)
+
+
+def _gray(image: NDArray[np.uint8]) -> Gray:
+    gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+    return np.ascontiguousarray(gray)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ from operators.learning.balance import class_weights
 from operators.learning.export import export_steps
 from operators.recognition.activity.episodes import Episode
 from operators.recognition.activity.features import NAMES
-from operators.recognition.activity.network import LAYERS, ActivityNetwork, ActivityStep
 from operators.recognition.activity.samples import (
     LAG,
     Track,
@@ -31,13 +30,12 @@ from operators.recognition.activity.sensed_people import SensedTrack
 from operators.simulator.classes import ACTIVITIES
 from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
+LAYERS = 2
 KIND = "activity"
 TOLERANCE = 0.5
 _STRIDES = (1, 2, 2, 3, 4)
 _UNSEEN = 0.15  # how much a moment out of sight counts
 _LEAST = 0.35
-
-
 _STILL = [ACTIVITIES.index(name) for name in ("standing", "sitting", "resting")]
 _SPEED = NAMES.index("speed, short")
 _MOVING = [
@@ -49,6 +47,44 @@ _MOVING = [
 ]
 _SIDES = [NAMES.index("longer side"), NAMES.index("shorter side")]
 _GROWN = [NAMES.index("longer side over its least"), NAMES.index("shorter side over its least")]
+Scored = list[tuple[Track | SensedTrack, NDArray[np.int64], NDArray[np.bool_]]]
+
+
+class ActivityNetwork(nn.Module):
+    """Feature vectors (B, T, F) → scores (B, T, C) of activities.
+
+    Method: Hochreiter and Schmidhuber, "Long short-term memory", 1997.
+    """
+
+    def __init__(self, features: int, classes: int, width: int = 96) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("scale", torch.ones(features))
+        self.mean: Tensor
+        self.scale: Tensor
+        self.width = width
+        self.enter = nn.Sequential(nn.Linear(features, width), nn.ReLU(), nn.Dropout(0.1))
+        self.lstm = nn.LSTM(width, width, LAYERS, batch_first=True, dropout=0.2)
+        self.leave = nn.Sequential(nn.Dropout(0.2), nn.Linear(width, classes))
+
+    def forward(self, features: Tensor) -> Tensor:
+        entered = self.enter((features - self.mean) / self.scale)
+        passed, _ = self.lstm(entered)
+        return torch.as_tensor(self.leave(passed))
+
+
+class ActivityStep(nn.Module):
+    """One step of several agents: features (N, F) and states (L, N, W) → probabilities (N, C) and next states."""
+
+    def __init__(self, network: ActivityNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, features: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        network = self.network
+        entered = network.enter((features[:, None] - network.mean) / network.scale)
+        passed, (hidden, cell) = network.lstm(entered, (hidden, cell))
+        return network.leave(passed[:, 0]).softmax(dim=1), hidden, cell
 
 
 def _columns(group: str) -> tuple[list[int], NDArray[np.float32]]:
@@ -96,24 +132,16 @@ class ActivityTask:
             for track in sensed
             for _ in range(repeats)
         ]
-        self._sensed = len(sensed)
+        self._sensed, self.samples = len(sensed), len(self._training)
         self._validation = scored_tracks(validation, seed)
         if sensed_validation:
             self._validation["sensed"] = [(t, t.now, t.right) for t in sensed_validation]
-        self.activities = ActivityNetwork(len(NAMES), len(ACTIVITIES), width)
+        self.network = ActivityNetwork(len(NAMES), len(ACTIVITIES), width)
         every = np.concatenate([features for features, _, _ in self._training])
-        self.activities.mean.copy_(torch.from_numpy(every.mean(axis=0)))
-        self.activities.scale.copy_(torch.from_numpy(np.maximum(every.std(axis=0), 0.05)))
+        self.network.mean.copy_(torch.from_numpy(every.mean(axis=0)))
+        self.network.scale.copy_(torch.from_numpy(np.maximum(every.std(axis=0), 0.05)))
         known = np.concatenate([labels[labels >= 0] for _, labels, _ in self._training])
         self._weights = class_weights(known, len(ACTIVITIES))
-
-    @property
-    def network(self) -> nn.Module:
-        return self.activities
-
-    @property
-    def samples(self) -> int:
-        return len(self._training)
 
     def description(self) -> dict[str, Any]:
         return {
@@ -122,7 +150,7 @@ class ActivityTask:
             "episodes": self._episodes,
             "variations": self._variations,
             "sensed": self._sensed,
-            "width": self.activities.width,
+            "width": self.network.width,
         }
 
     def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> tuple[Tensor, Tensor, Tensor]:
@@ -137,7 +165,7 @@ class ActivityTask:
 
     def loss(self, batch: tuple[Tensor, Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
         features, labels, weights = (part.to(device) for part in batch)
-        scores = self.activities(features).float().flatten(0, 1)
+        scores = self.network(features).float().flatten(0, 1)
         each = functional.cross_entropy(
             scores, labels.flatten(), self._weights.to(device), reduction="none", ignore_index=-1, label_smoothing=0.05
         )
@@ -219,9 +247,6 @@ def drawn(episode: Episode, rng: np.random.Generator, variations: int) -> list[T
     for _ in range(variations):
         tracks += tracked_sequences(episode, int(rng.choice(_STRIDES)), rng)
     return tracks
-
-
-Scored = list[tuple[Track | SensedTrack, NDArray[np.int64], NDArray[np.bool_]]]
 
 
 def scored_tracks(episodes: Sequence[Episode], seed: int) -> dict[str, Scored]:

@@ -14,16 +14,76 @@ from torch.nn import functional
 
 from operators.learning.balance import class_weights
 from operators.learning.export import export_rows
-from operators.recognition.posture.data import POSTURES, Postures
+from operators.recognition.posture.data import BODY, POSTURES, Postures
 from operators.recognition.posture.model import KIND
-from operators.recognition.posture.network import DeployedPosture, PostureNetwork
 from operators.recognition.posture.silhouette import HALF, MIDDLE, SIDE
 from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
+_CHANNELS = (24, 48, 96)
+_HIDDEN = 128
 F32 = NDArray[np.float32]
-
 _LIMBS = 4.0  # weight of where the limbs are
 _BATCH = 256
+
+
+class PostureNetwork(nn.Module):
+    """Silhouettes (N, 3, SIDE, SIDE) → scores (N, C) of activities, and where the limbs are (N, BODY).
+
+    Limbs are learned beside the activities, since they tell much more of each silhouette than one name does; in use
+    they are left out. Residual blocks: He et al., "Deep residual learning for image recognition", 2016.
+    """
+
+    def __init__(self, classes: int) -> None:
+        super().__init__()
+        first, second, third = _CHANNELS
+        self.body = nn.Sequential(
+            _halved(3, first),
+            _halved(first, second),
+            _Residual(second),
+            _halved(second, third),
+            _Residual(third),
+            _halved(third, third),
+            nn.Flatten(),
+            nn.Dropout(0.2),
+            nn.Linear(third * (SIDE // 16) ** 2, _HIDDEN),
+            nn.ReLU(),
+            nn.Dropout(0.2),
+        )
+        self.activity, self.limbs = nn.Linear(_HIDDEN, classes), nn.Linear(_HIDDEN, BODY)
+
+    def forward(self, silhouettes: Tensor) -> tuple[Tensor, Tensor]:
+        seen = self.body(silhouettes)
+        return self.activity(seen), self.limbs(seen)
+
+
+class DeployedPosture(nn.Module):
+    """Silhouettes (N, 3, SIDE, SIDE) → probabilities (N, C): what the network file computes."""
+
+    def __init__(self, network: PostureNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, silhouettes: Tensor) -> Tensor:
+        scores, _ = self.network(silhouettes)
+        return torch.as_tensor(scores.softmax(dim=1))
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(*_convolution(channels, channels), nn.ReLU(), *_convolution(channels, channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.relu(x + self.body(x))
+
+
+def _halved(inputs: int, outputs: int) -> nn.Module:
+    """Half the resolution."""
+    return nn.Sequential(*_convolution(inputs, outputs, 2), nn.ReLU())
+
+
+def _convolution(inputs: int, outputs: int, stride: int = 1) -> tuple[nn.Module, nn.Module]:
+    return nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs)
 
 
 class PostureTask:
@@ -33,17 +93,9 @@ class PostureTask:
 
     def __init__(self, training: Postures, validation: Postures, *, seed: int = 0) -> None:
         torch.manual_seed(seed)
-        self._training, self._validation = training, validation
-        self.postures = PostureNetwork(len(POSTURES))
+        self._training, self._validation, self.samples = training, validation, len(training.activities)
+        self.network = PostureNetwork(len(POSTURES))
         self._weights = class_weights(training.activities, len(POSTURES))
-
-    @property
-    def network(self) -> nn.Module:
-        return self.postures
-
-    @property
-    def samples(self) -> int:
-        return len(self._training.activities)
 
     def description(self) -> dict[str, Any]:
         return {"classes": list(POSTURES), "silhouettes": self.samples, "side": SIDE}
@@ -55,7 +107,7 @@ class PostureTask:
 
     def loss(self, batch: tuple[Tensor, Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
         shapes, bodies, activities = (part.to(device) for part in batch)
-        scores, limbs = self.postures(shapes)
+        scores, limbs = self.network(shapes)
         entropy = functional.cross_entropy(scores.float(), activities, self._weights.to(device), label_smoothing=0.03)
         return {"entropy": entropy, "limbs": _LIMBS * functional.smooth_l1_loss(limbs.float(), bodies, beta=0.1)}
 

@@ -147,6 +147,7 @@ class SceneGraphBuilder(Operator):
             return [otherwise if values is None or b.id not in row else known[row[b.id]] for b in now.bodies]
 
         held = list(now.relations.items())
+        tracks = [(t, k) for k, b in enumerate(now.bodies) if b.id in row for t in nodes.tracks_of(row[b.id])]
         return SceneGraph(
             stamp=nodes.stamp,
             frame=nodes.frame,
@@ -163,6 +164,8 @@ class SceneGraphBuilder(Operator):
             subjects=np.array([at[s] for (s, _, _), _ in held], np.int32),
             objects=np.array([at[o] for (_, _, o), _ in held], np.int32),
             relation_scores=np.array([min(score, 1.0) for _, score in held], np.float32),
+            tracks=None if nodes.tracks is None else np.array([track for track, _ in tracks], np.int64),
+            track_nodes=None if nodes.tracks is None else np.array([node for _, node in tracks], np.int32),
         )
 
     def _activities(self, nodes: SceneGraph, now: Snapshot, recognized: Activity | None) -> Activity:

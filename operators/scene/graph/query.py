@@ -189,6 +189,7 @@ def as_json(graph: SceneGraph, activities: Activity | None = None) -> dict[str, 
                 "orientation": None if graph.orientations is None else graph.orientations[k].tolist(),
                 "score": None if graph.scores is None else round(float(graph.scores[k]), 4),
                 "last_seen": None if graph.last_seen is None else int(graph.last_seen[k]),
+                "tracks": list(graph.tracks_of(k)),
             }
         )
     relations = [

@@ -18,6 +18,7 @@ from dataflow.messages import (
     PointCloud,
     Pose,
     SegmentationMap,
+    Tracks,
     Transforms,
 )
 from dataflow.messages.diagnostics import Level
@@ -59,6 +60,10 @@ class ObjectLifter(Operator):
     pose: Sampled[Pose | Odometry] = Sampled(
         required=False, doc="the cloud's sensor or its robot; gives the upward direction"
     )
+    tracks: Sampled[Tracks] = Sampled(
+        required=False,
+        doc="which tracks the detections of the same stamp are of: the ids of boxes and images, -1 for none",
+    )
     boxes: Out[Boxes3D] = Out(doc="objects in the cloud's frame, with their numbers of points")
     images: Out[Detections2D] = Out(doc="the image's boxes of the objects, in the order of the boxes")
     clusters: Out[Clusters] = Out(doc="the object of every point of the cloud, in the order of the boxes")
@@ -92,9 +97,12 @@ class ObjectLifter(Operator):
         extrinsics: Transforms | None = None,
         segmentation: SegmentationMap | None = None,
         pose: Pose | Odometry | None = None,
+        tracks: Tracks | None = None,
     ) -> dict[str, Any]:
         """Raises ValueError where the calibration is of another image or no transform relates the frames."""
         _check(detections, image_info)
+        if tracks is not None:
+            detections = detections.replace(ids=_track_ids(detections, tracks))
         up, _ = gravity(cloud, pose, extrinsics, self._up)
         usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
         points = cloud.points[usable].astype(np.float64)
@@ -148,6 +156,15 @@ class ObjectLifter(Operator):
                 f"{detections.width}x{detections.height} in {detections.frame!r}"
             )
         return segmentation
+
+
+def _track_ids(detections: Detections2D, tracks: Tracks) -> NDArray[np.int64]:
+    """Returns the track (N,) of each detection, -1 where it is of none or the tracks are of another image."""
+    ids = np.full(detections.count, -1, np.int64)
+    if tracks.stamp == detections.stamp and tracks.detections is not None:
+        matched = tracks.detections >= 0
+        ids[tracks.detections[matched]] = tracks.ids[matched]
+    return ids
 
 
 def _check(detections: Detections2D, info: CameraInfo) -> None:

@@ -78,7 +78,7 @@ class SavedMap:
             votes = np.zeros(max(len(classes), 1))
             votes[place] = each["votes"]
             if not classes or "agent" not in labels.roles(classes[int(votes.argmax())]):
-                objects.append({**_before(each, stamp), "votes": votes, "velocity": np.zeros(3)})
+                objects.append({**_before(each, stamp), "votes": votes, "velocity": np.zeros(3), "tracks": []})
         surfaces = [_before(each, stamp) for each in self.surfaces["surfaces"]]
         kept = {**self.objects, "objects": objects, "gone": [], "stamp": None}
         return kept, {**self.surfaces, "surfaces": surfaces}

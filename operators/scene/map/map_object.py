@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ WHOLE = 100_000_000
 
 _BRINK = 0.012  # metres that masks and clouds lose of each side of an object
 _KEPT = 16  # views of an object
+_TRACKS = 16  # tracks of an object that are kept
 _FAR, _ENOUGH = 1.6, 5  # a view is dropped at so many times the range of the third nearest of so many views
 _SAMPLE = 16  # points of a view that are kept
 _SMALL = 0.5  # metres up to which things are seen whole, so that the kept views have points enough
@@ -43,7 +44,8 @@ class MapObject:
     `view` (2,) the horizontal directions of the views; `most` is the largest number of voxels that it had; `images` are
     the views that its box is fitted to, `form` which of the ways in which its class stands, -1 while that is open,
     `fresh` how many of them are new since the last fit; `held` whether it was last seen in a hand. `beside` counts by
-    id the views in which another object was seen too, in a separate place in the image.
+    id the views in which another object was seen too, in a separate place in the image. `tracks` are the ids of the
+    last tracks in images that were of it, the latest last.
     """
 
     id: int
@@ -66,6 +68,7 @@ class MapObject:
     beside: Counter[int] = field(default_factory=Counter)
     held: bool = False
     fresh: int = 0
+    tracks: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.class_id = int(self.votes.argmax())
@@ -98,6 +101,11 @@ class MapObject:
     @property
     def box(self) -> tuple[Array, Array, float]:
         return self.center, self.size, self.yaw
+
+    def follow(self, tracks: Iterable[int]) -> None:
+        """Notes tracks that are of the object, the latest last."""
+        new = list(tracks)
+        self.tracks = [*(t for t in self.tracks if t not in new), *new][-_TRACKS:]
 
     def look(self, view: ImageView, points: Array | None = None) -> bool:
         """Keeps a view that adds information, with some of its points (N, 3).
@@ -184,7 +192,7 @@ class MapObject:
         beside = sorted(self.beside.items())
         rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
         points = [np.concatenate([v.points for v in rows]), np.array([len(v.points) for v in rows])] if rows else []
-        return plain | rest | {"held": self.held, "fresh": self.fresh, "points": points}
+        return plain | rest | {"held": self.held, "fresh": self.fresh, "points": points, "tracks": self.tracks}
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:
@@ -202,6 +210,7 @@ class MapObject:
             parts = np.split(np.array(state["points"][0]), np.cumsum(state["points"][1])[:-1])
             made.images = [replace(v, points=own) for v, own in zip(made.images, parts, strict=True)]
         made.fresh = int(state.get("fresh", 0))
+        made.tracks = [int(track) for track in state.get("tracks", ())]
         return made
 
 

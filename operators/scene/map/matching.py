@@ -20,6 +20,7 @@ LARGE = 0.8  # metres on the ground from which a thing is seldom seen whole, so 
 _COARSE = 0.3  # metres from which a thing is often hidden in part
 _WITHIN = 0.8  # share of an image box that is in that of an object, where the rest is hidden
 _COVERING = 0.6  # share of the smaller of two image boxes, from which one covers the other
+_TRACKED = 0.5  # by which what may be an object, and is of its track, is likelier it
 _SLACK = 0.02  # of the distance, by which points stray
 
 
@@ -54,7 +55,8 @@ class MapSettings:
 class Observation:
     """One object as seen once: points (N, 3) in the world, class, score, and mean colour (3,) in [0, 1] if known.
 
-    `image` is what the image shows of it, where there is one; those of one time share `P`.
+    `image` is what the image shows of it, where there is one; those of one time share `P`. `track` is the id of its
+    track in the images, -1 for none.
     """
 
     points: Array
@@ -62,17 +64,19 @@ class Observation:
     score: float
     color: Array | None = None
     image: ImageView | None = None
+    track: int = -1
 
 
 def alike_mover(each: Observation, cells: Cells, object: MapObject, stamp: int, s: MapSettings) -> float:
-    """Returns how likely an observation is of a mover, in [0, 1], by where it should be by now; 0 where it is not."""
+    """Returns how likely an observation is of a mover, by where that should be by now and its track; 0 for not."""
     if each.class_id != object.class_id:
         return 0.0
     since = (stamp - object.seen) * 1e-9
     center, _, _ = standing_box(cells.points)
     away = center - object.center - object.velocity * min(since, 1.0)
     reach = s.mover_reach + s.mover_speed * min(since, 2.0)
-    return max(0.0, 1 - float(np.hypot(away[0], away[1])) / reach)
+    near = 1 - float(np.hypot(away[0], away[1])) / reach
+    return near + (_TRACKED if each.track in object.tracks else 0.0) if near > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ class InImage:
 def alike(
     each: Observation, cells: Cells, object: MapObject, image: InImage | None, s: MapSettings, *, large: bool
 ) -> float:
-    """Returns how likely an observation is of an object, in [0, 1]; 0 where it is not.
+    """Returns how likely an observation is of an object: in [0, 1], more if it is of its track, 0 where it is not.
 
     `image` compares them where there is an image. `large` things are seldom seen whole: their voxels tell.
     """
@@ -102,6 +106,7 @@ def alike(
         share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
         return 0.5 * share if share >= 0.5 else 0.0
     value = 0.3 * (1 - away / reach) + 0.1 * color_likeness(each.color, object.color)
+    value += _TRACKED if each.track in object.tracks else 0.0
     if image is not None and image.iou >= s.image_overlap:
         return value + 0.6 * image.iou
     if image is not None and not large:  # what is hidden in part shows in part of its box

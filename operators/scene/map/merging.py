@@ -72,6 +72,9 @@ def merge(a: MapObject, b: MapObject, kinds: Kinds) -> MapObject:
     for class_id, count in enumerate(other.votes.tolist()):
         best.vote(class_id, count)
     best.evidence = min(max(best.evidence, other.evidence), MOST_EVIDENCE)
+    earlier, later = sorted((other, best), key=lambda each: each.seen)
+    best.tracks, latest = earlier.tracks, later.tracks
+    best.follow(latest)
     best.seen, best.views = max(best.seen, other.seen), best.views + other.views
     best.told += other.told
     best.view = best.view + other.view

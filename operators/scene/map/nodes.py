@@ -79,6 +79,8 @@ def nodes_of(
         last_seen=np.array([each.seen for each in entries], np.int64),
         subjects=np.zeros(0, np.int32),
         objects=np.zeros(0, np.int32),
+        tracks=np.array([track for o in objects for track in o.tracks], np.int64),
+        track_nodes=np.array([k for k, o in enumerate(objects) for _ in o.tracks], np.int32),
     )
 
 

@@ -87,6 +87,8 @@ class ObjectMap:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
                 ids[k] = self._begin(each, cells[k], stamp, view.origin)
+            if each.track >= 0:
+                self.objects[joined[k] if k in joined else ids[k]].follow([each.track])
         shown = {i: cells[k] for k, i in joined.items()}
         self._note_beside(seen, [joined.get(k) for k in range(len(seen))])
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
@@ -286,7 +288,7 @@ class ObjectMap:
             if new:
                 chosen = min(new, key=lambda o: (o.born, o.id))
                 del self.gone[i], self.objects[chosen.id]
-                chosen.id, chosen.born = i, old.born
+                chosen.id, chosen.born, chosen.tracks = i, old.born, [*old.tracks, *chosen.tracks]
                 self.objects[i] = chosen
                 self.moved += 1
 

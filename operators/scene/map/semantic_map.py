@@ -56,13 +56,14 @@ class State(Counts):
 class SemanticMap(Operator):
     """Accumulates objects and surfaces in the world, each with class, box, existence and when it was last seen.
 
-    What a view shows is joined to the map by place, class and colour; two entries that come to share their place and
-    are not seen beside each other are one. Each view also shows empty space: an object whose place is empty goes, and
-    one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move by
-    themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is out
-    of sight. An object that is seen often enough is given, whatever its size: if its class is never so large, or if it
-    is of a small class and seldom surely detected, it is doubted, which halves its score or lowers it by what the label
-    lacks. Surfaces are joined by their planes and by where they lie; there is one floor, and people stand on it.
+    What a view shows is joined to the map by place, class, colour and the track that it is of (the ids of `boxes`), of
+    which nodes keep the last ones; two entries that come to share their place and are not seen beside each other are
+    one. Each view also shows empty space: an object whose place is empty goes, and one of its class, size and colour
+    that appears elsewhere takes its id, moved and not doubled. Classes that move by themselves are followed instead,
+    and forgotten after a while out of sight. Everything else is kept while it is out of sight. An object that is seen
+    often enough is given, whatever its size: if its class is never so large, or if it is of a small class and seldom
+    surely detected, it is doubted, which halves its score or lowers it by what the label lacks. Surfaces are joined by
+    their planes and by where they lie; there is one floor, and people stand on it.
 
     With `save` the map is written at the end, and with it the classes that were learned for it; `map_file` begins with
     such a map, in whose frame the pose must be. Objects that move by themselves are not taken over.
@@ -270,7 +271,8 @@ class SemanticMap(Operator):
         if len(points) < 3:
             return None
         class_id = int(boxes.class_ids[k]) if self.state.classes else 0
-        return Observation(points, class_id, float(boxes.scores[k]), color, image)
+        track = -1 if boxes.ids is None else int(boxes.ids[k])
+        return Observation(points, class_id, float(boxes.scores[k]), color, image, track)
 
     def _boxes(self, stamp: int, objects: list[MapObject], scores: list[float]) -> Boxes3D:
         return Boxes3D(

@@ -16,27 +16,12 @@ from dataflow.messages import (
     Pose,
     Transforms,
 )
-from operators.simulator import truth
+from operators.simulator import settings, truth
 from operators.simulator.rendering.optics import Optics
 from operators.simulator.sensors import color, depth, gnss, inertial, landmarks, lidar, magnetic, radar, wheels
 from operators.simulator.sensors.frames import BODY_TO_OPTICAL, Array, displaced_optical, mounted
 from operators.simulator.sensors.noise import NoisePool
 from operators.simulator.sensors.schedule import Tick
-from operators.simulator.settings import (
-    ColorCamera,
-    DepthCamera,
-    Gnss,
-    Inertial,
-    Landmarks,
-    Lidar,
-    Magnetometer,
-    Mount,
-    Radar,
-    Sensors,
-    StereoRig,
-    Truth,
-    Wheels,
-)
 from operators.simulator.stage import Stage
 
 Messages = dict[str, Message]
@@ -62,8 +47,8 @@ class Rig:
         stage: Stage,
         seed: int,
         frames: FrameNames,
-        sensors: Sensors,
-        true: Truth,
+        sensors: settings.Sensors,
+        true: settings.Truth,
     ) -> None:
         self.stage, self.frames, self._seed, self._sensors, self._true = stage, frames, seed, sensors, true
         camera, depth_camera, pair = sensors.color_camera, sensors.depth_camera, sensors.stereo
@@ -75,7 +60,7 @@ class Rig:
             depth_camera.focal or camera.focal,
         )
         self._stereo_optics = _optics(pair.width, pair.height, pair.focal)
-        mount: Mount = camera.mount or stage.world.camera_mount
+        mount: settings.Mount = camera.mount or stage.world.camera_mount
         self.T_base_color = mounted(mount) @ BODY_TO_OPTICAL
         self.T_base_depth = self.T_base_color @ mounted((*depth_camera.offset, *depth_camera.rotation))
         self.T_base_left = mounted(pair.mount) @ BODY_TO_OPTICAL if pair.mount else self.T_base_color
@@ -84,7 +69,7 @@ class Rig:
         self._wheel_model = wheels.WheelModel(sensors.wheels, seed)
         self._magnetic_model = magnetic.MagneticModel(seed)
 
-    def color(self, camera: ColorCamera, t: float, tick: Tick, rng: Rng) -> Messages:
+    def color(self, camera: settings.ColorCamera, t: float, tick: Tick, rng: Rng) -> Messages:
         T_base_camera = displaced_optical(self.T_base_color, camera.mount_error)
         view = self.stage.view(t, T_base_camera, self._color_optics, color=True)
         assert view.color is not None
@@ -117,13 +102,13 @@ class Rig:
             messages["masks"] = truth.masks(view, tick.stamp, self.frames.image)
         return messages
 
-    def _smear(self, t: float, camera: ColorCamera, T_base_camera: Array) -> tuple[float, float]:
+    def _smear(self, t: float, camera: settings.ColorCamera, T_base_camera: Array) -> tuple[float, float]:
         """Tells how far the image moves while the shutter is open, in pixels: by the robot's turning alone."""
         omega = T_base_camera[:3, :3].T @ self.stage.drive.state(t).angular
         focal, seconds = self._color_optics.fx, camera.shutter * 1e-9
         return -focal * omega[1] * seconds, focal * omega[0] * seconds
 
-    def depth(self, camera: DepthCamera, t: float, tick: Tick, rng: Rng) -> Messages:
+    def depth(self, camera: settings.DepthCamera, t: float, tick: Tick, rng: Rng) -> Messages:
         T_base_camera = displaced_optical(self.T_base_depth, camera.mount_error)
         view = self.stage.view(t, T_base_camera, self._depth_optics, color=False)
         levels = depth.measure(view, camera, self._pool, rng)
@@ -144,7 +129,7 @@ class Rig:
             )
         return messages
 
-    def stereo(self, pair: StereoRig, t: float, tick: Tick, rng: Rng) -> Messages:
+    def stereo(self, pair: settings.StereoRig, t: float, tick: Tick, rng: Rng) -> Messages:
         messages: Messages = {}
         dark = rng.random() < pair.black
         left = displaced_optical(self.T_base_left, pair.mount_error)
@@ -156,33 +141,33 @@ class Rig:
             messages[port] = Image(stamp=tick.stamp, frame=f"stereo_{port}_optical", data=pixels)
         return messages
 
-    def lidar(self, scanner: Lidar, t: float, tick: Tick, rng: Rng) -> Messages:
+    def lidar(self, scanner: settings.Lidar, t: float, tick: Tick, rng: Rng) -> Messages:
         return {"points": lidar.sweep(self.stage, scanner, t, rng, tick.stamp, "lidar")}
 
-    def imu(self, imu: Inertial, t: float, tick: Tick, rng: Rng) -> Messages:
+    def imu(self, imu: settings.Inertial, t: float, tick: Tick, rng: Rng) -> Messages:
         return {"imu": self._imu_model.measure(imu, self.stage.drive, t, rng, tick.stamp, "imu")}
 
-    def magnetometer(self, sensor: Magnetometer, t: float, tick: Tick, rng: Rng) -> Messages:
+    def magnetometer(self, sensor: settings.Magnetometer, t: float, tick: Tick, rng: Rng) -> Messages:
         field = self._magnetic_model.measure(sensor, self.stage.drive, t, rng, tick.stamp, "magnetometer")
         return {"magnetic_field": field}
 
-    def wheels(self, driven: Wheels, t: float, tick: Tick, rng: Rng) -> Messages:
+    def wheels(self, driven: settings.Wheels, t: float, tick: Tick, rng: Rng) -> Messages:
         counts, odometry = self._wheel_model.measure(
             driven, self.stage.world.path, t, rng, tick.stamp, self.frames.odometry, self.frames.base
         )
         return {"wheel_ticks": counts, "wheel_odometry": odometry}
 
-    def radar(self, sensor: Radar, t: float, tick: Tick, rng: Rng) -> Messages:
+    def radar(self, sensor: settings.Radar, t: float, tick: Tick, rng: Rng) -> Messages:
         return {"radar_scan": radar.scan(self.stage, sensor, t, rng, tick.stamp, "radar")}
 
-    def landmarks(self, sensor: Landmarks, t: float, tick: Tick, rng: Rng) -> Messages:
+    def landmarks(self, sensor: settings.Landmarks, t: float, tick: Tick, rng: Rng) -> Messages:
         return {"sightings": landmarks.sightings(self.stage, sensor, t, rng, tick.stamp, sensor.frame)}
 
-    def gnss(self, receiver: Gnss, t: float, tick: Tick, rng: Rng) -> Messages:
+    def gnss(self, receiver: settings.Gnss, t: float, tick: Tick, rng: Rng) -> Messages:
         fix = self._gnss_model.measure(receiver, self.stage, t, rng, tick.stamp, "gnss")
         return {} if fix is None else {"fix": fix}
 
-    def poses(self, depth_camera: DepthCamera, t: float, tick: Tick) -> Messages:
+    def poses(self, depth_camera: settings.DepthCamera, t: float, tick: Tick) -> Messages:
         """The true ones of the base and of the depth camera, where that really is."""
         T_base_depth = displaced_optical(self.T_base_depth, depth_camera.mount_error)
         return {

@@ -71,6 +71,14 @@ class Wall:
         return np.asarray(self.T_world_wall @ pose(out, along, up, yaw))
 
 
+def ring(x: float, y: float, height: float, *, inside: bool = True) -> list[Wall]:
+    """The four walls of a rectangle of half extents `x` and `y`, seen from inside or from outside."""
+    corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
+    if not inside:
+        corners.reverse()
+    return [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
+
+
 def raise_wall(builder: Builder, wall: Wall, style: Style, *, accent: bool = False) -> None:
     """The wall's surface and its skirting board."""
     half = wall.length / 2

@@ -19,6 +19,7 @@ from operators.simulator.things.furnishing import (
     line_wall,
     put_on_floor,
     raise_wall,
+    ring,
 )
 
 LANE = 1.0
@@ -33,8 +34,8 @@ def corridor(seed: int, order: Order) -> World:
     x, y = block_x + width, block_y + width
     builder, style = Builder(), Style.drawn(rng)
     lay_floor(builder, (-x, -y), (x, y), height, style)
-    outer = _ring(x, y, height, inside=True)
-    inner = _ring(block_x, block_y, height, inside=False)
+    outer = ring(x, y, height)
+    inner = ring(block_x, block_y, height, inside=False)
     cast = order.cast(["walker", "walker", "ball", "rover"])
     roles = [str(role) for role in rng.permutation(cast)] if order.movers else [""] * 4
     kept = [
@@ -81,14 +82,6 @@ def corridor(seed: int, order: Order) -> World:
         tuple(builder.scripts),
         lanes=tuple(builder.lanes),
     )
-
-
-def _ring(x: float, y: float, height: float, *, inside: bool) -> list[Wall]:
-    """The four walls of a rectangle, seen from inside or from outside."""
-    corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
-    if not inside:
-        corners.reverse()
-    return [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
 
 
 def _lane(x: float, y: float) -> Array:

@@ -21,6 +21,7 @@ from operators.simulator.things.furnishing import (
     line_wall,
     put_on_floor,
     raise_wall,
+    ring,
     scatter,
     small_items,
 )
@@ -38,8 +39,7 @@ def office(seed: int, order: Order) -> World:
     half_x, half_y, height = rng.uniform(4.3, 5.0), rng.uniform(3.7, 4.2), rng.uniform(2.5, 2.9)
     builder, style = Builder(), Style.drawn(rng)
     lay_floor(builder, (-half_x, -half_y), (half_x, half_y), height, style)
-    corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
-    walls = [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
+    walls = ring(half_x, half_y, height)
     accent = int(rng.integers(4))
     door_wall = int(rng.integers(4))
     cast = order.cast(["worker", "walker", "ball", "rover"])

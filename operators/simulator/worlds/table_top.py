@@ -14,12 +14,12 @@ from operators.simulator.things import furniture, objects
 from operators.simulator.things.furnishing import (
     FLOOR,
     Style,
-    Wall,
     decorate,
     lay_floor,
     line_wall,
     put_on_floor,
     raise_wall,
+    ring,
     scatter,
     small_items,
 )
@@ -31,8 +31,7 @@ def table_top(seed: int, order: Order) -> World:
     half_x, half_y, height = rng.uniform(3.4, 3.8), rng.uniform(3.4, 3.8), rng.uniform(2.4, 2.7)
     builder, style = Builder(), Style.drawn(rng)
     lay_floor(builder, (-half_x, -half_y), (half_x, half_y), height, style)
-    corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
-    walls = [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
+    walls = ring(half_x, half_y, height)
     walked, door_wall = (int(k) for k in rng.permutation(4)[:2])
     if order.movers:
         ways = [walls[walked].place(0.88, s * (walls[walked].length / 2 - 1.3)) for s in (-1.0, -0.3, 0.4, 1.0)]

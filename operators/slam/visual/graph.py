@@ -16,7 +16,7 @@ from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import KeyframeGraph, Node
 from operators.slam.place_graph import WINDOW, PlaceGraph
 from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting
-from operators.slam.visual.local_bundle import adjust_newest
+from operators.slam.visual.bundle import adjust_newest
 from operators.slam.visual.map_points import MapPoints
 from operators.slam.visual.place_index import PlaceIndex
 from operators.slam.visual.view import Judge, Sight, View, sight

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
+
+import numpy as np
 
 from dataflow.messages import (
     CameraInfo,
@@ -17,7 +19,9 @@ from dataflow.messages import (
     PointCloud,
     Transforms,
 )
+from dataflow.messages.geometry import transform_points
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
+from operators.cloud.filtering import Voxels
 from operators.geometry.calibration import check_calibration
 from operators.odometry.emission import LEVELS as ODOMETRY_LEVELS
 from operators.odometry.emission import outputs
@@ -25,12 +29,30 @@ from operators.odometry.rgbd.odometry import Calibration, camera_of, same
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import DepthNoise
 from operators.slam.emission import corrections, map_poses, path_of, sizes, status_of
-from operators.slam.visual.cloud import cloud_of
+from operators.slam.keyframe_graph import Node
 from operators.slam.visual.graph import GraphSettings
 from operators.slam.visual.map_file import read_visual_map, write_visual_map
 from operators.slam.visual.mapper import RgbdSlam, SlamResult, SlamState
-from operators.slam.visual.view import Judge
+from operators.slam.visual.view import STRIDE, Judge, View
 from operators.status import counted_status
+
+
+def cloud_of(nodes: Iterable[Node[View]], voxel: float, frame: str, stamp: int) -> PointCloud:
+    """Returns what the views of nodes saw, in the map, thinned to a mean point in each voxel; grey as it was seen."""
+    points, shades = [np.zeros((0, 3))], [np.zeros(0, np.uint8)]
+    for node in nodes:
+        if node.view is not None:
+            points.append(transform_points(node.T, node.view.surface.points(STRIDE)))
+            shades.append(node.view.shades)
+    everything = np.concatenate(points).astype(np.float32)
+    voxels = Voxels.by_size(everything, voxel)
+    grey = np.rint(voxels.means(np.concatenate(shades))).astype(np.uint8)
+    return PointCloud(
+        stamp=stamp,
+        frame=frame,
+        points=voxels.means(everything).astype(np.float32),
+        colors=np.repeat(grey[:, None], 3, axis=1),
+    )
 
 
 @dataclass(kw_only=True)

@@ -22,7 +22,7 @@ from dataflow.messages import (
     Text,
 )
 from dataflow.messages.base import is_built_in, message_types
-from dataflow.messages.display.png import png, turbo
+from dataflow.messages.display.pictures import png, turbo
 
 RED, BLUE = (2, 0)
 """Channels as OpenCV decodes them."""

@@ -9,7 +9,6 @@ from made_view import HEIGHT, Array, room, turned
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Diagnostics, Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
-from dataflow.operator import FINDING
 from dataflow.testing import play
 from operators.cloud import CameraMount, camera_mount
 from operators.cloud.vertical import Vertical
@@ -78,7 +77,7 @@ def test_a_given_base_is_compared_with_the_first_view_that_shows_the_vertical(do
     assert (status.stamp, status.levels.tolist()) == (1, [Level.WARN if wrong else Level.OK])
     said = "looks 0° down, turned by 0°, by the surfaces in sight 28° down"
     assert (said in status.messages[0]) is wrong
-    assert (said in str(mount.summary().get(FINDING))) is wrong
+    assert (said in mount.finding()) is wrong
 
 
 def test_a_given_base_is_not_called_wrong_where_no_surface_shows_the_vertical() -> None:
@@ -190,7 +189,7 @@ def test_a_given_base_is_passed_on_when_it_changes() -> None:
     assert again["base_extrinsics"].digest() == then.replace(stamp=3).digest()
 
 
-@pytest.mark.parametrize("pair", [("depth", "color"), ("color", "depth")])
+@pytest.mark.parametrize("pair", [pytest.param(("depth", "color"), marks=pytest.mark.long), ("color", "depth")])
 def test_the_base_holds_all_cameras_whichever_is_the_parent(pair: tuple[str, str]) -> None:
     T = np.eye(4)
     T[0, 3] = 0.05

@@ -50,6 +50,7 @@ def test_motions_that_are_returned_are_apart() -> None:
             assert np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.5 or cosine < 0.98
 
 
+@pytest.mark.long
 def test_more_matches_than_it_can_compare_are_thinned() -> None:
     source, target = made(MOST_MATCHES, 600)
     best = motions(source, target, 0.1, 100, np.random.default_rng(0))[0]

@@ -95,6 +95,7 @@ def test_a_stream_with_b_frames_is_refused_by_its_stamp() -> None:
         decoder.process(CompressedVideo(stamp=7, frame="cam", format="h264", data=packet))
 
 
+@pytest.mark.long
 def test_the_images_are_the_same_in_every_placement_and_verify(recorded: Path, tmp_path: Path) -> None:
     assert len(images(recorded)) in (24, 18)
     replay(recorded, placement="process_each", record=tmp_path / "again.mcap")

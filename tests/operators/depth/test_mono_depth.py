@@ -15,7 +15,7 @@ from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, RelativeDepth
 from dataflow.testing import Played, play
 from operators.depth import MonoDepth
-from operators.depth.scaling import fitted
+from operators.depth.mono_depth import fitted
 
 onnx = pytest.importorskip("onnx")
 

@@ -18,12 +18,12 @@ from typer.testing import CliRunner, Result
 
 from dataflow.messages import Image
 from operators.detection import CustomDetector
-from operators.detection.custom.anchors import fit_anchors, mean_best_iou, size_iou
 from operators.detection.custom.augmentation import view
 from operators.detection.custom.dataset import DataError, labelled
 from operators.detection.custom.decode import decode_grid, find_boxes
 from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.custom.folder import read_detection_data
+from operators.detection.custom.training import fit_anchors, mean_best_iou, size_iou
 from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union

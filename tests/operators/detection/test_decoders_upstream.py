@@ -75,6 +75,7 @@ def assert_same(found: Detections2D, boxes: Any, scores: Any, labels: Any) -> No
     assert found.count >= 3
 
 
+@pytest.mark.long
 def test_yolox_as_its_postprocess_in_torch(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     cells = sum((SIDE // stride) ** 2 for stride in (8, 16, 32))

@@ -11,7 +11,7 @@ import pytest
 
 from dataflow.messages import Detections2D, Image, Keypoints2D
 from operators.detection import KeypointDetector
-from operators.detection.keypoints import COCO_KEYPOINTS, Cut
+from operators.detection.keypoint_detector import COCO_KEYPOINTS, Cut
 from operators.inference import ModelError
 
 onnx = pytest.importorskip("onnx")

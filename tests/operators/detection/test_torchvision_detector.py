@@ -72,6 +72,7 @@ def test_equal_images_give_equal_boxes_and_grey_ones_are_taken(checkpoint: Path)
     assert once.digests() == again.digests()
 
 
+@pytest.mark.long
 def test_a_lower_threshold_is_not_cut_off_by_the_model(checkpoint: Path) -> None:
     few = play(detector(checkpoint), {"image": [image()]})["detections"][0]
     operator = TorchvisionDetector(

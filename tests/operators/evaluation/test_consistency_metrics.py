@@ -64,6 +64,7 @@ def test_covariances_that_are_not_honest_lie_outside(factor: float, mean: float)
     assert str(found["pose_band_95_percent"]).endswith(", out")
 
 
+@pytest.mark.long
 def test_directions_without_variance_do_not_count() -> None:
     found = figures(1.0, flat=True)
     assert found["position_nees_mean"] == pytest.approx(1.0, abs=0.1)

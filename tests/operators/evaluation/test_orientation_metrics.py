@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from dataflow.messages import Imu, Pose, Transforms
 from dataflow.testing import play
 from operators.evaluation import OrientationMetrics
-from operators.evaluation.orientation_error import differences, errors, without_mean_heading
+from operators.evaluation.orientation_metrics import differences, errors, without_mean_heading
 
 
 def test_heading_and_inclination_are_what_was_turned() -> None:

@@ -135,7 +135,7 @@ def test_wheels_hold_a_robot_that_stands() -> None:
     assert operator.summary()["robot/wheels standstill, used"] > 100
 
 
-@pytest.mark.parametrize("by_radar", [False, True], ids=["sightings", "radar"])
+@pytest.mark.parametrize("by_radar", [False, pytest.param(True, marks=pytest.mark.long)], ids=["sightings", "radar"])
 def test_ranges_to_known_landmarks_and_a_magnetometer_place_it(by_radar: bool) -> None:
     robot = Robot(8.0)
     places = np.array([[5.0, 5, 2], [-5, 4, 0], [4, -6, 3], [-4, -5, 1]])

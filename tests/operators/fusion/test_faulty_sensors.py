@@ -188,7 +188,7 @@ def test_room_that_the_filter_makes_is_a_warning_with_the_name_of_the_sensor() -
     assert any("made room" in text for _, text in run.alarms["robot/fix"])
 
 
-@pytest.mark.parametrize("wheels", [True, False])
+@pytest.mark.parametrize("wheels", [pytest.param(True, marks=pytest.mark.long), False])
 def test_positions_that_jump_are_named_and_not_followed_since_the_inertial_sensor_felt_nothing(wheels: bool) -> None:
     drive = Drive(13.0)
     run = Run(drive, drive.fixes(jump=(6.0, 11.0)), *([drive.wheels(1.0)] if wheels else []))
@@ -219,7 +219,7 @@ def test_a_jump_that_a_sensor_of_another_kind_sees_too_is_believed() -> None:
     assert made_room(alike) == 0 < made_room(other)
 
 
-@pytest.mark.parametrize("factor", [0.0, 2.0], ids=["blocked", "spinning"])
+@pytest.mark.parametrize("factor", [0.0, pytest.param(2.0, marks=pytest.mark.long)], ids=["blocked", "spinning"])
 def test_wheels_that_block_or_spin_in_an_outage_are_named_and_not_believed(factor: float) -> None:
     drive = Drive(10.0)
     run = Run(drive, drive.fixes(out=(4.5, 8.5)), drive.wheels(factor))
@@ -228,13 +228,14 @@ def test_wheels_that_block_or_spin_in_an_outage_are_named_and_not_believed(facto
     assert "robot/fix" not in run.alarms
 
 
+@pytest.mark.long
 def test_wheels_that_spin_by_less_than_the_inertial_sensor_can_exclude_are_named() -> None:
     drive = Drive(10.0)
     run = Run(drive, drive.fixes(out=(4.5, 8.5)), drive.wheels(1.5))
     assert 5.0 <= run.alarms["robot/wheels"][0][0] <= 6.0
 
 
-@pytest.mark.parametrize("late", [0.2, 0.5])
+@pytest.mark.parametrize("late", [0.2, pytest.param(0.5, marks=pytest.mark.long)])
 def test_late_stamps_of_positions_beside_wheels_are_named_with_their_offset(late: float) -> None:
     drive = Drive(15.0)
     run = Run(drive, drive.fixes(stamped=late), drive.wheels(1.0))
@@ -254,6 +255,7 @@ def test_wheels_of_a_wrong_scale_are_named_with_it() -> None:
     assert run.alarms["robot/wheels"][0][0] < run.alarms.get("robot/fix", [(12.0, "")])[0][0]
 
 
+@pytest.mark.long
 def test_an_offset_or_a_scale_that_is_estimated_is_not_warned_of() -> None:
     drive = Drive(12.0)
     settings = {
@@ -264,12 +266,14 @@ def test_an_offset_or_a_scale_that_is_estimated_is_not_warned_of() -> None:
     assert not run.alarms
 
 
-def test_a_drive_without_faults_raises_no_alarm() -> None:
+@pytest.mark.parametrize("wheels", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_a_drive_without_faults_raises_no_alarm(wheels: bool) -> None:
     drive = Drive(15.0)
-    assert not Run(drive, drive.fixes(out=(6.0, 9.0)), drive.wheels(1.0)).alarms
-    assert not Run(drive, drive.fixes()).alarms
+    streams = [drive.fixes(out=(6.0, 9.0)), drive.wheels(1.0)] if wheels else [drive.fixes()]
+    assert not Run(drive, *streams).alarms
 
 
+@pytest.mark.long
 def test_alarms_and_doubts_come_back_from_a_snapshot() -> None:
     drive = Drive(8.0)
     fixes = drive.fixes(jump=(6.0, 9.0))
@@ -329,7 +333,7 @@ def test_a_first_heading_told_wrongly_is_warned_of_within_a_second_and_while_it_
     assert np.concatenate(told).mean() >= 0.95
 
 
-@pytest.mark.parametrize("wrong", [0.5, -0.5])
+@pytest.mark.parametrize("wrong", [0.5, pytest.param(-0.5, marks=pytest.mark.long)])
 def test_a_first_heading_told_wrongly_is_found_out_by_wheels(wrong: float) -> None:
     drive = Drive(5.0)
     time, errors, claimed, warned = heading_of(drive, wrong, drive.wheels(1.0)).T
@@ -338,6 +342,7 @@ def test_a_first_heading_told_wrongly_is_found_out_by_wheels(wrong: float) -> No
     assert warned[~late].any()
 
 
+@pytest.mark.long
 def test_a_first_heading_told_rightly_raises_no_doubt_and_costs_no_confidence() -> None:
     drive = Drive(6.0)
     run = Run(drive, drive.fixes(), heading_sigma=0.05)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from dataflow.messages import Imu, MagneticField
 from dataflow.testing import Played, play
-from operators.evaluation.orientation_error import differences, errors, without_mean_heading
+from operators.evaluation.orientation_metrics import differences, errors, without_mean_heading
 from operators.fusion import OrientationFilter
 from operators.fusion.orientation import Orientation, OrientationConfig
 from operators.sources.broad_imu import read_trial

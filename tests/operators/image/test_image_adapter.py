@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from dataflow.messages import Diagnostics, Image
 from dataflow.testing import Played, play
 from operators.image import ImageAdapter
-from operators.image.adaptation import Adaptation, Measured, exposed_longer, measure
+from operators.image.image_adapter import Adaptation, Measured, exposed_longer, measure
 
 WIDTH, HEIGHT = 160, 120
 

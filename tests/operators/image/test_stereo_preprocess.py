@@ -17,7 +17,7 @@ from operators.depth import StereoDepth
 from operators.geometry import se3
 from operators.geometry.lens import undistorted
 from operators.image import StereoPreprocess, stereo_preprocess
-from operators.image.rectification import Rectification, rectify
+from operators.image.stereo_preprocess import Rectification, rectify
 
 WIDTH, HEIGHT = 200, 150
 # the right camera, 0.2 m to the right, a little below, turned about all axes

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from source_trees import nodes_of
 
 from operators.detection.coco import COCO_CLASSES
 from operators.labels import ROLES, LabelSpace, LabelSpaceError, labels_file
@@ -114,9 +115,8 @@ ORDINARY = frozenset(("clock", "robot", "train", "sink", "bus", "box", "table"))
 
 def literals(file: Path) -> Iterator[str]:
     """Yields the strings of a module that are not docstrings."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    told = {id(node.value) for node in nodes_of(file) if isinstance(node, ast.Expr)}
+    for node in nodes_of(file):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told:
             yield node.value
 

@@ -40,14 +40,6 @@ def scene(folder: Path, size: tuple[int, int]) -> np.ndarray:
     return warp(pixels, fitted((pixels.shape[1], pixels.shape[0]), size), size)
 
 
-@pytest.fixture(scope="module")
-def trained(worlds: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with detector.onnx and segmenter.onnx."""
-    folder = tmp_path_factory.mktemp("networks")
-    train(pair(worlds, seed=1), Settings(epochs=1, batch=4, threads=1), folder / "pair.onnx")
-    return folder
-
-
 @pytest.mark.long
 def test_a_training_begins_with_what_the_file_answers(trained: Path, worlds: Path) -> None:
     task = pair(worlds)
@@ -62,10 +54,12 @@ def test_a_training_begins_with_what_the_file_answers(trained: Path, worlds: Pat
     assert np.allclose(task.boxes.anchors, anchors, atol=1e-3)
 
 
+@pytest.mark.long
 def test_networks_of_rendered_worlds_are_marked_as_trained_in_simulation(trained: Path) -> None:
     assert all(trained_in_simulation(trained / name) for name in ("detector.onnx", "segmenter.onnx"))
 
 
+@pytest.mark.long
 def test_normalisation_while_training_agrees_with_what_was_measured(trained: Path, worlds: Path) -> None:
     task = pair(worlds)
     task.begin_with(trained / "detector.onnx")
@@ -112,12 +106,14 @@ def test_a_detector_and_a_segmenter_alone_begin_so_too(trained: Path, worlds: Pa
         assert np.abs(mine.numpy() - theirs).max() < 0.05
 
 
+@pytest.mark.long
 def test_anchors_grow_with_the_input(trained: Path, worlds: Path) -> None:
     task = pair(worlds, (2 * SIZE[0], 2 * SIZE[1]))
     task.begin_with(trained / "detector.onnx")
     assert np.allclose(task.boxes.anchors, 2 * np.array(read_facts(trained / "detector.onnx")["anchors"]), atol=1e-3)
 
 
+@pytest.mark.long
 def test_a_file_that_does_not_fit_is_refused_with_what_differs(trained: Path, worlds: Path) -> None:
     with pytest.raises(
         TrainingFileError, match=r"its architecture is 'smallresnet-0[.]25 fpn grid', and this one's 'sm"

@@ -50,7 +50,7 @@ def off(drive: Drive, played: Played) -> list[float]:
     return [float(np.hypot(*(p.position[:2] - drive.pose(p.stamp * 1e-9)[:2]))) for p in played["pose"]]  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2, 3))])
 def test_a_hall_that_looks_the_same_from_both_ends_is_ambiguous_and_both_places_are_named(seed: int) -> None:
     drive = HallDrive(5.0, seed=seed)
     played, operator = localized(drive, {"scan": drive.scans()})
@@ -64,7 +64,7 @@ def test_a_hall_that_looks_the_same_from_both_ends_is_ambiguous_and_both_places_
     assert min(float(np.hypot(*(other[:2] - place[:2]))) for place in both) < 0.2
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_what_makes_the_ends_differ_decides(seed: int) -> None:
     drive = HallDrive(5.0, notch=True, seed=seed)
     played, _ = localized(drive, {"scan": drive.scans()})
@@ -72,6 +72,7 @@ def test_what_makes_the_ends_differ_decides(seed: int) -> None:
     assert max(off(drive, played)) < 0.15
 
 
+@pytest.mark.long
 def test_a_known_start_or_a_position_decides() -> None:
     drive = HallDrive(4.0)
     known, _ = localized(drive, {"scan": drive.scans()}, start=tuple(drive.pose(0.05).tolist()))

@@ -63,7 +63,7 @@ def errors(drive: Drive, poses: list[Any], since: float = 1.0) -> tuple[float, f
     return float(far), float(turned), len(off)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_a_scan_finds_the_robot_anywhere_in_the_map(seed: int) -> None:
     drive = Drive(5.0, seed)
     played, _ = localized(drive, {"scan": drive.scans()})
@@ -73,7 +73,7 @@ def test_a_scan_finds_the_robot_anywhere_in_the_map(seed: int) -> None:
     assert count >= 79
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_a_robot_that_was_carried_away_is_found_again(seed: int) -> None:
     drive = Drive(6.0, seed, carried=(3.0, 0.45))
     played, operator = localized(drive, {"scan": drive.scans()})
@@ -85,6 +85,7 @@ def test_a_robot_that_was_carried_away_is_found_again(seed: int) -> None:
     assert operator.summary()["particles injected"] > 0
 
 
+@pytest.mark.long
 def test_landmarks_without_identity_and_positions_localize_too() -> None:
     drive = Drive(5.0)
     sensors = {"seen": drive.sightings(known=False), "place": drive.positions()}
@@ -139,6 +140,7 @@ def test_a_lidar_that_degrades_loses_its_say_and_the_pose_stays_right(wrong: dic
     assert count > 130
 
 
+@pytest.mark.long
 def test_landmarks_that_degrade_lose_their_say_to_the_lidar() -> None:
     drive = Drive(7.0)
     sensors = {"scan": drive.scans(), "seen": drive.sightings(off=0.5, after=3.0)}
@@ -157,6 +159,7 @@ def test_a_modality_that_contradicts_the_fused_estimate_is_named() -> None:
     assert dict(zip(last.names, last.messages, strict=True))["lidar alone"] == "contradicts the fused estimate"
 
 
+@pytest.mark.long
 def test_a_gyroscope_makes_up_for_wheels_that_slip() -> None:
     drive = Drive(8.0)
     slipping = drive.odometry(slip=0.5)

@@ -9,7 +9,7 @@ import pytest
 
 from operators.detection.coco import CLASS_LISTS
 from operators.detection.decoders import LAYOUTS
-from operators.detection.keypoints import KEYPOINT_LAYOUTS
+from operators.detection.keypoint_detector import KEYPOINT_LAYOUTS
 from operators.inference import ModelError
 from operators.models.registry import Model, Registry
 

@@ -109,7 +109,7 @@ def finding(operator: ColorDepthCheck, known: Transforms) -> tuple[str, list[Tra
         made = operator.process(image, depth, info("color"), info("depth"), known)
         if made is not None and isinstance(corrected := made.get("corrected"), Transforms):
             given.append(corrected)
-    return str(operator.summary().get("finding", "")), given
+    return operator.finding(), given
 
 
 def boards(seed: int, shift: Callable[[float], float]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:

@@ -38,7 +38,9 @@ def test_sensors_that_fit_raise_no_alarm() -> None:
     assert warnings(played) == []
 
 
-@pytest.mark.parametrize(("scale", "text"), [(1.05, "5.0% too long"), (0.96, "4.0% too short")])
+@pytest.mark.parametrize(
+    ("scale", "text"), [pytest.param(1.05, "5.0% too long", marks=pytest.mark.long), (0.96, "4.0% too short")]
+)
 def test_depths_of_another_scale_are_said_with_the_scale(scale: float, text: str) -> None:
     said = warnings(checked(extrinsics(), scale))
     assert len(said) >= 8

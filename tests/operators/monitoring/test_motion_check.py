@@ -136,7 +136,7 @@ def test_a_camera_whose_depths_are_too_long_is_named_by_the_others() -> None:
     assert "motions/lidar and wheels" in said[-1]
 
 
-@pytest.mark.parametrize("sensor", ["wheels", "imu"])
+@pytest.mark.parametrize("sensor", [pytest.param("wheels", marks=pytest.mark.long), "imu"])
 def test_a_sensor_that_repeats_a_reading_of_motion_is_said_and_one_at_rest_is_not(sensor: str) -> None:
     given: list[Any] = wheels() if sensor == "wheels" else gyroscope()
     held = next(m for m in given if m.stamp >= 6_000_000_000)
@@ -160,7 +160,7 @@ def test_a_gyroscope_of_another_scale_is_named() -> None:
     ("sensor", "axis", "name"),
     [
         ("lidar", "z", "motions/lidar"),
-        ("camera", "y", "motions/camera"),
+        pytest.param("camera", "y", "motions/camera", marks=pytest.mark.long),
         ("camera", "x", "motions/camera"),
         ("imu", "y", "gyroscope of imu"),
     ],

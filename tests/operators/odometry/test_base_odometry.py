@@ -36,6 +36,7 @@ def test_the_bases_pose_is_that_of_the_base() -> None:
     assert (made.frame, made.child_frame) == ("odom_base", "base_link")
 
 
+@pytest.mark.long
 def test_covariance_is_that_of_the_base_by_sampling() -> None:
     rng = np.random.default_rng(0)
     spread = np.diag([1e-4, 2e-4, 1e-4, 1e-5, 4e-5, 2e-5])

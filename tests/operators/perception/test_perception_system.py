@@ -110,6 +110,7 @@ def test_several_samples_of_one_step_are_taken_at_their_own_stamps(room: Room) -
     assert digests(singly)["graph"] == digests(together)["graph"]
 
 
+@pytest.mark.long
 def test_without_fusion_the_camera_gives_the_pose_and_arrays_will_do(room: Room) -> None:
     with room.system() as system:
         assert system.sensors == ("image", "depth")
@@ -121,6 +122,7 @@ def test_without_fusion_the_camera_gives_the_pose_and_arrays_will_do(room: Room)
     assert {"cloud", "detections", "tracks", "boxes", "objects", "graph"} <= result.made().keys()
 
 
+@pytest.mark.long
 def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
     with room.system(("image", "depth", "imu", "wheels")) as system:
         for stamp, step in room.given("image", "depth", "imu", "wheels"):
@@ -142,10 +144,20 @@ def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
 @pytest.mark.parametrize(
     ("sensors", "there", "gone"),
     [
-        (("image",), {"detections", "segmentation", "tracks"}, {"lifter", "objects", "scene", "fusion", "base"}),
-        (("image", "points"), {"detections", "cloud", "pose"}, {"odometry", "fusion", "wheeled"}),
+        pytest.param(
+            ("image",),
+            {"detections", "segmentation", "tracks"},
+            {"lifter", "objects", "scene", "fusion", "base"},
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            ("image", "points"),
+            {"detections", "cloud", "pose"},
+            {"odometry", "fusion", "wheeled"},
+            marks=pytest.mark.long,
+        ),
         (("imu", "wheels"), set(), {"detector", "lifter", "scene", "wheeled"}),
-        (("wheels", "command"), set(), {"fusion", "scene"}),
+        pytest.param(("wheels", "command"), set(), {"fusion", "scene"}, marks=pytest.mark.long),
     ],
     ids=["camera", "camera_and_lidar", "inertial_and_wheels", "wheels_and_commands"],
 )

@@ -20,15 +20,27 @@ def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def classifier(shapes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Returns what the command makes of the shapes in a few epochs."""
+def trained(shapes: Path, folder: Path, epochs: int) -> Path:
+    """Returns what the command makes of the shapes in some epochs."""
     pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.training.commands import train
 
-    out = tmp_path_factory.mktemp("trained") / "shapes.onnx"
-    words = ["classifier", str(shapes), "--out", str(out), "--size", "64x64", "--epochs", "14", "--variation", "0.3"]
-    done = CliRunner().invoke(train, [*words, "--threads", "1", "--workers", "1", "--evaluate-every", "7"])
+    out = folder / "shapes.onnx"
+    words = ["classifier", str(shapes), "--out", str(out), "--size", "64x64", "--epochs", str(epochs)]
+    words += ["--variation", "0.3", "--threads", "1", "--workers", "1", "--evaluate-every", "7"]
+    done = CliRunner().invoke(train, words)
     assert done.exit_code == 0, done.output
     assert "operators.recognition:ImageClassifier" in done.output
     return out
+
+
+@pytest.fixture(scope="session")
+def classifier(shapes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network that has hardly learned anything."""
+    return trained(shapes, tmp_path_factory.mktemp("trained"), 1)
+
+
+@pytest.fixture(scope="session")
+def good_classifier(shapes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network that tells the shapes apart, for long tests."""
+    return trained(shapes, tmp_path_factory.mktemp("trained"), 14)

@@ -15,9 +15,9 @@ from operators.recognition import FeatureExtractor
 
 
 @pytest.mark.long
-def test_vectors_have_length_one_and_are_alike_for_alike_things(classifier: Path) -> None:
+def test_vectors_have_length_one_and_are_alike_for_alike_things(good_classifier: Path) -> None:
     shown = [image(picture(shape, 700 + i), i) for i, shape in enumerate(SHAPES * 4)]
-    played = play(FeatureExtractor(weights=str(classifier)), {"image": shown})
+    played = play(FeatureExtractor(weights=str(good_classifier)), {"image": shown})
     vectors = np.concatenate([message.vectors for message in played["features"]])
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=1e-5)
     alike = vectors @ vectors.T
@@ -32,14 +32,15 @@ def test_equal_images_give_equal_vectors(classifier: Path) -> None:
     assert runs[0] == runs[1]
 
 
-def test_an_object_has_the_vector_of_its_part_of_the_image_and_its_id(classifier: Path) -> None:
+@pytest.mark.long
+def test_an_object_has_the_vector_of_its_part_of_the_image_and_its_id(good_classifier: Path) -> None:
     shown, boxes = scene()
-    operator = FeatureExtractor(weights=str(classifier), per="object")
+    operator = FeatureExtractor(weights=str(good_classifier), per="object")
     (found,) = play(operator, {"image": [shown], "detections": [boxes]})["features"]
     assert found.ids is not None
     assert found.ids.tolist() == [7, 9]
     alone = [image(picture("disc", 901)), image(picture("stripes", 902), 1)]
-    whole = play(FeatureExtractor(weights=str(classifier)), {"image": alone})["features"]
+    whole = play(FeatureExtractor(weights=str(good_classifier)), {"image": alone})["features"]
     alike = found.vectors @ np.concatenate([m.vectors for m in whole]).T
     assert alike[0, 0] > alike[0, 1]
     assert alike[1, 1] > alike[1, 0]

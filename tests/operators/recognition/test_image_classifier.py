@@ -15,18 +15,20 @@ from operators.recognition import ImageClassifier
 from operators.weights import shipped
 
 
-def test_new_images_get_their_class(classifier: Path) -> None:
+@pytest.mark.long
+def test_new_images_get_their_class(good_classifier: Path) -> None:
     shown = [(shape, image(picture(shape, 500 + i), i)) for i, shape in enumerate(SHAPES * 5)]
-    found = play(ImageClassifier(weights=str(classifier)), {"image": [i for _, i in shown]})["classes"]
+    found = play(ImageClassifier(weights=str(good_classifier)), {"image": [i for _, i in shown]})["classes"]
     right = [message.labels() == (shape,) for (shape, _), message in zip(shown, found, strict=True)]
     assert np.mean(right) >= 0.9
     assert found[0].class_names == SHAPES
     np.testing.assert_allclose([message.probabilities.sum() for message in found], 1.0, rtol=1e-4)
 
 
-def test_each_object_of_the_image_gets_its_class_and_keeps_its_id(classifier: Path) -> None:
+@pytest.mark.long
+def test_each_object_of_the_image_gets_its_class_and_keeps_its_id(good_classifier: Path) -> None:
     shown, boxes = scene()
-    operator = ImageClassifier(weights=str(classifier), per="object")
+    operator = ImageClassifier(weights=str(good_classifier), per="object")
     (found,) = play(operator, {"image": [shown], "detections": [boxes]})["classes"]
     assert found.labels() == ("disc", "stripes")
     assert found.ids.tolist() == [7, 9]

@@ -36,12 +36,12 @@ def mapped(solid: Solid, label: str) -> Played:
     ("label", "size", "center"),
     [
         ("chair", (0.95, 0.95, 1.0), (3.2, 0.2, 0.5)),  # an armchair
-        ("chair", (0.45, 0.50, 0.95), (3.0, 0.2, 0.475)),  # of the usual size
-        ("bin", (0.48, 0.55, 0.93), (3.0, 0.2, 0.465)),  # of 120 litres
+        pytest.param("chair", (0.45, 0.50, 0.95), (3.0, 0.2, 0.475), marks=pytest.mark.long),  # of the usual size
+        pytest.param("bin", (0.48, 0.55, 0.93), (3.0, 0.2, 0.465), marks=pytest.mark.long),  # of 120 litres
         ("monitor", (0.10, 1.23, 0.71), (3.2, 0.2, 1.0)),  # of 55 inches
-        ("shelf", (0.60, 1.0, 2.0), (3.8, 0.2, 1.0)),
-        ("box", (0.60, 0.80, 0.60), (3.0, 0.2, 0.3)),  # for moving
-        ("bottle", (0.27, 0.27, 0.49), (2.6, 0.2, 0.245)),  # of a water cooler
+        pytest.param("shelf", (0.60, 1.0, 2.0), (3.8, 0.2, 1.0), marks=pytest.mark.long),
+        pytest.param("box", (0.60, 0.80, 0.60), (3.0, 0.2, 0.3), marks=pytest.mark.long),  # for moving
+        pytest.param("bottle", (0.27, 0.27, 0.49), (2.6, 0.2, 0.245), marks=pytest.mark.long),  # of a water cooler
         ("book", (0.62, 0.45, 0.06), (2.2, 0.2, 0.5)),  # an atlas that lies open
     ],
 )

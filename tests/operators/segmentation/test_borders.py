@@ -207,6 +207,7 @@ def test_it_finds_borders_better_than_the_first_look(files: tuple[Path, Path, Se
     assert wrong[1] < 0.75 * wrong[0]
 
 
+@pytest.mark.long
 def test_it_repeats_itself_and_confidence_stays(files: tuple[Path, Path, SegmentationData]) -> None:
     plain, finer, _ = files
     image = Image(stamp=1, frame="camera", data=scene(800)[0])
@@ -238,6 +239,7 @@ def test_8_bits_leave_it_in_the_file(files: tuple[Path, Path, SegmentationData],
     assert (first == second).mean() > 0.97
 
 
+@pytest.mark.long
 def test_a_second_network_that_does_not_fit_is_refused(
     files: tuple[Path, Path, SegmentationData], tmp_path: Path
 ) -> None:
@@ -252,6 +254,7 @@ def test_a_second_network_that_does_not_fit_is_refused(
 # ---- training
 
 
+@pytest.mark.long
 def test_a_segmenter_without_scores_or_of_other_classes_is_refused(
     files: tuple[Path, Path, SegmentationData], tmp_path: Path
 ) -> None:
@@ -280,6 +283,7 @@ def test_the_scores_in_the_file_are_those_of_the_network(tmp_path: Path) -> None
     assert np.abs(below - (theirs - theirs.max(axis=1, keepdims=True))).max() < 0.06
 
 
+@pytest.mark.long
 def test_an_interrupted_training_ends_with_the_same_bits(
     files: tuple[Path, Path, SegmentationData], tmp_path: Path
 ) -> None:

@@ -284,6 +284,7 @@ def test_a_provider_that_finds_no_device_is_not_silently_replaced_by_the_cpu(
         made.setup()
 
 
+@pytest.mark.long
 def test_an_exported_network_of_torchvision_gives_the_map_of_the_operator_for_those(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     models = pytest.importorskip("torchvision.models")

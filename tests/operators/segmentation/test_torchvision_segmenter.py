@@ -62,6 +62,7 @@ def test_unsure_pixels_become_void_and_equal_images_give_equal_maps(checkpoint: 
     assert run() == run()
 
 
+@pytest.mark.long
 def test_a_class_may_have_a_threshold_of_its_own(checkpoint: Path) -> None:
     def run(**params: object) -> SegmentationMap:
         operator = TorchvisionSegmenter(model=NAME, checkpoint=str(checkpoint), side=0, with_confidence=True, **params)

@@ -76,6 +76,7 @@ def test_the_heading_is_that_of_the_camera_whatever_its_mount() -> None:
     assert (turned - 1.0 + np.pi) % (2 * np.pi) - np.pi == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.long
 def test_where_nobody_chooses_it_says_what_to_ask_for() -> None:
     with pytest.raises(ValueError, match=r"no person here chooses .* give people: 3 or 4"):
         robot("office", 801, people=2)

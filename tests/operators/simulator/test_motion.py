@@ -251,7 +251,7 @@ def test_movers_never_jump_and_never_sink_into_the_floor(name: str) -> None:
         assert min(thing.vertices(t)[:, 2].min() for t in times[::25]) > -0.01
 
 
-@pytest.mark.parametrize("name", ["office", "corridor"])
+@pytest.mark.parametrize("name", ["office", pytest.param("corridor", marks=pytest.mark.long)])
 def test_a_robot_is_said_to_drive_while_it_moves_and_to_rest_while_it_stands(name: str) -> None:
     robot = next(thing for thing in world(name, 0).things if isinstance(thing.mover, Driving))
     seen = set()

@@ -139,6 +139,7 @@ def test_the_camera_and_its_truth_are_the_same_alone_and_beside_all_others(
         assert alone[port] == everything[port], port
 
 
+@pytest.mark.long
 def test_a_sensor_that_is_off_has_no_messages_and_no_frame() -> None:
     streams = camera_only(color_camera=SMALL)
     assert set(streams) == {"image", "image_info", "extrinsics"}

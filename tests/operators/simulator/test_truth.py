@@ -28,7 +28,7 @@ from operators.simulator.trajectory import Trajectory
 from operators.simulator.truth import masks, velocity
 from operators.simulator.worlds.make import NAMES, make_world
 
-WORLDS = ("office", "table_top")
+WORLDS = ("office", pytest.param("table_top", marks=pytest.mark.long))
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 

@@ -94,6 +94,7 @@ def test_its_command_makes_nearly_the_same_first_second_on_any_machine(demo: Rec
             assert alike(ours, theirs), f"{stream} at {ours.stamp}"
 
 
+@pytest.mark.long
 def test_it_makes_the_same_first_second_to_the_bit_on_such_a_machine(demo: Recording, again: Recording) -> None:
     there, here = (
         {key: recording.metadata["machine"][key] for key in ("architecture", "cpu")}

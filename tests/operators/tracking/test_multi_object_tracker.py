@@ -89,6 +89,17 @@ def test_an_end_is_told_once_and_its_id_is_not_used_again() -> None:
     assert ids(messages[-1]) == [2]
 
 
+def test_tracks_name_the_detections_that_they_were_matched_with() -> None:
+    empty, strays = [30.0, 40, 30, 90, 0.9], [400.0, 300, 440, 380, 0.25]
+    rows = [[walker(100), walker(300)], [empty, walker(302), strays, walker(102)], [walker(104)]]
+    messages = tracked([image(k, each) for k, each in enumerate(rows)])
+    matched = [
+        None if m.detections is None else dict(zip(m.ids.tolist(), m.detections.tolist(), strict=True))
+        for m in messages
+    ]
+    assert matched == [{1: 0, 2: 1}, {1: 3, 2: 1}, {1: 0, 2: -1}]
+
+
 def test_boxes_of_another_class_are_another_object() -> None:
     messages = tracked([image(k, [walker(100), walker(102)], [0, 1]) for k in range(5)])
     assert ids(messages[-1]) == [1, 2]

@@ -15,25 +15,13 @@ from dataflow.cli.main import app
 from dataflow.messages import Image
 from operators.detection.custom.folder import read_detection_data
 from operators.segmentation import Segmenter
-from operators.segmentation.dataset import read_segmentation_data
 from operators.weights import NetworkFileError, open_network, read_facts
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     pytest.importorskip("torch", reason="training needs the extra [train]")
-    from operators.learning.loop import Settings, train
-    from operators.training.pair import PairTask
     from operators.training.quantization import quantize_network
 
 SIZE = (160, 128)
-
-
-@pytest.fixture(scope="module")
-def trained(worlds: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with detector.onnx and segmenter.onnx."""
-    folder = tmp_path_factory.mktemp("networks")
-    task = PairTask(read_detection_data(worlds), read_segmentation_data(worlds), SIZE, width=0.25)
-    train(task, Settings(epochs=2, batch=4, threads=1), folder / "pair.onnx")
-    return folder
 
 
 def views(worlds: Path) -> list[NDArray[np.uint8]]:
@@ -98,7 +86,9 @@ def test_what_cannot_be_done_is_said_and_leaves_no_file(trained: Path, worlds: P
     assert list(tmp_path.iterdir()) == [small]
 
 
-@pytest.mark.parametrize(("kind", "score"), [("detector", "ap50"), ("segmenter", "miou")])
+@pytest.mark.parametrize(
+    ("kind", "score"), [("detector", "ap50"), pytest.param("segmenter", "miou", marks=pytest.mark.long)]
+)
 def test_the_command_scores_both_files(trained: Path, worlds: Path, tmp_path: Path, kind: str, score: str) -> None:
     arguments = ["train", "quantize", str(trained / f"{kind}.onnx"), str(worlds), "--out", str(tmp_path / "small.onnx")]
     result = CliRunner().invoke(app, [*arguments, "--images", "2", "--json"])

@@ -87,6 +87,7 @@ def test_a_trained_detector_is_loaded_with_its_own_classes(data: Path, tmp_path:
     assert set(found.labels()) <= set(NAMES)
 
 
+@pytest.mark.long
 def test_a_trained_segmenter_is_loaded_with_its_own_classes(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "masks.pth"
     told = trained(SEGMENTER, data, out, "--size", "64x64")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,15 +27,12 @@ SIZE = (160, 128)
 
 
 @pytest.fixture(scope="module")
-def apart(worlds: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def apart(trained: Path, worlds: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with detector.onnx and segmenter.onnx, whose ranges were measured on different images."""
     folder = tmp_path_factory.mktemp("networks")
-    task = PairTask(read_detection_data(worlds), read_segmentation_data(worlds), SIZE, width=0.25)
-    train(task, Settings(epochs=2, batch=4, threads=1), folder / "pair.onnx")
     views = [image.read() for image in read_detection_data(worlds).training]
     for name, seen in (("detector", views[:2]), ("segmenter", views[2:])):
-        shutil.move(folder / f"{name}.onnx", folder / f"{name}.float.onnx")
-        quantize_network(folder / f"{name}.float.onnx", seen, folder / f"{name}.onnx")
+        quantize_network(trained / f"{name}.onnx", seen, folder / f"{name}.onnx")
     return folder
 
 
@@ -86,10 +82,10 @@ def test_a_head_behind_another_range_computes_what_it_did(apart: Path, tmp_path:
 
 
 @pytest.mark.long
-def test_what_cannot_share_is_told_and_leaves_no_file(apart: Path, worlds: Path, tmp_path: Path) -> None:
+def test_what_cannot_share_is_told_and_leaves_no_file(trained: Path, apart: Path, worlds: Path, tmp_path: Path) -> None:
     out = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
-    with pytest.raises(TrainingFileError, match=r"detector\.float\.onnx is not in 8 bits: `dataflow train quantize`"):
-        share_trunk(apart / "detector.float.onnx", apart / "segmenter.onnx", *out)
+    with pytest.raises(TrainingFileError, match=r"detector\.onnx is not in 8 bits: `dataflow train quantize`"):
+        share_trunk(trained / "detector.onnx", apart / "segmenter.onnx", *out)
     task = PairTask(read_detection_data(worlds), read_segmentation_data(worlds), SIZE, width=0.25, seed=5)
     train(task, Settings(epochs=1, batch=4, threads=1, seed=5), tmp_path / "other" / "pair.onnx")
     views = [image.read() for image in read_detection_data(worlds).training]

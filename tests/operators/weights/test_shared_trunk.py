@@ -78,6 +78,7 @@ def test_one_network_may_be_some_images_ahead_and_few_images_are_kept(computed: 
     assert len(computed) == 10
 
 
+@pytest.mark.long
 def test_operators_give_the_same_alone_and_beside_each_other(computed: list[Pixels]) -> None:
     rng = np.random.default_rng(1)
     shown = [

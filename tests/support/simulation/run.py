@@ -205,7 +205,7 @@ class Simulation:
 
     def _named(self, child: Child) -> str:
         assert self._supervisor is not None
-        return next(label for label, each in self._supervisor._children.items() if each is child)
+        return next(label for label, each in self._supervisor._here._children.items() if each is child)
 
     def _born(self, process: Process) -> None:
         life = self._lives[process.label] = self._lives.get(process.label, 0) + 1

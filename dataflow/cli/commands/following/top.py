@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -83,10 +84,12 @@ def _samples(
     from dataflow.client.attach import graph_of, still_runs
 
     board = Board(graph_of(found))
+    several = any(node.machine is not None for node in board.graph.nodes.values())
     board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
     time.sleep(first)
     while True:
-        yield board.update(processes.statuses(ANSWER_WITHIN, firings=latencies), time.monotonic())
+        sample = board.update(processes.statuses(ANSWER_WITHIN, firings=latencies), time.monotonic())
+        yield replace(sample, machines=processes.machines(ANSWER_WITHIN)) if several else sample
         if not still_runs(found):
             return
         time.sleep(every)

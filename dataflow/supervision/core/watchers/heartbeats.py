@@ -55,9 +55,18 @@ class Heartbeats(Watcher):
 
     def tick(self) -> None:
         for process in self.run.processes.values():
+            if process.label in self.run.unreachable:
+                self._wait_for_link(process)
             beat = self._beats.get(process.label)
             if beat is not None and process.life is Life.RUNNING and self.run.steady - beat > BEAT_WITHIN:
                 self._miss(process, f"gave no sign of life for {self.run.steady - beat:.1f} s")
+
+    def _wait_for_link(self, process: Supervised) -> None:
+        """Goes on without a process that is out of reach, from now on; when it is back, it has the usual time."""
+        self._beats[process.label] = self.run.steady
+        if process.life is Life.RUNNING and not process.silent:
+            process.silent = True
+            self._cover.cover()
 
     def _miss(self, process: Supervised, cause: str) -> None:
         if self._restarts.may_restart(process):

@@ -194,6 +194,11 @@ class LiveRestarts(RestartPolicy):
                     where=fields["where"],
                     traceback=fields["traceback"],
                 )
+            case "reloaded":
+                name = fields["operator"]
+                text = f"operator {name!r} goes on with new code after {fields['seconds']:.2g} s"
+                said = (text, f"its state: {fields['state']}", fields["warning"])
+                run.event("reload", "; ".join(filter(None, said)), operators=[name])
             case "stream_ended":
                 self._ended_streams[fields["stream"]] = fields["reason"]
             case "gap":

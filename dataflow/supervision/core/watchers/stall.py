@@ -125,6 +125,8 @@ class LiveStallWatch(StallWatch):
             names = "; ".join(p.at_work() for p in stuck)
             raise RunFailed(f"all sources have ended, and a call does not: {names}", self.run.last_words(stuck))
         for process in list(self.run.working()):
+            if process.label in self.run.unreachable:
+                self._signs[process.label] = now
             sign = self._signs.get(process.label, now)
             silence = now - sign
             if silence > timeout - notice(timeout):

@@ -124,6 +124,7 @@ def test_what_rolls_drifts_less_where_it_cannot_slip() -> None:
     assert count(operator, "slip, used") > 150
 
 
+@pytest.mark.long
 def test_two_plays_and_one_continued_from_a_snapshot_give_equal_bits() -> None:
     velocity, tremble = walked(6.0, 4.0)
     imu, poses, _ = readings(velocity, tremble)

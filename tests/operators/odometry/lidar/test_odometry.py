@@ -18,8 +18,8 @@ from operators.geometry import se3
 from operators.odometry import LidarOdometry
 from operators.odometry.lidar import tracker
 from operators.odometry.lidar.map import PlaneMap, thinned
+from operators.odometry.lidar.odometry import Sweep
 from operators.odometry.lidar.search import around
-from operators.odometry.lidar.sweep import Sweep
 
 Array = NDArray[np.float64]
 STEP = 100_000_000  # ns
@@ -123,6 +123,7 @@ def test_points_with_times_are_deskewed() -> None:
     assert np.linalg.norm(off[-1, :3]) < np.linalg.norm(skewed[-1, :3])
 
 
+@pytest.mark.long
 def test_points_without_times_are_deskewed_by_their_azimuth_where_it_is_known_how_the_lidar_turns() -> None:
     clouds = [scan(ROOM, circling, k, timed=True) for k in range(20)]
     plain = [c.replace(time_offsets=None) for c in clouds]
@@ -234,10 +235,12 @@ def carried_blind(world: list[Any]) -> list[str]:
     return texts(play(LidarOdometry(give_up=2.0), {"cloud": clouds}))[15:]
 
 
+@pytest.mark.long
 def test_a_lidar_is_not_found_again_in_a_bare_corridor() -> None:
     assert all(text.startswith("lost: nothing constrains motion along (1.00, 0.00") for text in carried_blind(CORRIDOR))
 
 
+@pytest.mark.long
 def test_a_lidar_is_not_found_again_in_a_room_that_looks_alike_in_four_headings() -> None:
     square = [
         (2, -0.6, (-4, 4), (-4, 4)), (2, 2.0, (-4, 4), (-4, 4)), (0, -4, (-4, 4), (-1, 2)), (0, 4, (-4, 4), (-1, 2)),
@@ -277,6 +280,7 @@ def driven(seed: int) -> Played:
     return play(LidarOdometry(near=1.0), {"cloud": [scan(street(seed), car, k) for k in (0, 1, 2, *range(8, 50, 6))]})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_a_car_that_moves_metres_between_scans_is_followed(seed: int) -> None:
     played = driven(seed)
@@ -371,6 +375,7 @@ def test_thinning_keeps_the_first_point_of_a_cube() -> None:
     assert thinned(points, 0.5).tolist() == [0, 2, 4]
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_the_end_of_a_drive_is_that_of_direct_registration(data_dir: Path) -> None:
     import small_gicp

@@ -126,6 +126,7 @@ def test_a_reset_clock_begins_a_new_path() -> None:
     assert sent["status"].messages[0].startswith("initialising")
 
 
+@pytest.mark.long
 def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
     given = streams(16)
     known = given["image_info"][0]

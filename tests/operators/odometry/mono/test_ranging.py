@@ -91,6 +91,7 @@ def test_a_depth_image_now_and_then_gives_metres() -> None:
     assert np.linalg.norm(poses[-1].linear) == pytest.approx(0.03 * RATE, rel=0.3)
 
 
+@pytest.mark.long
 def test_the_position_at_which_metres_are_found_counts_from_where_the_map_began() -> None:
     found = 30
     played = run(streams({found: measured(found)}))
@@ -103,7 +104,9 @@ def test_the_position_at_which_metres_are_found_counts_from_where_the_map_began(
     assert "gives the scale" in said(played)[found]
 
 
-@pytest.mark.parametrize("between", [0.0, 0.4], ids=["of an image's stamp", "between two images"])
+@pytest.mark.parametrize(
+    "between", [pytest.param(0.0, marks=pytest.mark.long), 0.4], ids=["of an image's stamp", "between two images"]
+)
 def test_a_depth_camera_of_another_place_size_and_rate_gives_the_same_metres(between: float) -> None:
     given = streams({})
     frames = [k + between for k in range(0, COUNT - 1, 6)]
@@ -150,6 +153,7 @@ def test_depth_that_shows_nothing_is_counted_and_changes_no_pose(make: Any, use:
     assert operator.summary()[f"depth {use}"] == 10
 
 
+@pytest.mark.long
 def test_a_depth_image_that_comes_again_counts_once() -> None:
     operator, once = MonoVisualOdometry(), measured(20)
     alone, again = run(streams({20: once})), run(streams(dict.fromkeys(range(20, 30), once)), operator)
@@ -158,6 +162,7 @@ def test_a_depth_image_that_comes_again_counts_once() -> None:
     assert "depth repeats the last one" in said(again)[21]
 
 
+@pytest.mark.long
 def test_depth_that_contradicts_a_known_scale_is_left_out() -> None:
     good = {k: measured(k) for k in range(14, 24)}
     wrong = {k: (1.4 * measured(k)).astype(np.float32) for k in range(24, 24 + PERSISTENT - 1)}
@@ -183,6 +188,7 @@ def test_a_scale_that_was_wrong_is_found_anew_without_a_jump_and_the_way_so_far_
     assert spread[at - 1] < 0.2 * np.linalg.norm(estimate[at - 1])
 
 
+@pytest.mark.long
 def test_an_input_without_messages_changes_nothing() -> None:
     silent = streams({}) | {"depth": [], "depth_info": []}
     assert play(MonoVisualOdometry(), silent, static=STATIC[:2]).digests() == run(streams({})).digests()

@@ -68,6 +68,7 @@ def test_a_reference_in_metres_gives_the_scale() -> None:
     assert np.linalg.norm(speed) == pytest.approx(0.03 * RATE, rel=0.3)
 
 
+@pytest.mark.long
 def test_a_reference_that_comes_later_brings_the_map_to_metres() -> None:
     truth = aside(40)
     results = follow(rendered(40), [None] * 20 + [*truth[20:]])

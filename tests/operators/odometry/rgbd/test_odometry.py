@@ -173,9 +173,9 @@ def without_depth(frame: Frame) -> Frame:
 @pytest.mark.parametrize(
     ("count", "speed", "rate", "offset", "refine", "metres", "radians"),
     [
-        (40, 1.0, 30.0, 0.0, True, 0.012, 0.006),  # slow
-        (40, 1.0, 30.0, 0.0, False, 0.03, 0.015),  # slow, features only
-        (25, 3.0, 10.0, 0.0, True, 0.015, 0.008),  # 10 Hz: 2.3 degrees a frame
+        pytest.param(40, 1.0, 30.0, 0.0, True, 0.012, 0.006, marks=pytest.mark.long),  # slow
+        pytest.param(40, 1.0, 30.0, 0.0, False, 0.03, 0.015, marks=pytest.mark.long),  # slow, features only
+        pytest.param(25, 3.0, 10.0, 0.0, True, 0.015, 0.008, marks=pytest.mark.long),  # 10 Hz: 2.3 degrees a frame
         (25, 3.0, 10.0, 0.05, True, 0.015, 0.008),  # two cameras 5 cm apart
         (25, 3.0, 10.0, 0.05, False, 0.04, 0.02),  # the same, features only
     ],
@@ -208,6 +208,7 @@ def test_unmodelled_extrinsics_cost_accuracy() -> None:
     assert told < 0.7 * untold
 
 
+@pytest.mark.long
 def test_pure_rotation_is_followed() -> None:
     poses = [se3.exp(np.array([0, 0, 0, 0, 0.03 * i, 0])) for i in range(15)]
     frames = [(render(T, K_COLOR)[0], render(T, K_DEPTH)[1]) for T in poses]
@@ -253,6 +254,7 @@ def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() 
             assert np.linalg.eigvalsh(result.covariance - carried)[0] > 0
 
 
+@pytest.mark.long
 def test_first_frames_of_a_camera_that_tracks_well_count_as_those_after_them() -> None:
     """Nothing is known of the noise then; the doubt would stay in every later pose."""
     odometry, added = RgbdOdometry(camera()), []
@@ -303,6 +305,7 @@ def repeated(frames: list[Frame], first: int, last: int) -> list[Frame]:
     return [*frames[:first], *[frames[first]] * (last - first), *frames[last:]]
 
 
+@pytest.mark.long
 def test_frozen_images_are_noticed_and_not_used() -> None:
     frames, poses = sequence(40)
     color_stuck = [(stuck[0], f[1]) for stuck, f in zip(repeated(frames, 10, 25), frames, strict=True)]
@@ -327,7 +330,7 @@ def test_lost_depth_is_bridged_by_the_depth_of_the_map() -> None:
     assert errors(results, poses)[0] < 0.04
 
 
-@pytest.mark.parametrize("share", [0.5, 0.9])
+@pytest.mark.parametrize("share", [pytest.param(0.5, marks=pytest.mark.long), 0.9])
 def test_sparse_depth_is_depth(share: float) -> None:
     frames, poses = sequence(25, 3.0)
     rng = np.random.default_rng(3)
@@ -337,6 +340,7 @@ def test_sparse_depth_is_depth(share: float) -> None:
     assert errors(results, poses)[0] < 0.03
 
 
+@pytest.mark.long
 def test_keyframes_are_renewed_where_depth_reaches_less_far() -> None:
     """Most of what comes into view is beyond the reach of the depth camera: poorer keyframes are all that there is."""
     frames, poses = sequence(60, 1.5)
@@ -476,6 +480,7 @@ def mover_sequence(count: int) -> Sequence:
     return moved, poses
 
 
+@pytest.mark.long
 def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
     frames, poses = mover_sequence(25)
     results = follow(frames, rate=10.0)
@@ -487,6 +492,7 @@ def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
     assert errors(results, poses)[0] < 0.03
 
 
+@pytest.mark.long
 def test_keyframes_hold_nothing_of_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     frames, _ = mover_sequence(25)
     odometry, fits = RgbdOdometry(camera()), []
@@ -535,6 +541,7 @@ def test_bare_wall_keeps_its_distance_and_admits_the_rest() -> None:
     assert sigma[0] > 0.05
 
 
+@pytest.mark.long
 def test_a_start_in_the_dark_costs_no_more_than_the_dark() -> None:
     frames, poses = sequence(40)
     results = follow([black(without_depth(f)) if i < 5 else f for i, f in enumerate(frames)])
@@ -665,6 +672,7 @@ def test_operator_gives_the_core_poses_in_named_frames() -> None:
     assert out.pose_covariance is not None
 
 
+@pytest.mark.long
 def test_operator_goes_on_alike_from_a_recorded_state() -> None:
     frames, _ = sequence(40)
 
@@ -695,6 +703,7 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
     assert pack_state(one.snapshot()) == pack_state(other.snapshot())
 
 
+@pytest.mark.long
 def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
     frames, _ = sequence(40)
     stamps = [k * 33_000_000 for k in range(8)]

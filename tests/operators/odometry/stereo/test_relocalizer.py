@@ -167,6 +167,7 @@ def test_a_segment_is_numbered_anew_and_one_that_was_found_again_is_gone_on_with
     assert known.placed(known.keyframes[0], None).segment == 0
 
 
+@pytest.mark.long
 def test_a_pose_elsewhere_than_shape_and_brightness_say_is_not_believed() -> None:
     pairs, poses = sequence(25)
     known = [kept(poses[k], k, pairs[k]) for k in (4, 8)]

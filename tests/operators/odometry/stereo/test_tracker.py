@@ -47,6 +47,7 @@ def test_pose_follows_known_motion() -> None:
     assert rotation < 0.005
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shift", [0.33, 2.0])
 def test_disparities_that_are_off_by_a_constant_do_not_stretch_the_way(shift: float) -> None:
     """The right image is shifted, as an imperfect rectification leaves it: 2 px are a fifth of what is 15 m away."""
@@ -135,6 +136,7 @@ def test_black_and_frozen_images_are_noticed_and_bridged() -> None:
     assert frozen[10].reason == "left image repeats the last one; right image repeats the last one"
 
 
+@pytest.mark.long
 def test_long_darkness_is_a_loss_that_the_covariance_tells_of() -> None:
     pairs, poses = sequence(25)
     dark = (np.zeros_like(pairs[0][0]),) * 2
@@ -212,6 +214,7 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
 # -- recorded data -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_recorded_drive_is_followed_within_one_percent(data_dir: Path) -> None:
     folder = data_dir / "kitti_odometry_06"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from operators.recognition.activity.looks import Looks
+from operators.recognition.activity.recognizer import Looks
 
 
 def probabilities(*values: float) -> np.ndarray:

@@ -72,6 +72,7 @@ def image(pixels: np.ndarray, stamp: int = 0) -> Image:
     return Image(stamp=stamp, frame="camera", data=pixels)
 
 
+@pytest.mark.long
 def test_a_learned_object_is_found_where_it_is_and_nowhere_else(learned: Path) -> None:
     hits = false = 0
     operator = LearnedDetector(objects=[str(learned)])

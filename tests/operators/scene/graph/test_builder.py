@@ -296,6 +296,16 @@ def test_with_the_classes_of_coco_things_are_in_a_refrigerator_and_persons_sit_o
     assert (2, "under", 1) not in found
 
 
+def test_nodes_keep_the_tracks_that_are_theirs() -> None:
+    nodes = room(0, [MUG, LAMP, TABLE]).replace(tracks=np.array([5, 9, 4]), track_nodes=np.array([0, 0, 2], np.int32))
+    graph = play(Builder(), {"nodes": [nodes]})["graph"][0]
+    assert isinstance(graph, SceneGraph)
+    held = {name: graph.tracks_of(k) for k, name in enumerate(graph.names())}
+    assert held == {"mug 2": (5, 9), "lamp 7": (), "table 1": (4,)} | {
+        name: () for name in ("room", "floor") if name in held
+    }
+
+
 def test_two_plays_are_equal_and_a_restored_graph_goes_on_the_same() -> None:
     rooms = [[TABLE, MUG, CHAIR, person(5 - 0.15 * k, -0.9)] for k in range(20)]
     whole = built(rooms)

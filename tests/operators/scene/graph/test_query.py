@@ -37,6 +37,8 @@ def graph(stamp: int = 1_000_000_000) -> SceneGraph:
         subjects=np.array([ids.index(s) for s, _, _, _ in RELATIONS], np.int32),
         objects=np.array([ids.index(o) for _, _, o, _ in RELATIONS], np.int32),
         relation_scores=np.array([s for _, _, _, s in RELATIONS], np.float32),
+        tracks=np.array([12, 31, 7]),
+        track_nodes=np.array([ids.index(i) for i in (2, 2, 4)], np.int32),
     )
 
 
@@ -104,6 +106,7 @@ def test_what_is_proposed_is_a_relation_and_no_relation_is_called_something_else
 def test_the_graph_as_json_names_layers_and_scores() -> None:
     made = as_json(graph())
     assert {n["name"]: n["layer"] for n in made["nodes"]}["room -2"] == "room"
+    assert {n["id"]: n["tracks"] for n in made["nodes"] if n["tracks"]} == {2: [12, 31], 4: [7]}
     assert made["relations"][0] == {"subject": 2, "predicate": "on", "object": 1, "score": 0.9}
     json.dumps(made)
 
@@ -132,7 +135,9 @@ def test_the_command_answers_from_a_recording(recording: Path) -> None:
     assert code == 0
     assert json.loads(out)["stamp"] == 2_000_000_000
     assert [m["id"] for m in json.loads(out)["matches"]] == [2, 3]
-    assert "holding" in asked(str(recording), "--nodes")[1]
+    nodes = asked(str(recording), "--nodes")[1]
+    assert "holding" in nodes
+    assert "12, 31" in nodes
 
 
 def test_a_time_after_the_last_graph_is_said(recording: Path) -> None:

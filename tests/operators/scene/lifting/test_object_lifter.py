@@ -17,6 +17,7 @@ from dataflow.messages import (
     Detections2D,
     Diagnostics,
     PointCloud,
+    Tracks,
     Transforms,
     pack_masks,
 )
@@ -62,6 +63,22 @@ def test_a_box_that_hides_part_of_another_keeps_its_own_points(masks: bool) -> N
         own = world[clusters.labels == number]
         assert len(own) >= 8
         assert (np.abs(own - center) < np.array(size) / 2 + 0.1).all(axis=1).mean() > 0.97
+
+
+@pytest.mark.parametrize(("stamp", "ids"), [(1, [7, -1, 4]), (2, [-1, -1, -1])], ids=["same image", "another"])
+def test_objects_have_the_ids_of_the_tracks_of_their_detections(stamp: int, ids: list[int]) -> None:
+    pose = camera(1)
+    cloud, detections, segmentation = look(pose, [CRATE, BEHIND, MUG], noise=0.004)
+    none = np.zeros(3)
+    tracks = Tracks(
+        stamp=stamp, ids=[4, 7, 9], states=[1, 1, 2], scores=none, class_ids=[1, 0, 0], ages=none, unseen=none,
+        boxes=np.zeros((3, 4)), detections=[2, 0, -1],
+    )  # fmt: skip
+    lifter = ObjectLifter()
+    lifter.setup()
+    made = lifter.process(detections, cloud, INFO, segmentation=segmentation, pose=pose, tracks=tracks)
+    assert made["boxes"].ids.tolist() == ids
+    assert made["images"].ids.tolist() == ids
 
 
 def test_a_detection_of_nothing_has_no_object_and_is_counted() -> None:

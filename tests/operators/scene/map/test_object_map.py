@@ -16,6 +16,7 @@ from operators.scene.map.cuboid import ImageView
 from operators.scene.map.kinds import Kinds
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.matching import MapSettings, Observation
+from operators.scene.map.merging import merge
 from operators.scene.map.object_map import ObjectMap
 from operators.scene.map.range_view import RangeView
 
@@ -48,8 +49,8 @@ def observation(solid: Solid, class_id: int, T: NDArray[np.float64]) -> Observat
     return Observation(surface(solid), class_id, 0.8, None, ImageView(P, box, np.ones(4, np.bool_), T[:3, 3]))
 
 
-def after(scenes: Sequence[Sequence[tuple[Solid, int]]]) -> ObjectMap:
-    """The map after views of things, each said to be of a class, a quarter of a second apart."""
+def after(scenes: Sequence[Sequence[tuple[Solid, int]]], tracks: Sequence[int] = ()) -> ObjectMap:
+    """The map after views of things, each said to be of a class and perhaps a track, a quarter of a second apart."""
     known = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
     for k, scene in enumerate(scenes):
         T = looking(0.4 * np.sin(k))
@@ -62,6 +63,7 @@ def after(scenes: Sequence[Sequence[tuple[Solid, int]]]) -> ObjectMap:
             hidden |= (np.abs(at - center)[:, 1:] < size[1:] / 2).all(axis=1)
         points = np.concatenate([wall[~hidden], *(surface(solid) for solid, _ in scene)])
         seen = [observation(solid, class_id, T) for solid, class_id in scene]
+        seen = [replace(each, track=track) for each, track in zip(seen, tracks or [-1] * len(seen), strict=True)]
         in_sensor = (points - T[:3, 3]) @ T[:3, :3]
         known.update((k + 1) * SECOND // 4, seen, RangeView(in_sensor, T, 0.012))
     return known
@@ -108,6 +110,25 @@ def test_a_part_that_is_never_seen_beside_its_whole_is_no_object_of_its_own() ->
 def test_neighbours_that_are_seen_beside_each_other_are_two(gap: float) -> None:
     beside: Solid = ((2.0, 0.12 + gap, 0.1), THING[1])
     assert len(after([[(THING, BOX), (beside, MUG)]] * 8).confirmed()) == 2
+
+
+@pytest.mark.parametrize(("track", "id"), [(3, 1), (4, 2), (9, 1), (-1, 1)], ids=["first", "second", "new", "none"])
+def test_of_two_things_that_a_view_may_show_it_is_the_one_of_its_track(track: int, id: int) -> None:
+    behind: Solid = ((2.22, 0.0, 0.1), THING[1])
+    known = after([[(THING, MUG), (behind, MUG)]] * 6, tracks=[3, 4])
+    T = looking(0.0)
+    between = replace(observation(((2.1, 0.0, 0.1), THING[1]), MUG, T), track=track)
+    assert known.update(2 * SECOND, [between], RangeView((between.points - T[:3, 3]) @ T[:3, :3], T, 0.012)) == [id]
+    assert track in (-1, known.objects[id].tracks[-1])
+
+
+def test_a_merged_object_has_the_tracks_of_both_and_the_last_ones_are_kept() -> None:
+    first, second = (after([[(THING, MUG)]] * 3, tracks=[track]).objects[1] for track in (5, 8))
+    first.follow(range(10, 30))
+    second.seen += 1
+    both = merge(first, second, Kinds([], {}))
+    assert both.tracks == [*range(15, 30), 8]
+    assert MapObject.restored(both.snapshot(), 0.03).tracks == both.tracks
 
 
 def test_a_ball_that_lies_still_is_remembered_and_one_that_is_moved_keeps_its_id() -> None:

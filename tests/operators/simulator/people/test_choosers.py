@@ -17,6 +17,7 @@ from operators.simulator.things.furnishing import FLOOR
 from operators.simulator.worlds.make import NAMES, make_world
 
 ROBOT_RADIUS = 0.22
+OFFICE_AND_LONG = [NAMES[0], *(pytest.param(name, marks=pytest.mark.long) for name in NAMES[1:])]
 
 
 @functools.lru_cache
@@ -70,7 +71,7 @@ def test_who_chooses_has_six_candidates_and_gets_what_it_wants(name: str, seed: 
         assert reached == goals
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OFFICE_AND_LONG)
 def test_a_goal_is_known_before_it_is_reached(name: str) -> None:
     """From the choice until the hand or the pelvis moves there are seconds in which to infer it."""
     for person in choosers(world(name, 0)):
@@ -82,8 +83,8 @@ def test_a_goal_is_known_before_it_is_reached(name: str) -> None:
         assert min(leads) > 2
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", OFFICE_AND_LONG)
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_the_hand_takes_what_it_reaches_for(name: str, seed: int) -> None:
     here = world(name, seed)
     for person in choosers(here):
@@ -133,7 +134,7 @@ def test_persons_more_keep_their_lanes_and_stay_off_the_robots_path(name: str) -
             assert all(lane.apart(other) > 0 for other in here.lanes[k + 1 :]), (seed, lane.mover)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OFFICE_AND_LONG)
 def test_what_is_carried_lies_on_its_table_while_nobody_holds_it(name: str) -> None:
     here = world(name, 0)
     for thing in (t for t in here.objects() if isinstance(t.mover, Carried)):

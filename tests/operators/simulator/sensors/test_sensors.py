@@ -267,6 +267,7 @@ def test_wheels_without_error_follow_the_path_and_with_it_drift() -> None:
     assert error < 5 * math.sqrt(np.trace(real.pose_covariance[:2, :2]))  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_radar_sees_the_still_world_come_nearer_as_the_robot_drives() -> None:
     source = robot(
         movers=False, duration="3s",
@@ -422,6 +423,7 @@ def test_a_camera_sights_landmarks_by_the_same_bearings_without_ranges() -> None
     np.testing.assert_array_equal(c.covariances, b.covariances[:, 1:, 1:])
 
 
+@pytest.mark.long
 def test_a_landmark_behind_something_is_not_sighted() -> None:
     source = robot(duration="100ms", movers=False, landmarks={"rate": 10, "missing": 0, "max_range": 100})
     (message,) = stream(source, "sightings")
@@ -475,6 +477,7 @@ def test_geodetic_coordinates_return_to_the_same_place(
     np.testing.assert_allclose([offset @ east, offset @ np.cross(up, east), offset @ up], enu, atol=1e-5)
 
 
+@pytest.mark.long
 def test_satellite_fixes_scatter_about_the_antenna() -> None:
     fixes: list[Any] = stream(robot(duration="20s", hold=30, gnss={"rate": 20, "noise": 0.5, "drift": 0}), "fix")
     north = np.array([fix.latitude for fix in fixes])

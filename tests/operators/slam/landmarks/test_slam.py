@@ -112,6 +112,7 @@ def test_pose_and_map_are_near_the_truth_and_the_covariance_is_honest() -> None:
     assert np.sqrt(np.mean(np.square(off))) < 0.12
 
 
+@pytest.mark.long
 def test_covariances_of_landmarks_cover_their_errors() -> None:
     distances = []
     for seed in range(12):
@@ -197,6 +198,7 @@ def test_the_operator_gives_what_the_filter_gives() -> None:
     np.testing.assert_allclose(correction.matrix("odom") @ odometry.matrix(), pose.matrix(), atol=1e-9)
 
 
+@pytest.mark.long
 def test_equal_inputs_give_equal_bits() -> None:
     first, second = (play(LandmarkSlam(association="unknown"), Walk(2).messages(known=False)) for _ in range(2))
     for port in ("pose", "landmarks", "correction"):

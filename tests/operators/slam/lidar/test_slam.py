@@ -106,6 +106,7 @@ def test_a_place_seen_again_is_a_loop_and_the_map_does_not_grow_there(around: Pl
     assert len(around["map"]) > 0
 
 
+@pytest.mark.long
 def test_poses_are_those_of_the_body_where_one_is_named() -> None:
     mount = at(0.3, 0.1, 0.4)
     extrinsics = Transforms.from_matrix(mount, stamp=0, frame="base_link", child_frame="lidar")
@@ -153,6 +154,7 @@ def mapped(poses: Sequence[Matrix], said: Sequence[Matrix], slam: LidarMapper) -
     ]
 
 
+@pytest.mark.long
 def test_a_loop_takes_drift_away() -> None:
     poses = on_round(ROUND + 5)
     said = drifting(poses)

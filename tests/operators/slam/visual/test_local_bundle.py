@@ -19,7 +19,7 @@ from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.slam.keyframe_graph import KeyframeGraph, Node
-from operators.slam.visual.local_bundle import adjust_newest
+from operators.slam.visual.bundle import adjust_newest
 from operators.slam.visual.map_points import LONE, MapPoints
 from operators.slam.visual.view import View
 from operators.sources.room import Room, camera_path

@@ -148,6 +148,7 @@ def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
     assert found.max() < 0.05
 
 
+@pytest.mark.long
 def test_a_saved_map_of_another_room_is_not_found(saved: Path) -> None:
     played = run(frames(elsewhere(10), seed=5), map_file=str(saved))
     assert {text.split(":")[0] for text in texts(played)} == {"searching"}
@@ -227,6 +228,7 @@ def test_blind_frames_are_told_and_survived() -> None:
     assert errors(played["pose"], poses, poses[0])[-1] < 0.05
 
 
+@pytest.mark.long
 def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
     once = streams(frames(on_round(8)))
     stamps = [image.stamp for image in once["image"]]
@@ -263,6 +265,7 @@ def test_a_restored_state_goes_on_alike() -> None:
     assert pack_state(one.snapshot()) == pack_state(other.snapshot())
 
 
+@pytest.mark.long
 def test_covariance_covers_the_error(around: Played) -> None:
     poses = on_round(ROUND + 6)
     squares = []

@@ -1,0 +1,155 @@
+"""`dataflow health` and `dataflow metrics`: whether a running graph does its work, for programs that watch over it."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.text import Text
+
+from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.support.arguments import Json
+from dataflow.cli.support.output import DIFFERENT, INTERRUPTED, fail, friendly_errors, out, print_json, say, size
+
+if TYPE_CHECKING:
+    from dataflow.cli.support.board import Row
+
+ANSWER_WITHIN = 1.0
+CONNECT_WITHIN = 3.0
+PORT = 9464
+HERE = Path()
+
+Folder = Annotated[
+    Path, typer.Option("--folder", metavar="DIR", help="Where recordings are written: its disk is looked at.")
+]
+
+
+def health(
+    rate: Annotated[
+        list[str] | None,
+        typer.Option("--rate", metavar="OPERATOR=HZ", help="The least rate of an operator; may be repeated."),
+    ] = None,
+    losses: Annotated[
+        float, typer.Option("--losses", metavar="SHARE", help="Share of messages that an operator may drop.", min=0.0)
+    ] = 0.1,
+    free: Annotated[float, typer.Option("--free", metavar="GB", help="Free space on the disk.", min=0.0)] = 1.0,
+    folder: Folder = HERE,
+    over: Annotated[
+        float, typer.Option("--over", metavar="SECONDS", help="Time over which rates are taken.", min=0.1, max=600)
+    ] = 2.0,
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    json: Json = False,
+) -> None:
+    """Check whether a running graph does its work: for a watchdog, a container's health check, a cron job.
+
+    It does not where the process of an operator gives no answer, an operator was restarted meanwhile, no operator
+    fires, one drops more than `--losses` of its messages or is slower than its `--rate`, or the disk has less than
+    `--free` left. Each reason is a line.
+
+    Exit codes: 0 healthy; 1 not; 2 no such graph runs.
+
+    Examples:
+
+      dataflow health
+      dataflow health --rate camera=25 --rate detector=8 --folder out --free 5
+    """
+    from dataflow.cli.support.board import Board
+    from dataflow.client.attach import graph_of
+    from dataflow.client.processes import processes_of
+
+    with friendly_errors():
+        found = running_graph(graph, wait)
+        resolved = graph_of(found)
+        least = _rates(rate or (), resolved.nodes)
+        board = Board(resolved)
+        with processes_of(found) as processes:
+            processes.connected(len(found.endpoints), CONNECT_WITHIN)
+            before = board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
+            time.sleep(over)
+            sample = board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
+        reasons = [*faults(before.rows, sample.rows, least=least, losses=losses), *_disk(folder, free)]
+    if json:
+        print_json({"graph": found.name, "healthy": not reasons, "reasons": reasons})
+    else:
+        for reason in reasons:
+            out.print(Text(reason), soft_wrap=True)
+        if not reasons:
+            out.print(Text(f"{found.name} is healthy: {len(sample.rows)} operators"), soft_wrap=True)
+    if reasons:
+        raise typer.Exit(DIFFERENT)
+
+
+def faults(before: Sequence[Row], now: Sequence[Row], *, least: Mapping[str, float], losses: float) -> Iterator[str]:
+    """Yields what is wrong with the operators of a graph, by two looks at them."""
+    restarts = {row.operator: row.restarts for row in before}
+    for row in now:
+        handled = row.rate + row.drop_rate
+        if row.state == "no answer":
+            yield f"{row.operator}: its process does not answer"
+        elif row.restarts > restarts[row.operator]:
+            yield f"{row.operator}: was restarted ({row.restarts} times so far)"
+        elif row.rate < least.get(row.operator, 0.0):
+            yield f"{row.operator}: fires at {row.rate:.1f} Hz, less than {least[row.operator]:g}"
+        elif handled and row.drop_rate / handled > losses:
+            yield f"{row.operator}: drops {row.drop_rate / handled:.0%} of its messages"
+    working = [row for row in now if row.state not in ("ended", "no answer")]
+    if working and not any(row.rate for row in working):
+        yield "no operator fires"
+
+
+def metrics(
+    port: Annotated[int, typer.Option("--port", metavar="PORT", help="Of loopback; 0: a free one.")] = PORT,
+    folder: Folder = HERE,
+) -> None:
+    """Serve figures of all graphs that run here to Prometheus, at http://127.0.0.1:PORT/metrics, until Ctrl-C.
+
+    Firings, messages, losses, waits, CPU and wall time, restarts and lag of every operator, and the free space of a
+    disk, as they are when they are asked for. Graphs may come and go. Nothing listens beyond loopback.
+
+    Examples:
+
+      dataflow metrics
+      dataflow metrics --port 9500 --folder out
+    """
+    from dataflow.client.metrics import MetricsServer, collect
+    from dataflow.transport.registry import running
+
+    with friendly_errors():
+        try:
+            server = MetricsServer(lambda: collect(running(), [folder]), port)
+        except OSError as error:
+            raise fail(f"cannot listen on port {port} of loopback: {error.strerror}") from None
+        say(f"http://127.0.0.1:{server.port}/metrics")
+        try:
+            server.serve()
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+
+
+def _rates(words: Sequence[str], operators: Mapping[str, object]) -> dict[str, float]:
+    from dataflow.graph.problems import did_you_mean
+
+    found = {}
+    for word in words:
+        operator, _, number = word.rpartition("=")
+        if operator not in operators:
+            raise fail(
+                f"--rate {word}: no operator {operator!r} runs: {did_you_mean(operator, operators, 'there are')}"
+            )
+        try:
+            found[operator] = float(number)
+        except ValueError:
+            raise fail(f"--rate {word}: expected a number of Hz behind the '='") from None
+    return found
+
+
+def _disk(folder: Path, free: float) -> Iterator[str]:
+    if not folder.exists():
+        yield f"{folder} is not there"
+    elif (left := shutil.disk_usage(folder).free) < free * 1e9:
+        yield f"the disk of {folder} has {size(left)} left, less than {free:g} GB"

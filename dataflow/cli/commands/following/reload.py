@@ -1,0 +1,59 @@
+"""`dataflow reload`: new code of an operator in a graph that runs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.text import Text
+
+from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.support.arguments import Json
+from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, print_json, say
+
+
+def reload(
+    operator: Annotated[str, typer.Argument(metavar="OPERATOR", help="Its name in the graph, such as detector.")],
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    timeout: Annotated[
+        float, typer.Option("--timeout", metavar="SECONDS", help="Wait so long for an answer.", min=0.1)
+    ] = 30.0,
+    json: Json = False,
+) -> None:
+    """Let an operator of a live run go on with its code as it is in its files now.
+
+    Its module is imported again, with the modules of the same code that have changed, between two firings. It keeps its
+    state where it gives one (`snapshot`) and the new code takes it, and its messages that wait. Where the new code
+    fails, or declares other ports, the old code goes on. The recording holds this as a restart, with the digests of
+    both codes. Sources, and modules that declare message types, are not reloaded.
+
+    Exit codes: 0 reloaded; 1 refused: the old code goes on, or no answer; 2 no such graph or operator.
+
+    Examples:
+
+      dataflow reload tracker
+      dataflow reload front/cloud --graph two_cameras
+    """
+    from dataflow.client.attach import graph_of
+    from dataflow.client.processes import NoAnswer, Refused, processes_of
+    from dataflow.graph.problems import did_you_mean
+
+    with friendly_errors():
+        found = running_graph(graph, wait)
+        nodes = graph_of(found).nodes
+        if operator not in nodes:
+            raise fail(f"no operator {operator!r} runs: {did_you_mean(operator, nodes, 'there are')}")
+        with processes_of(found) as processes:
+            try:
+                outcome = processes.reload(operator, timeout)
+            except (Refused, NoAnswer) as error:
+                raise fail(f"{operator} is not reloaded: {error}", code=DIFFERENT) from None
+    if outcome["warning"]:
+        say(escape(outcome["warning"]))
+    if json:
+        print_json({"operator": operator, **outcome})
+    else:
+        text = f"{operator} goes on with new code after {outcome['seconds']:.2g} s; its state: {outcome['state']}"
+        out.print(Text(text), soft_wrap=True)

@@ -1,0 +1,99 @@
+"""`dataflow join` and `dataflow keys`: machines that take part in a graph, and what lets them in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dataflow.cli.support.arguments import FLAG, ModuleFolders, find_modules_in
+from dataflow.cli.support.output import fail, friendly_errors, say
+
+Authority = Annotated[Path, typer.Option("--authority", metavar="FOLDER", help="The folder of `dataflow keys new`.")]
+
+
+def join(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name in graphs (`machine:`).")],
+    connect: Annotated[
+        str, typer.Option("--connect", metavar="ENDPOINT", help="Where the run listens (`dataflow run --listen`).")
+    ],
+    keys: Annotated[Path | None, typer.Option("--keys", metavar="FOLDER", help="This machine's keys.")] = None,
+    folder: Annotated[
+        Path, typer.Option("--folder", metavar="FOLDER", help="Where operators run, and files that are sent lie.")
+    ] = Path("dataflow-agent"),
+    path: ModuleFolders = None,
+    timeout: Annotated[
+        float,
+        typer.Option("--timeout", metavar="SECONDS", help="Operators go on for so long without the supervisor."),
+    ] = 30.0,
+    once: Annotated[bool, typer.Option("--once", metavar=FLAG, help="End after one run.")] = False,
+) -> None:
+    """Let this machine take part in graphs that run elsewhere.
+
+    It waits for a run, compares its code with the run's, takes the files that it lacks, and starts, watches and ends
+    the operators that the graph gives to it. When the supervisor is not heard for too long (--timeout), it ends
+    them. Then it waits for the next run; Ctrl-C ends it.
+
+    Examples:
+
+      dataflow join robot --connect tls/192.168.1.2:7447 --keys robot-keys
+    """
+    import signal
+
+    from dataflow.supervision.agent import Agent
+
+    find_modules_in(path)
+    with friendly_errors():
+        agent = Agent(name, connect, keys, folder, say, patience=timeout)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: agent.stop())
+        agent.run(once=once)
+
+
+def new(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder to make.")],
+) -> None:
+    """Make an authority, which issues keys. Its folder stays where it is: who has it can issue keys.
+
+    Examples:
+
+      dataflow keys new authority
+    """
+    from dataflow.machines.keys import KeysError, new_authority
+
+    try:
+        new_authority(folder)
+    except KeysError as error:
+        raise fail(str(error)) from None
+    say(f"{folder} issues keys: dataflow keys add NAME --authority {folder}")
+
+
+def add(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The machine's name, and that of the folder to make.")],
+    authority: Authority,
+    serves: Annotated[
+        list[str] | None,
+        typer.Option("--serves", metavar="ADDRESS", help="Graphs are run there, and others reach it by this address."),
+    ] = None,
+    tools: Annotated[bool, typer.Option("--tools", metavar=FLAG, help="Keys for tools alone, on any machine.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Another folder than NAME.")] = None,
+) -> None:
+    """Make the keys of one machine, in a folder to be taken there.
+
+    Examples:
+
+      dataflow keys add laptop --authority authority --serves 192.168.1.2 --serves laptop.local
+      dataflow keys add robot --authority authority
+      dataflow keys add my_tools --authority authority --tools
+    """
+    from dataflow.machines.keys import TOOLS, KeysError, issue
+
+    if tools and serves:
+        raise fail("--tools and --serves exclude each other: tools only connect")
+    folder = out or Path(name)
+    try:
+        issue(authority, folder, TOOLS if tools else name, serves=serves or ())
+    except KeysError as error:
+        raise fail(str(error)) from None
+    say(f"{folder}: the keys of {'tools' if tools else f'machine {name!r}'}")

@@ -1,0 +1,143 @@
+"""Keys by which machines and tools know each other: an authority of the user's own and one certificate for each.
+
+`openssl` makes them (P-256, ten years), so no library is needed. A certificate's common name is the machine's
+name; that of every tool is `TOOLS`. Only the certificate of the supervisor's machine may serve: no robot can pass for
+it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from dataflow.transport import NetworkError
+
+TOOLS = "dataflow tools"
+KEYS = "dataflow-machines"
+"""The first chunk of the keys of agents and their runs."""
+GRAPH_KEY = f"{KEYS}/graph"
+"""Answers tools on other machines which graph runs."""
+DAYS = 3650
+_AUTHORITY, _CERTIFICATE, _KEY = "authority.pem", "certificate.pem", "key.pem"
+_AUTHORITY_KEY = "authority.key"
+_CURVE = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
+
+
+class KeysError(RuntimeError):
+    """Keys cannot be made or are incomplete; the message names the folder, and what would be right."""
+
+
+def new_authority(folder: Path) -> None:
+    """Makes a folder with a new authority, which issues keys. Raises `KeysError` where there is one."""
+    if (folder / _AUTHORITY_KEY).exists():
+        raise KeysError(f"{folder} has an authority already: keys that it issued would be worthless with another")
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    made = ("-keyout", str(folder / _AUTHORITY_KEY), "-out", str(folder / _AUTHORITY))
+    _openssl("req", "-x509", *_CURVE, "-days", str(DAYS), "-subj", "/CN=dataflow authority", *made)
+
+
+def issue(authority: Path, folder: Path, name: str, *, serves: Iterable[str] = ()) -> None:
+    """Makes the keys of a machine, or of `TOOLS`, in a folder to be taken there.
+
+    `serves`: the addresses and host names by which others reach a supervisor there; without any it cannot be one.
+    Raises `KeysError`.
+    """
+    if not (authority / _AUTHORITY_KEY).is_file():
+        raise KeysError(f"{authority} has no {_AUTHORITY_KEY}; make an authority with: dataflow keys new {authority}")
+    if (folder / _KEY).exists():
+        raise KeysError(f"{folder} has keys already; name another folder")
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    served = list(serves)
+    usage = "serverAuth,clientAuth" if served else "clientAuth"
+    extensions = [f"extendedKeyUsage={usage}", "basicConstraints=CA:FALSE"]
+    if served:
+        extensions.append("subjectAltName=" + ",".join(f"{'IP' if _is_ip(s) else 'DNS'}:{s}" for s in served))
+    with tempfile.TemporaryDirectory() as scratch:
+        request, wanted = Path(scratch, "request"), Path(scratch, "extensions")
+        wanted.write_text("\n".join(extensions) + "\n")
+        subject = f"/CN={name}"
+        _openssl("req", "-new", *_CURVE, "-subj", subject, "-keyout", str(folder / _KEY), "-out", str(request))
+        by = ("-CA", str(authority / _AUTHORITY), "-CAkey", str(authority / _AUTHORITY_KEY), "-CAcreateserial")
+        out = ("-extfile", str(wanted), "-out", str(folder / _CERTIFICATE), "-days", str(DAYS))
+        _openssl("x509", "-req", "-in", str(request), *by, *out)
+    (folder / _AUTHORITY).write_bytes((authority / _AUTHORITY).read_bytes())
+
+
+def _is_ip(address: str) -> bool:
+    return ":" in address or address.replace(".", "").isdigit()
+
+
+def _openssl(*words: str) -> None:
+    """Runs openssl, whose files only their owner can read. Raises `KeysError`."""
+    before = os.umask(0o077)
+    try:
+        subprocess.run(["openssl", *words], check=True, capture_output=True, timeout=60, text=True)
+    except FileNotFoundError:
+        raise KeysError("openssl is not installed; it makes keys (Debian: apt install openssl)") from None
+    except subprocess.SubprocessError as error:
+        raise KeysError(f"openssl {words[0]}: {getattr(error, 'stderr', '') or error}") from error
+    finally:
+        os.umask(before)
+
+
+def settings(keys: Path | None, endpoint: str, *, tools: bool = False) -> dict[str, Any]:
+    """Returns the settings of Zenoh for an endpoint between machines. Raises `NetworkError` where it would be open.
+
+    Without keys only a Unix socket is allowed: any user of a machine can reach its loopback.
+    """
+    if keys is None:
+        if endpoint.startswith("unixsock-stream/"):
+            return {}
+        raise NetworkError(f"{endpoint!r} needs keys: make them with `dataflow keys new FOLDER`, give them by --keys")
+    if not endpoint.startswith("tls/"):
+        raise NetworkError(f"endpoint {endpoint!r} with keys: expected tls/<address>:<port>")
+    if missing := [name for name in (_AUTHORITY, _CERTIFICATE, _KEY) if not (keys / name).is_file()]:
+        raise NetworkError(f"keys {str(keys)!r}: no {', '.join(missing)}; `dataflow keys add` makes such a folder")
+    certificate, key = str(keys / _CERTIFICATE), str(keys / _KEY)
+    tls = {
+        "root_ca_certificate": str(keys / _AUTHORITY),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+    }
+    return {"transport/link/tls": tls}
+
+
+def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
+    """Returns the access control of a supervisor's machine: a machine gets its own keys, machines and tools
+    the graph's streams and requests, and every other certificate nothing."""
+    every = ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"]
+    every += ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
+    both = {"permission": "allow", "flows": ["ingress", "egress"], "messages": every}
+    open_to_all = [f"{namespace}/**", *_runtime_keys(namespace), GRAPH_KEY]
+    rules = [{"id": "graph", **both, "key_exprs": open_to_all}, {"id": "all", **both, "key_exprs": ["**"]}]
+    subjects = [
+        {"id": "tools", "cert_common_names": [TOOLS]},
+        {"id": "here", "link_protocols": ["unixsock-stream"]},
+    ]
+    policies = [{"rules": ["graph"], "subjects": ["tools"]}, {"rules": ["all", "graph"], "subjects": ["here"]}]
+    for name in machines:
+        rules.append({"id": name, **both, "key_exprs": [f"{KEYS}/machine/{name}/**"]})
+        subjects.append({"id": name, "cert_common_names": [name]})
+        policies.append({"rules": [name, "graph"], "subjects": [name]})
+    return {
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": rules,
+            "subjects": subjects,
+            "policies": policies,
+        }
+    }
+
+
+def _runtime_keys(namespace: str) -> list[str]:
+    """Returns the keys of requests: `**` matches no verbatim chunk."""
+    return [f"{namespace}/@/**", f"{namespace}/**/@/**"]

@@ -1,0 +1,223 @@
+"""An ordered pipe between two machines that loses nothing while both ends live, over links that stall and reset.
+
+Frames are numbered. Zenoh keeps their order on one link, and a link that resets loses what was on it: the receiver
+sees the next number (or the sender's mark) ahead of what it expects, and asks for everything from there on, as a new
+*round*. Frames of earlier rounds that are still on their way are ignored, so nothing is resent because a link is slow.
+Beats go both ways besides, of a higher priority: what was taken, the round that is wanted, and the time, by which the
+offset of the other machine's clock is measured (as NTP does, from the exchange with the shortest delay).
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from dataflow.transport import Bus
+
+BEAT_EVERY = 0.2
+AWAY_AFTER = 1.5
+"""Seconds without a sign of the other end after which its link counts as down."""
+IN_FLIGHT, IN_FLIGHT_BYTES = 4096, 8 << 20
+"""Frames, and bytes of them, that are sent before the first of them is acknowledged."""
+ACKNOWLEDGE_AFTER = 256
+MOST_WAITING = 256 << 20
+"""Bytes that wait for a link, at most, before messages that may be missed are dropped."""
+EXCHANGES = 64
+"""Exchanges of beats among which the one with the shortest delay measures the clocks' offset."""
+
+_FRAME = struct.Struct("!IQB")  # round, number, whether it is a mark: the number of the next frame
+_BEAT = struct.Struct("!IQqqq")  # round wanted, frames taken, sent at; of the other's last beat: sent at, taken at (ns)
+
+
+class Clocks:
+    """The other machine's clock against this one's."""
+
+    def __init__(self) -> None:
+        self._exchanges: deque[tuple[int, int]] = deque(maxlen=EXCHANGES)
+
+    def exchanged(self, asked: int, taken: int, answered: int, heard: int) -> None:
+        """Takes one exchange (ns): asked here, taken and answered there by that clock, heard here."""
+        delay = (heard - asked) - (answered - taken)
+        self._exchanges.append((delay, ((taken - asked) + (answered - heard)) // 2))
+
+    @property
+    def best(self) -> tuple[int, int] | None:
+        """Returns (delay, offset) in nanoseconds: by how much the other clock is ahead, at most half the delay wrong.
+        None before the first exchange."""
+        return min(tuple(self._exchanges), default=None)
+
+
+class Pipe:
+    """One end. `take` gets the frames in order, on a thread of Zenoh's, and must not wait."""
+
+    def __init__(self, bus: Bus, out: str, into: str, take: Callable[[bytes], None], *, bounded: bool) -> None:
+        """`out`, `into`: the keys below which frames go and come. `bounded`: what may be dropped is, beyond
+        `MOST_WAITING` bytes."""
+        self.clocks = Clocks()
+        self.dropped = 0
+        self.bounded = bounded
+        self._take = take
+        self._changed = threading.Condition()
+        self._waiting: deque[tuple[bytes, bool]] = deque()
+        self._waiting_bytes = 0
+        self._sent: deque[bytes] = deque()
+        self._sent_bytes = 0
+        self._base, self._next = 0, 0  # numbers: of the first frame in `_sent`, and of the next one to go out (again)
+        self._round = 0
+        self._wanted, self._expected, self._unsaid = 0, 0, 0
+        self._heard: tuple[int, int] = (0, 0)  # the other's last beat: sent at, by its clock; taken at, by this one's
+        self._heard_at = -AWAY_AFTER
+        self._closed = False
+        session = bus.session
+        self._frames = session.declare_publisher(
+            f"{out}/frames", congestion_control=zenoh.CongestionControl.BLOCK, express=True
+        )
+        self._beats = session.declare_publisher(
+            f"{out}/beats",
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=True,
+        )
+        self._subscribers = [
+            session.declare_subscriber(f"{into}/frames", zenoh.handlers.Callback(self._on_frame, indirect=False)),
+            session.declare_subscriber(f"{into}/beats", zenoh.handlers.Callback(self._on_beat, indirect=False)),
+        ]
+        for act in (self._send_frames, self._send_beats):
+            threading.Thread(target=act, name="pipe", daemon=True).start()
+
+    def send(self, frame: bytes, *, droppable: bool = False) -> None:
+        """Queues a frame; on any thread. One that is `droppable` may be dropped while it waits, the oldest first."""
+        with self._changed:
+            self._waiting.append((frame, droppable))
+            self._waiting_bytes += len(frame)
+            if self.bounded and self._waiting_bytes > MOST_WAITING:
+                self._drop_oldest()
+            self._changed.notify_all()
+
+    @property
+    def heard(self) -> bool:
+        """Returns whether the other end was ever heard."""
+        return self._heard_at >= 0
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the other end was heard."""
+        return time.monotonic() - self._heard_at
+
+    @property
+    def idle(self) -> bool:
+        """Returns whether the other end has taken everything."""
+        with self._changed:
+            return not (self._waiting or self._sent)
+
+    def close(self, within: float = 0.0) -> None:
+        """Ends it, after waiting (bounded) until the other end has taken everything."""
+        deadline = time.monotonic() + within
+        with self._changed:
+            self._changed.wait_for(lambda: not (self._waiting or self._sent), max(0.0, deadline - time.monotonic()))
+            self._beat()  # what was taken last
+            self._closed = True
+            self._changed.notify_all()
+        for each in self._subscribers:
+            each.undeclare()
+
+    # Out
+
+    def _drop_oldest(self) -> None:
+        kept: deque[tuple[bytes, bool]] = deque()
+        for frame, droppable in self._waiting:
+            if droppable and self._waiting_bytes > MOST_WAITING:
+                self._waiting_bytes -= len(frame)
+                self.dropped += 1
+            else:
+                kept.append((frame, droppable))
+        self._waiting = kept
+
+    def _send_frames(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._due(), BEAT_EVERY)
+                if self._closed:
+                    return
+                said = self._next_frame()
+            if said is not None:
+                try:
+                    self._frames.put(said)
+                except zenoh.ZError:  # the session is being closed
+                    return
+
+    def _due(self) -> bool:
+        room = len(self._sent) < IN_FLIGHT and self._sent_bytes < IN_FLIGHT_BYTES
+        return self._next < self._base + len(self._sent) or (bool(self._waiting) and room)
+
+    def _next_frame(self) -> bytes | None:
+        """Returns what goes out next: a frame again, a new one, or, while some are unacknowledged, the mark."""
+        if not self._due():
+            return _FRAME.pack(self._round, self._next, 1) if self._sent else None
+        if self._next == self._base + len(self._sent):
+            frame, _ = self._waiting.popleft()
+            self._waiting_bytes -= len(frame)
+            self._sent.append(frame)
+            self._sent_bytes += len(frame)
+        number, self._next = self._next, self._next + 1
+        return _FRAME.pack(self._round, number, 0) + self._sent[number - self._base]
+
+    def _taken(self, number: int, wanted: int) -> None:
+        """The other end has taken all frames before `number`, and wants them from there on as the round `wanted`."""
+        with self._changed:
+            while self._base < number and self._sent:
+                self._sent_bytes -= len(self._sent.popleft())
+                self._base += 1
+            self._next = max(self._next, self._base)
+            if wanted > self._round:
+                self._round, self._next = wanted, self._base
+            self._changed.notify_all()
+
+    # In
+
+    def _on_frame(self, sample: Any) -> None:
+        data = sample.payload.to_bytes()
+        if len(data) < _FRAME.size or self._closed:
+            return
+        self._heard_at = time.monotonic()
+        round_, number, mark = _FRAME.unpack_from(data)
+        if round_ != self._wanted:
+            return
+        if number > self._expected:
+            self._wanted += 1
+            self._beat()
+        elif number == self._expected and not mark:
+            self._expected += 1
+            self._unsaid += 1
+            self._take(data[_FRAME.size :])
+            if self._unsaid >= ACKNOWLEDGE_AFTER or len(data) > IN_FLIGHT_BYTES // 16:
+                self._beat()
+
+    def _on_beat(self, sample: Any) -> None:
+        data, now = sample.payload.to_bytes(), time.time_ns()
+        if len(data) != _BEAT.size or self._closed:
+            return
+        wanted, taken, sent_at, ours, taken_at = _BEAT.unpack(data)
+        self._heard_at = time.monotonic()
+        self._heard = (sent_at, now)
+        if ours:
+            self.clocks.exchanged(ours, taken_at, sent_at, now)
+        self._taken(taken, wanted)
+
+    def _beat(self) -> None:
+        self._unsaid = 0
+        try:
+            self._beats.put(_BEAT.pack(self._wanted, self._expected, time.time_ns(), *self._heard))
+        except zenoh.ZError:  # the session is being closed
+            self._closed = True
+
+    def _send_beats(self) -> None:
+        while not self._closed:
+            self._beat()
+            time.sleep(BEAT_EVERY)

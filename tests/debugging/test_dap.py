@@ -1,0 +1,391 @@
+"""An editor that steps forwards and back sees what a run with prints shows."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import dataflow
+from dataflow.debugging.dap.session import Session, listen
+from dataflow.debugging.debugger import Debugger
+from dataflow.recording import Recording
+
+SOURCE = '''
+from dataclasses import dataclass
+
+import numpy as np
+
+from dataflow.messages import FeatureVector
+from dataflow.operator import In, Operator, Out, Source
+
+
+class Numbers(Source):
+    x: Out[FeatureVector]
+
+    def stream(self):
+        for k in range(12):
+            vectors = np.array([[k, k * k]], np.float32)
+            yield {"x": FeatureVector(stamp=1_700_000_000_000_000_000 + k * 100_000_000, vectors=vectors, model="made")}
+
+
+@dataclass
+class State:
+    total: float = 0.0
+
+
+def clipped(value, most):
+    if value > most:
+        value = most
+    return value
+
+
+class Adder(Operator):
+    """Adds up."""
+
+    x: In[FeatureVector]
+    total: Out[FeatureVector]
+    state: State
+
+    def process(self, x):
+        added = 0.0
+        for value in x.vectors[0].tolist():
+            added += clipped(value, 50.0)
+        self.state.total += added
+        return {"total": FeatureVector(stamp=x.stamp, vectors=np.array([[self.state.total]], np.float32), model="made")}
+'''
+LINES = {text.strip(): number for number, text in enumerate(SOURCE.splitlines(), 1)}
+ADDED = LINES["added += clipped(value, 50.0)"]
+CLIPS = LINES["value = most"]
+TOTAL = LINES["self.state.total += added"]
+
+WATCHED = {"added", "value", "most"}
+
+
+class Client:
+    """An editor: requests, and what comes of them."""
+
+    def __init__(self, connection: socket.socket, file: Path) -> None:
+        connection.settimeout(60)
+        self._stream = connection.makefile("rwb")
+        self._file, self._seq = file, 0
+        self.told: list[str] = []
+
+    def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
+        answer = self.request(command, **arguments)
+        assert answer["success"], answer
+        body: dict[str, Any] = answer["body"]
+        return body
+
+    def request(self, command: str, **arguments: Any) -> dict[str, Any]:
+        self._seq += 1
+        data = json.dumps({"seq": self._seq, "type": "request", "command": command, "arguments": arguments}).encode()
+        self._stream.write(b"Content-Length: %d\r\n\r\n" % len(data) + data)
+        self._stream.flush()
+        while (message := self._read())["type"] != "response":
+            self._note(message)
+        assert message["request_seq"] == self._seq
+        return message
+
+    def stopped(self) -> tuple[str, int]:
+        """The reason and the line of the next stop."""
+        while (message := self._read())["event"] != "stopped":
+            self._note(message)
+        return message["body"]["reason"], self.line()
+
+    def go(self, command: str) -> tuple[str, int]:
+        self.ask(command)
+        return self.stopped()
+
+    def line(self) -> int:
+        return int(self.frames()[0]["line"])
+
+    def frames(self) -> list[dict[str, Any]]:
+        frames: list[dict[str, Any]] = self.ask("stackTrace", threadId=1)["stackFrames"]
+        return frames
+
+    def call(self) -> int:
+        return int(self.ask("threads")["threads"][0]["name"].split(" call ")[1].split()[0])
+
+    def variables(self) -> dict[str, str]:
+        frame = self.frames()[0]["id"]
+        scope = self.ask("scopes", frameId=frame)["scopes"][0]["variablesReference"]
+        return {each["name"]: each["value"] for each in self.parts(scope)}
+
+    def parts(self, reference: int) -> list[dict[str, Any]]:
+        parts: list[dict[str, Any]] = self.ask("variables", variablesReference=reference)["variables"]
+        return parts
+
+    def value(self, expression: str, **more: Any) -> str:
+        return str(self.ask("evaluate", expression=expression, frameId=1, **more)["result"])
+
+    def seen(self) -> tuple[int, int, dict[str, str]]:
+        """The call, the line and the watched variables, as `printed` has them."""
+        return self.call(), self.line(), {n: v for n, v in self.variables().items() if n in WATCHED}
+
+    def breakpoints(self, *lines: int, condition: str = "") -> list[dict[str, Any]]:
+        wanted = [{"line": line, "condition": condition} for line in lines]
+        set_now: list[dict[str, Any]] = self.ask(
+            "setBreakpoints", source={"path": str(self._file)}, breakpoints=wanted
+        )["breakpoints"]
+        return set_now
+
+    def _read(self) -> dict[str, Any]:
+        length = int(self._stream.readline().split(b":")[1])
+        self._stream.readline()
+        message: dict[str, Any] = json.loads(self._stream.read(length))
+        return message
+
+    def _note(self, message: dict[str, Any]) -> None:
+        if message["event"] == "output":
+            self.told.append(message["body"]["output"].strip())
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Recording, Path]]:
+    folder = tmp_path_factory.mktemp("dap")
+    (folder / "stepped_adder.py").write_text(SOURCE)
+    sys.path.insert(0, str(folder))
+    module = importlib.import_module("stepped_adder")
+    graph = dataflow.Graph().add("numbers", module.Numbers).add("adder", module.Adder)
+    graph.connect("adder", x="numbers/x").run(record=folder / "run.mcap")
+    with Recording(folder / "run.mcap") as recording:
+        yield recording, folder / "stepped_adder.py"
+    sys.path.remove(str(folder))
+    del sys.modules["stepped_adder"]
+
+
+@contextmanager
+def editing(recorded: tuple[Recording, Path], first: int = 0, **arguments: Any) -> Iterator[Client]:
+    """An editor that has said how it begins, and no breakpoints yet."""
+    failures: list[BaseException] = []
+    listening = listen(0)
+
+    def serve() -> None:
+        try:
+            connection, _ = listening.accept()
+            debugger = Debugger(recorded[0], "adder")
+            with connection:
+                Session(connection, debugger, first).serve()
+            debugger.close()
+        except BaseException as error:
+            failures.append(error)
+
+    server = threading.Thread(target=serve, daemon=True)
+    server.start()
+    with listening, socket.create_connection(listening.getsockname()) as connection:
+        client = Client(connection, recorded[1])
+        assert client.ask("initialize", adapterID="test")["supportsStepBack"]
+        client.ask("launch", **arguments)
+        yield client
+        client.ask("disconnect")
+    server.join(60)
+    assert not server.is_alive()
+    assert failures == []
+
+
+def printed() -> list[tuple[int, int, dict[str, str]]]:
+    """What prints at the beginning of each line of the source show, over all calls: call, line, variables.
+
+    It is written by hand beside the source, and does what the source does.
+    """
+    told: list[tuple[int, int, dict[str, str]]] = []
+    for call in range(12):
+        known: dict[str, str] = {}
+
+        def at(text: str, call: int = call, known: dict[str, str] = known) -> None:
+            told.append((call, LINES[text], dict(known)))
+
+        at("added = 0.0")
+        added = 0.0
+        known["added"] = repr(added)
+        at("for value in x.vectors[0].tolist():")
+        for value in (float(call), float(call * call)):
+            known["value"] = repr(value)
+            at("added += clipped(value, 50.0)")
+            outside = dict(known)
+            known.clear()
+            known |= {"value": repr(value), "most": "50.0"}
+            at("if value > most:")
+            if value > 50.0:
+                at("value = most")
+                known["value"] = "50.0"
+            at("return value")
+            added += min(value, 50.0)
+            known.clear()
+            known |= outside | {"added": repr(added)}
+            at("for value in x.vectors[0].tolist():")
+        at("self.state.total += added")
+        at(next(text for text in LINES if text.startswith('return {"total"')))
+    return told
+
+
+def test_breakpoints_and_variables_are_those_of_a_run_with_prints(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, stopOnEntry=False) as client:
+        assert [each["line"] for each in client.breakpoints(CLIPS, TOTAL)] == [CLIPS, TOTAL]
+        client.ask("configurationDone")
+        seen = []
+        while (reason := client.stopped()[0]) == "breakpoint":
+            seen.append(client.seen())
+            client.ask("continue")
+        assert reason == "end of the recording"
+        assert seen == [each for each in printed() if each[1] in (CLIPS, TOTAL)]
+        assert [line for line in client.told if "not as recorded" in line] == []
+        assert client.told[0] == "call 0: as recorded, digest by digest"
+        assert "this was the last call; at its last line again" in client.told
+
+
+def test_steps_into_are_the_lines_of_a_run_with_prints_and_five_steps_back_undo_them(
+    recorded: tuple[Recording, Path],
+) -> None:
+    expected = printed()
+    first = next(n for n, each in enumerate(expected) if each[0] == 7)
+    with editing(recorded, first=7) as client:
+        client.ask("configurationDone")
+        assert client.stopped()[0] == "entry"
+        seen = [client.seen()]
+        for _ in range(16):
+            client.go("stepIn")
+            seen.append(client.seen())
+        assert seen == expected[first : first + 17]
+        assert seen[-1][0] == 8  # into the next call
+        for back in range(1, 6):
+            assert client.go("stepBack")[0] == "step"
+            assert client.seen() == expected[first + 16 - back]
+        client.go("stepIn")
+        assert client.seen() == expected[first + 12]
+
+
+def test_reverse_continue_goes_to_the_last_hit_of_this_call_then_of_earlier_ones(
+    recorded: tuple[Recording, Path],
+) -> None:
+    hits = [each for each in printed() if each[1] in (CLIPS, ADDED)]
+    with editing(recorded, first=9, stopOnEntry=False) as client:
+        client.breakpoints(CLIPS, ADDED)
+        client.ask("configurationDone")
+        while client.stopped() and client.seen() != (9, CLIPS, {"value": "81.0", "most": "50.0"}):
+            client.ask("continue")
+        before = hits[: hits.index(client.seen())]
+        for expected in reversed(before[-8:]):
+            assert client.go("reverseContinue")[0] == "breakpoint"
+            assert client.seen() == expected
+        client.breakpoints()
+        assert client.go("reverseContinue")[0] == "entry"
+        assert client.seen() == printed()[0]
+
+
+def test_a_condition_stops_where_it_is_true_forwards_and_back(recorded: tuple[Recording, Path]) -> None:
+    expected = [each for each in printed() if each[1] == ADDED and float(each[2]["value"]) > 60]
+    with editing(recorded, stopOnEntry=False) as client:
+        client.breakpoints(ADDED, condition="value > 60")
+        client.ask("configurationDone")
+        client.stopped()
+        forwards = [client.seen()]
+        for _ in range(2):
+            client.go("continue")
+            forwards.append(client.seen())
+        assert forwards == expected[:3]
+        client.go("reverseContinue")
+        assert client.seen() == expected[1]
+
+
+def test_steps_over_and_out_stay_in_the_frame_and_leave_it(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, first=3) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        over = [client.go("next")[1] for _ in range(8)]
+        loop = LINES["for value in x.vectors[0].tolist():"]
+        assert over == [loop, ADDED, loop, ADDED, loop, TOTAL, TOTAL + 1, LINES["added = 0.0"]]
+        assert client.call() == 4
+        client.breakpoints(LINES["if value > most:"])
+        client.go("continue")
+        assert [frame["name"] for frame in client.frames()] == ["clipped", "process"]
+        client.breakpoints()
+        assert client.go("stepOut")[1] == loop
+        assert client.seen()[2] == {"added": "4.0", "value": "4.0"}
+
+
+def test_values_are_opened_and_expressions_evaluated(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, first=5) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        assert client.value("float(x.vectors[0, 1])") == "25.0"
+        assert client.value("self.state.total") == str(float(sum(k + k * k for k in range(5))))
+        told = client.ask("evaluate", expression="self.state", frameId=1)
+        assert [each["name"] for each in client.parts(told["variablesReference"])] == ["total"]
+        vectors = client.ask("evaluate", expression="x", frameId=1)["variablesReference"]
+        assert "vectors" in {each["name"] for each in client.parts(vectors)}
+        failed = client.request("evaluate", expression="nothing_such", frameId=1)
+        assert not failed["success"]
+        assert "nothing_such" in failed["message"]
+        assert not client.request("variables", variablesReference=9999)["success"]
+        assert not client.request("dataBreakpointInfo")["success"]
+        client.ask("evaluate", expression="goto 11", context="repl", frameId=1)
+        assert client.stopped()[0] == "entry"
+        assert client.seen() == next(each for each in printed() if each[0] == 11)
+
+
+def test_a_breakpoint_that_cannot_be_says_why(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded) as client:
+        doc = LINES['"""Adds up."""']
+        assert client.breakpoints(doc + 1)[0]["verified"]
+        (beyond,) = client.breakpoints(4000)
+        assert not beyond["verified"]
+        told = client.ask("setBreakpoints", source={"path": np_file()}, breakpoints=[{"line": 1}])
+        assert "not for libraries" in told["breakpoints"][0]["message"]
+        (wrong,) = client.breakpoints(ADDED, condition="value >")
+        assert not wrong["verified"]
+        client.ask("configurationDone")
+        client.stopped()
+
+
+def np_file() -> str:
+    import numpy
+
+    return str(numpy.__file__)
+
+
+def test_a_change_of_state_by_hand_is_told_when_the_call_is_made(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, first=2) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        client.value("setattr(self.state, 'total', 7.0)", context="repl")
+        client.breakpoints(TOTAL)
+        client.go("continue")
+        client.go("continue")
+        assert client.told[-1] == "call 2: not as recorded, differs in total"
+
+
+def test_restart_takes_over_edited_source(recorded: tuple[Recording, Path]) -> None:
+    file = recorded[1]
+    with editing(recorded, first=6) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        try:
+            file.write_text(SOURCE.replace("added = 0.0", "added = 0.5"))
+            assert client.go("restart")[0] == "entry"
+            client.go("next")
+            assert client.value("added") == "0.5"
+            assert "taken over: stepped_adder" in client.told
+        finally:
+            file.write_text(SOURCE)
+        client.go("restart")
+        client.go("next")
+        assert client.value("added") == "0.0"
+
+
+def test_what_is_no_message_of_the_protocol_ends_the_session(recorded: tuple[Recording, Path]) -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        theirs.sendall(b"GET / HTTP/1.1\r\nHost: here\r\n\r\n")
+        session = Session(ours, Debugger(recorded[0], "adder"), 0)
+        session.serve()
+        assert session._over

@@ -1,0 +1,184 @@
+"""A link that delays, stalls and resets loses nothing and restarts nothing; keys decide who may connect."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from joined_agents import HERE, end, join
+from relay import Relay
+
+from dataflow.graph import load_text
+from dataflow.machines.keys import TOOLS, KeysError, issue, new_authority, settings
+from dataflow.supervision.core.report import RunFailed, Status
+from dataflow.supervision.plan import Meeting
+from dataflow.supervision.run import run
+from dataflow.supervision.supervisor import Supervisor
+from dataflow.transport import NetworkError
+from dataflow.verification.verify import verify
+
+GRAPH = """\
+graph: two
+namespace: test
+operators:
+  sensor: {use: "machine_operators:Sensor", params: {steps: 400, size: 2000}, machine: robot}
+  here: {use: "machine_operators:Scale", inputs: {x: sensor/count},
+    live: {queue: block, restart: {max: 1, backoff: 10ms}}}
+  there: {use: "machine_operators:Scale", inputs: {x: sensor/count}, machine: robot, process: own,
+    live: {restart: {max: 1, backoff: 10ms}}}
+"""
+
+
+@pytest.fixture(scope="session")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys of two machines and of another authority's robot."""
+    folder = tmp_path_factory.mktemp("keys")
+    for authority in ("authority", "other"):
+        new_authority(folder / authority)
+    issue(folder / "authority", folder / "laptop", "laptop", serves=["127.0.0.1", "localhost"])
+    issue(folder / "authority", folder / "robot", "robot")
+    issue(folder / "authority", folder / "tools", TOOLS)
+    issue(folder / "other", folder / "stranger", "robot")
+    return folder
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def listening(port: int) -> list[str]:
+    """Returns the addresses at which anything listens on a port, by `ss`."""
+    shown = subprocess.run(["ss", "-Hltn", f"sport = :{port}"], capture_output=True, text=True, check=True, timeout=20)
+    return [line.split()[3] for line in shown.stdout.splitlines()]
+
+
+@pytest.fixture
+def link() -> Iterator[tuple[int, Relay]]:
+    """The port at which runs listen, and a relay to it with a delay of 20 ms."""
+    port = free_port()
+    relay = Relay(("127.0.0.1", port))
+    relay.delay = 0.02
+    yield port, relay
+    relay.close()
+
+
+def test_a_link_that_stalls_and_resets_loses_nothing_and_nothing_is_started_again(
+    keys: Path, link: tuple[int, Relay], tmp_path: Path
+) -> None:
+    port, relay = link
+    robot = join("robot", f"tls/127.0.0.1:{relay.port}", tmp_path / "files", "--keys", str(keys / "robot"))
+    stalled = threading.Event()
+
+    def spoil(status: Status) -> None:
+        counts = status.operators["sensor"]
+        if status.phase == "running" and counts.firings > 50 and not stalled.is_set():
+            stalled.set()
+            threading.Thread(target=trouble, daemon=True).start()
+
+    def trouble() -> None:
+        assert listening(port) == [f"127.0.0.1:{port}"]
+        relay.stalled = True
+        time.sleep(2.0)  # more than the link may be silent
+        relay.stalled = False
+        time.sleep(0.5)
+        relay.reset()
+
+    report = run(
+        load_text(GRAPH),
+        machines=Meeting(f"tls/127.0.0.1:{port}", keys / "laptop"),
+        live=True,
+        record=tmp_path / "link.mcap",
+        watch=spoil,
+    )
+
+    said = end(robot)
+    assert stalled.is_set()
+    assert {name: summary["taken"] for name, summary in report.summaries.items()} == {"here": 400, "there": 400}, said
+    assert not report.restarts
+    assert any("the link to machine 'robot' is down" in note for note in report.notes)
+    assert any("the link to machine 'robot' is back" in note for note in report.notes)
+    assert verify(tmp_path / "link.mcap", jobs=1).identical
+
+
+@pytest.mark.parametrize("who", ["stranger", pytest.param("tools", marks=pytest.mark.long)])
+def test_a_certificate_of_another_authority_or_of_a_tool_joins_nothing(keys: Path, tmp_path: Path, who: str) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    stranger = join("robot", endpoint, tmp_path / "files", "--keys", str(keys / who))
+    with pytest.raises(RunFailed, match=r"machine 'robot' did not join"):
+        run(load_text(GRAPH), machines=Meeting(endpoint, keys / "laptop"), start_timeout=4.0)
+    end(stranger)
+
+
+def test_an_endpoint_without_keys_is_refused_beyond_a_socket_of_this_user(keys: Path) -> None:
+    with pytest.raises(NetworkError, match=r"'tcp/127\.0\.0\.1:7447' needs keys: make them with `dataflow keys new"):
+        settings(None, "tcp/127.0.0.1:7447")
+    with pytest.raises(NetworkError, match=r"expected tls/<address>:<port>"):
+        settings(keys / "laptop", "tcp/0.0.0.0:7447")
+    with pytest.raises(NetworkError, match=r"no certificate\.pem, key\.pem"):
+        settings(keys / "authority", "tls/127.0.0.1:7447")
+    assert settings(None, "unixsock-stream//run/meet") == {}
+
+
+def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:
+    assert {path.stat().st_mode & 0o077 for path in keys.rglob("*key*") if path.is_file()} == {0}
+    with pytest.raises(KeysError, match="has keys already"):
+        issue(keys / "authority", keys / "robot", "robot")
+    with pytest.raises(KeysError, match="has an authority already"):
+        new_authority(keys / "authority")
+
+
+@pytest.mark.long
+def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(keys: Path, tmp_path: Path) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    robot = join("robot", endpoint, tmp_path / "files", "--keys", str(keys / "robot"))
+    found: dict[str, Any] = {}
+
+    def tool(*words: str, held: str = "tools") -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "dataflow.cli.main", *words, "--connect", endpoint, "--keys", str(keys / held)]
+        env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": str(HERE)}
+        return subprocess.run(command, capture_output=True, text=True, timeout=60, env=env, check=False)
+
+    def follow(supervisor: Supervisor) -> None:
+        try:
+            while supervisor.status.phase == "starting":
+                time.sleep(0.05)
+            found["echo"] = tool("echo", "there/y", "-n", "3", "--json")
+            found["top"] = tool("top", "--json")
+            found["set"] = tool("param", "set", "there.gain", "7")
+            found["record"] = tool("record", "there/y", "-o", str(tmp_path / "part.mcap"), "--seconds", "0.5")
+            found["stranger"] = tool("echo", "there/y", "-n", "1", held="stranger")
+        finally:
+            supervisor.stop()
+
+    @contextlib.contextmanager
+    def controls(supervisor: Supervisor) -> Iterator[None]:
+        following = threading.Thread(target=follow, args=(supervisor,))
+        following.start()
+        yield
+        following.join()
+
+    meeting = Meeting(endpoint, keys / "laptop")
+    run(load_text(GRAPH.replace("steps: 400", "steps: 1000000")), machines=meeting, live=True, controls=controls)
+
+    end(robot)
+    assert len(found["echo"].stdout.splitlines()) == 3, found["echo"]
+    top = json.loads(found["top"].stdout)
+    assert {row["operator"]: row["state"] for row in top["operators"]}["there"] == "running"
+    robot_state = top["machines"]["robot"]
+    assert robot_state["up"]
+    assert abs(robot_state["offset"]) <= robot_state["delay"]  # it is this machine's clock
+    assert found["set"].returncode == 0, found["set"]
+    assert found["record"].returncode == 0, found["record"]
+    assert found["stranger"].returncode != 0
+    assert "these keys are not let in" in found["stranger"].stderr

@@ -1,0 +1,120 @@
+"""The pipe gives every frame once and in order, whatever its link loses; beyond its bound it drops what may be."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dataflow.machines import pipe as pipes
+from dataflow.machines.pipe import Clocks, Pipe
+
+
+class Link:
+    """What stands for Zenoh between two pipes; `loses` decides which payloads on `.../frames` do not arrive."""
+
+    def __init__(self) -> None:
+        self._takers: dict[str, Callable[[Any], None]] = {}
+        self.loses: Callable[[bytes], bool] = lambda payload: False
+        self.session = self
+
+    def declare_publisher(self, key: str, **_: Any) -> Any:
+        return SimpleNamespace(put=lambda payload: self._put(key, payload))
+
+    def declare_subscriber(self, key: str, handler: Any) -> Any:
+        self._takers[key] = handler.callback
+        return SimpleNamespace(undeclare=lambda: self._takers.pop(key))
+
+    def _put(self, key: str, payload: bytes) -> None:
+        taker = self._takers.get(key)
+        if taker is not None and not (key.endswith("/frames") and self.loses(payload)):
+            taker(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload)))
+
+
+@pytest.fixture
+def link(monkeypatch: pytest.MonkeyPatch) -> Link:
+    monkeypatch.setattr(pipes, "BEAT_EVERY", 0.01)
+    monkeypatch.setattr(pipes.zenoh.handlers, "Callback", lambda callback, indirect: SimpleNamespace(callback=callback))
+    return Link()
+
+
+def ends(link: Any, taken: list[bytes], *, bounded: bool = False) -> tuple[Pipe, Pipe]:
+    return (
+        Pipe(link, "there", "here", lambda frame: None, bounded=bounded),
+        Pipe(link, "here", "there", taken.append, bounded=False),
+    )
+
+
+def emptied(pipe: Pipe) -> bool:
+    deadline = time.monotonic() + 20
+    while not pipe.idle and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return pipe.idle
+
+
+def test_frames_of_a_link_that_loses_arrive_once_and_in_order(link: Link) -> None:
+    taken: list[bytes] = []
+    passed = iter(range(1_000_000))
+    link.loses = lambda payload: next(passed) % 7 in (2, 3)  # single ones, pairs, and those that are sent again
+    a, b = ends(link, taken)
+
+    for k in range(300):
+        a.send(b"%d" % k)
+
+    assert emptied(a)
+    assert taken == [b"%d" % k for k in range(300)]
+    assert a.dropped == 0
+    a.close()
+    b.close()
+
+
+def test_the_last_frame_is_missed_by_the_mark_that_follows_it(link: Link) -> None:
+    taken: list[bytes] = []
+    lost = []
+    link.loses = lambda payload: payload.endswith(b"last") and not lost and not lost.append(payload)  # type: ignore[func-returns-value]
+    a, b = ends(link, taken)
+
+    a.send(b"last")
+
+    assert emptied(a)
+    assert taken == [b"last"]
+    assert lost
+    a.close()
+    b.close()
+
+
+def test_what_waits_for_a_dead_link_is_bounded_and_what_must_not_be_missed_is_kept(
+    link: Link, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipes, "MOST_WAITING", 1000)
+    monkeypatch.setattr(pipes, "IN_FLIGHT", 1)
+    taken: list[bytes] = []
+    link.loses = lambda payload: True
+    a, b = ends(link, taken, bounded=True)
+    a.send(b"first")
+    time.sleep(0.05)  # it is on its way
+
+    for k in range(100):
+        a.send(b"%02d" % k * 50, droppable=k % 10 != 0)
+    link.loses = lambda payload: False
+
+    assert emptied(a)
+    kept = [int(frame[:2]) for frame in taken[1:]]
+    assert {*range(0, 100, 10)} <= set(kept)  # beyond the bound alone, since they may not be dropped
+    assert kept == sorted(kept)
+    assert a.dropped == 100 - len(kept) > 80
+    a.close()
+    b.close()
+
+
+def test_the_offset_of_clocks_is_that_of_the_shortest_exchange() -> None:
+    clocks = Clocks()
+    assert clocks.best is None
+    clocks.exchanged(asked=100, taken=1600, answered=1700, heard=1200)  # 500 there, 500 back: 1000 ahead
+    assert clocks.best == (1000, 1000)
+    clocks.exchanged(asked=2000, taken=3010, answered=3020, heard=2030)  # 10 there, 10 back
+    clocks.exchanged(asked=3000, taken=4900, answered=4900, heard=3920)  # 900 there, 20 back
+    assert clocks.best == (20, 1000)

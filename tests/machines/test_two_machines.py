@@ -1,0 +1,172 @@
+"""A graph over two machines does what it does on one, and its recording verifies on one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from joined_agents import HERE, Robot, end, join
+
+from dataflow.graph import load_text
+from dataflow.supervision.core.report import RunFailed, RunReport
+from dataflow.supervision.plan import Meeting
+from dataflow.supervision.run import run
+from dataflow.verification.verify import verify
+
+RUNTIME = HERE.parent / "runtime"
+sys.path.append(str(RUNTIME))
+GRAPH = """\
+graph: two
+namespace: test
+operators:
+  sensor: {use: "machine_operators:Sensor", params: {steps: 120, size: SIZE}, machine: robot, MORE}
+  here: {use: "machine_operators:Scale", inputs: {x: sensor/count}, live: {queue: block}}
+  there: {use: "machine_operators:Scale", inputs: {x: here/y}, machine: robot, process: own, live: {queue: block}}
+  beside: {use: "machine_operators:Scale", inputs: {x: sensor/count}, machine: robot, process: own,
+    live: {queue: block}}
+  witness: {use: "machine_operators:Witness", inputs: {x: here/y}, machine: robot, process: own}
+  last: {use: "machine_operators:Scale", inputs: {x: there/y}, live: {queue: block}}
+"""
+
+
+def two(robot: Robot, text: str = GRAPH, **options: Any) -> RunReport:
+    graph = load_text(text.replace("SIZE", "1").replace(", MORE", ""))
+    return run(graph, machines=Meeting(robot.endpoint), **options)
+
+
+def taken(report: RunReport) -> Mapping[str, Any]:
+    return {name: summary["taken"] for name, summary in report.summaries.items() if "taken" in summary}
+
+
+@pytest.mark.parametrize("live", [pytest.param(False, marks=pytest.mark.long), True])
+def test_a_run_over_two_machines_loses_nothing_and_its_recording_verifies_on_one(
+    robot: Robot, live: bool, tmp_path: Path
+) -> None:
+    text = GRAPH.replace("SIZE", "20000")  # through shared memory on both sides of the link
+
+    report = two(robot, text, live=live, record=tmp_path / "two.mcap")
+
+    assert taken(report) == dict.fromkeys(("here", "there", "beside", "last"), 120)
+    assert report.summaries["witness"]["folder"] == str(robot.folder)
+    verified = verify(tmp_path / "two.mcap", jobs=1)
+    assert verified.identical, verified.as_json()
+    assert {v.operator for v in verified.operators} == {"here", "there", "beside", "last"}
+
+
+def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
+    robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("models").mkdir()
+    Path("models/factor.txt").write_text("3.5")
+    text = GRAPH.replace("  there: {", "  there: {params: {weights: models/factor.txt}, ")
+
+    report = two(robot, text)
+
+    assert report.summaries["there"]["factor"] == 3.5
+    assert (robot.folder / "models/factor.txt").read_text() == "3.5"
+    theirs = robot.code / "machine_operators.py"
+    before = theirs.read_text()
+    theirs.write_text(before + "# changed there\n")
+    with pytest.raises(RunFailed, match=r"machine 'robot' cannot take part: machine_operators\.py differs"):
+        two(robot)
+    theirs.write_text(before)
+
+
+@pytest.mark.long
+def test_a_process_of_another_machine_that_dies_is_started_again_there_or_ends_the_run(
+    robot: Robot, tmp_path: Path
+) -> None:
+    dying = GRAPH.replace("size: SIZE}", f"dies: '{tmp_path / 'died'}'}}")
+
+    with pytest.raises(RunFailed, match=r"process 'sensor' was killed by SIGKILL"):
+        two(robot, dying, live=True)
+    (tmp_path / "died").unlink()
+    policy = "live: {restart: {max: 2, backoff: 10ms}}"
+    calibrated = (
+        f"  calibrated: {{use: 'machine_operators:Calibrated', inputs: {{x: sensor/count, constant: sensor/constant}}, "
+        f"params: {{dies: '{tmp_path / 'taker died'}'}}, {policy}}}\n"
+    )
+    report = two(robot, dying.replace("MORE", policy) + calibrated, live=True, record=tmp_path / "died.mcap")
+
+    assert report.restarts == {"sensor": 1, "calibrated": 1}
+    assert report.summaries["calibrated"]["taken"] > 20
+    assert report.summaries["there"]["taken"] > 60
+    assert verify(tmp_path / "died.mcap", jobs=1).identical
+
+
+def test_a_machine_that_does_not_join_is_named_with_the_command_that_joins_it(tmp_path: Path) -> None:
+    meeting = Meeting(f"unixsock-stream/{tmp_path / 'meet'}")
+    with pytest.raises(RunFailed, match=r"machine 'robot' did not join\. On each: dataflow join NAME --connect unix"):
+        run(load_text(GRAPH.replace("SIZE", "1").replace(", MORE", "")), machines=meeting, start_timeout=0.2)
+
+
+def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:
+    graph = load_text(GRAPH.replace("SIZE", "1").replace(", MORE", ""))
+    with pytest.raises(RunFailed, match=r"machine robot: say where machines join .* or run all of it here"):
+        run(graph)
+    assert run(graph, machines=None).summaries["there"]["taken"] == 120
+
+
+@pytest.mark.long
+def test_a_supervisor_that_is_killed_leaves_no_operators_and_the_machine_takes_the_next_run(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
+    agent = join("robot", endpoint, tmp_path / "files", "--timeout", "2")
+    graph = tmp_path / "two.yaml"
+    graph.write_text(GRAPH.replace("SIZE", "1").replace(", MORE", "").replace("steps: 120", "steps: 1000000"))
+    command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--live", "--listen", endpoint, "--quiet"]
+    supervisor = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(HERE)})
+    there = psutil.Process(agent.pid)
+    await_(lambda: any(child.name() == "sensor" for child in there.children(recursive=True)))
+
+    supervisor.kill()
+
+    supervisor.wait(timeout=20)
+    await_(lambda: not there.children(recursive=True))
+    short = load_text(GRAPH.replace("SIZE", "1").replace(", MORE", ""))
+    assert run(short, machines=Meeting(endpoint)).summaries["there"]["taken"] == 120
+    assert "was not heard for 2 s" in end(agent)
+
+
+def await_(condition: Callable[[], bool], within: float = 60.0) -> None:
+    """Waits (bounded) until a condition holds."""
+    deadline = time.monotonic() + within
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.long
+def test_streams_of_a_run_are_equal_on_one_two_and_three_machines(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
+    agents = [join(name, endpoint, tmp_path / name, code=RUNTIME) for name in ("robot", "arm")]
+    steps = "params: {count: 200, ratio: 4}"
+    digests = []
+    for left, smooth in ((None, None), ("robot", None), ("robot", "arm")):
+        places = {"LEFT": left, "SMOOTH": smooth}
+        text = (
+            "graph: three\nnamespace: test\noperators:\n"
+            f"  left: {{use: 'runtime_operators:Counter', {steps}LEFT}}\n"
+            "  smooth: {use: 'runtime_operators:Smooth', inputs: {x: left/fast}SMOOTH}\n"
+            "  sum: {use: 'runtime_operators:Sum', inputs: {x: smooth/mean}}\n"
+        )
+        for word, machine in places.items():
+            text = text.replace(word, f", machine: {machine}" if machine else "")
+        digests.append(run(load_text(text), machines=Meeting(endpoint), window=(16, 1 << 20)).streams)
+
+    for agent in agents:
+        end(agent)
+    assert digests[0] == digests[1] == digests[2]
+    assert digests[0]["test/smooth/mean"][0] > 100
+
+
+def test_a_placement_that_puts_two_machines_into_one_process_is_refused(robot: Robot) -> None:
+    with pytest.raises(ValueError, match=r"process 'all' would be on several machines \(robot, this one\)"):
+        two(robot, placement="one_process")
