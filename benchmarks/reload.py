@@ -88,7 +88,7 @@ def main() -> int:
 
 
 class _Nowhere:
-    """An emitter whose messages reach nobody."""
+    """An emitter whose messages go nowhere."""
 
     def message(self, stream: str, entry: Entry) -> None: ...
 
