@@ -52,16 +52,11 @@ class Torchvision(ClassifierTask):
 
     def __init__(self, data: ClassificationData, size: tuple[int, int]) -> None:
         super().__init__(data, size)
-        self.resnet = torchvision.models.resnet18(weights=None, num_classes=len(data.classes))
-
-    @property
-    def network(self) -> nn.Module:
-        resnet: nn.Module = self.resnet
-        return resnet
+        self.network = torchvision.models.resnet18(weights=None, num_classes=len(data.classes))
 
     def loss(self, batch: tuple[Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
         images, labels = batch
-        scores = self.resnet(images.to(device)).float()
+        scores = self.network(images.to(device)).float()
         return {"entropy": nn.functional.cross_entropy(scores, labels, self.class_weights, label_smoothing=0.05)}
 
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
@@ -95,15 +90,11 @@ class FcnTask(SegmenterTask):
 
     def __init__(self, data: SegmentationData, size: tuple[int, int], weights: Path | None) -> None:
         super().__init__(data, size)
-        self.fcn = Fcn(len(data.classes), weights)
-
-    @property
-    def network(self) -> nn.Module:
-        return self.fcn
+        self.network = Fcn(len(data.classes), weights)
 
     def loss(self, batch: tuple[Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
         images, masks = batch
-        return self.loss_of(self.fcn(images.to(device)), masks)
+        return self.loss_of(self.network(images.to(device)), masks)
 
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
         """Nothing is kept."""

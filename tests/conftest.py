@@ -31,8 +31,9 @@ ROOMS = {
     "docs": ("docs", "scaffold"),
     "network": ("client", "foxglove", "machines", "transport"),
     "process": (
-        "analysis", "api", "cli", "doctor", "editing", "graphs", "operators/perception", "operators/training",
-        "capture", "process", "recordings_of", "runtime", "shipped", "simulation", "supervision", "verification",
+        "analysis", "api", "blame", "capture", "causes", "cli", "debugging", "doctor", "drops", "editing", "graphs",
+        "operators/perception", "operators/training", "process", "program", "recordings_of", "runtime", "shipped",
+        "simulation", "supervision", "verification",
     ),
 }  # fmt: skip
 """Folders of tests by marker; a test anywhere else is a `unit` test."""

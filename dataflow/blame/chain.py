@@ -33,6 +33,8 @@ SECONDS = 60.0
 ANOTHER = 8
 """Other messages of a stream, from its whole length, that are put in place of one of which nothing else shows an
 effect: a number on the same side of a threshold, nudged, shows none."""
+MOST_BYTES = 2**30
+"""Of the inputs of one operator's calls: beyond it earlier calls are not looked for."""
 HISTORY = 0.5
 """Of the time that is left, what the earlier calls of one operator may take."""
 
@@ -80,8 +82,8 @@ class Chain:
     - `value`, of the message `place` that `target` made. `links`: why each is on the chain.
     - `sensed`: the links at the chain's ends.
     - `left`: calls on the chain that were not looked into, as the time was up. `unsplit`: operator, first and last of
-      calls of which some left their mark in the state, which the time did not suffice to find.
-    - `notes`: what else could not be tried.
+      calls of which some left their mark in the state, which the time, or the memory for
+      their inputs (`MOST_BYTES`), did not suffice to find.
     """
 
     target: Call
@@ -91,7 +93,6 @@ class Chain:
     links: list[Link] = field(default_factory=list)
     left: list[Call] = field(default_factory=list)
     unsplit: list[tuple[str, int, int]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
     made: int = 0
     seconds: float = 0.0
 
@@ -399,6 +400,8 @@ class Blame:
         self._deadline = min(deadline, time.monotonic() + HISTORY * (deadline - time.monotonic()))
         try:
             while end > first:
+                if line.nbytes > MOST_BYTES:
+                    raise _OutOfTime
                 begin = max(first, end - size)
                 self._reach(Call(operator, begin), self._last[operator])
                 for number, effects in self._marks(call, begin, end):

@@ -22,6 +22,7 @@ from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import seeding_of
 from dataflow.sync import NEVER, Firing
+from dataflow.sync.entries import entries_of
 
 MOST_BYTES = 2**28
 """Of the states that are kept of one operator."""
@@ -58,6 +59,8 @@ class Line:
         self._begins = [bisect.bisect_left(places, setups[k - 1]) if k else 0 for k in before]
         self.shots: dict[int, Shot] = {}
         self.first = len(self.records)
+        self.nbytes = 0
+        """Of these inputs; a message that several calls take counts each time."""
         self._read: set[int] = set()
         self._states: dict[int, bytes] = {}
         """States before calls."""
@@ -112,6 +115,8 @@ class Line:
             if each.number <= until and each.firing is not None:
                 self.shots[each.number] = shot_of(self._debugger, each, tuple(changes.get(each.number, ())))
                 added.append(each.number)
+                inputs = each.firing.inputs.values()
+                self.nbytes += sum(entry.value.nbytes() for given in inputs for entry in entries_of(given))
             return each.number >= until
 
         if not take(fired):

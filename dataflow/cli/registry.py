@@ -78,7 +78,7 @@ def _elsewhere(called: Callable[..., None]) -> Callable[..., None]:
     more = [inspect.Parameter(name, _KEYWORD, default=None, annotation=kind) for name, kind in added.items()]
     at.__signature__ = signature.replace(parameters=[*known, *more])  # type: ignore[attr-defined]
     at.__annotations__ = {each.name: each.annotation for each in (*known, *more)}
-    del at.__wrapped__  # type: ignore[attr-defined]
+    del at.__wrapped__
     return at
 
 

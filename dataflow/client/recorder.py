@@ -30,6 +30,7 @@ from dataflow.transport.codec import TypeOf, decode
 from dataflow.transport.envelope import DecodeError
 from dataflow.transport.publisher import undeclare
 from dataflow.transport.registry import RunningGraph
+from dataflow.video.group import Groups
 
 WAITING_BYTES = 512 * 2**20
 """Of messages that wait to be written: beyond it the oldest are let go, and counted as missed."""
@@ -61,7 +62,8 @@ class Tally:
 class AttachedRecorder:
     """Writes envelopes of a graph's streams into one file, or into one after the other. A context manager.
 
-    `metadata` goes into each file. Static messages are written at the beginning of each. Gaps are known from
+    `metadata` goes into each file. Static messages are written at the beginning of each, and the packets of video since
+    the last key frame. Gaps are known from
     the numbers of messages, which have no gaps.
     """
 
@@ -89,6 +91,7 @@ class AttachedRecorder:
         self._statics: dict[str, Envelope] = {}
         self._added: set[str] = set()
         self._due: dict[str, tuple[int, int]] = {}
+        self._groups = Groups[Envelope]()
         self._stamps: dict[str, int] = {}
         self._ends: dict[str, dict[str, Any]] = {}
         self._first: int | None = None
@@ -143,10 +146,11 @@ class AttachedRecorder:
         elif due is not None and (place < due or (place[0] == due[0] and message.stamp <= self._stamps[stream])):
             self.tally.refused += 1
             return
+        self._groups.begin(stream, message, envelope.incarnation)
         if not static and self._split_due(message.stamp):
             self._finish()
             self._writer = self._open()
-            for known in self._statics.values():
+            for known in (*self._statics.values(), *(packet for _, packet in self._groups)):
                 if known.message is not None:
                     self._write(known, known.message)
         if due is not None and not static:
@@ -157,6 +161,7 @@ class AttachedRecorder:
         if self._first is None and not static:
             self._first = message.stamp
         self._write(envelope, message)
+        self._groups.add(stream, message, envelope)
         self.tally.messages[stream] = self.tally.messages.get(stream, 0) + 1
         self.tally.bytes = self._saved + self._writer.saved_bytes
 

@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
 
+import xxhash
+
 from dataflow.execution.failure import readable
 from dataflow.execution.snapshots import differing_fields
 from dataflow.messages.base import Message
@@ -85,7 +87,8 @@ class Judge:
         if "state" in record.detail and (packed or b"") != record.detail["state"]:
             self.result.states += 1
             what = differing_fields(record.detail["state"], packed or b"")
-            self.differ(record, "", "the recorded state", f"another state: {what}")
+            digest = xxhash.xxh3_64_hexdigest(packed or b"")  # so that two runs that differ each show that they do
+            self.differ(record, "", "the recorded state", f"another state ({digest}): {what}")
 
     def files(self, record: FiringRecord, now: Mapping[str, str]) -> None:
         """Notes files whose content is that of no file of the same name that was read then, wherever that lay."""

@@ -111,7 +111,7 @@ def store() -> Path:
     return (Path(home) if home else Path.home() / ".local" / "share") / "dataflow" / "code"
 
 
-class _Swap(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):
+class _Swap(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Modules that are imported again, from given texts."""
 
     def __init__(self, texts: Mapping[str, bytes]) -> None:
@@ -166,9 +166,6 @@ class _Swap(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):
         return importlib.util.spec_from_file_location(
             fullname, there.origin, loader=self, submodule_search_locations=places
         )
-
-    def get_source(self, fullname: str) -> str:
-        return importlib.util.decode_source(self._texts[fullname])
 
     def exec_module(self, module: ModuleType) -> None:
         name = module.__name__

@@ -19,6 +19,7 @@ from typing import Any
 import zenoh
 
 from dataflow.transport import Bus
+from dataflow.transport.publisher import undeclare
 
 BEAT_EVERY = 0.2
 AWAY_AFTER = 1.5
@@ -125,7 +126,7 @@ class Pipe:
             self._closed = True
             self._changed.notify_all()
         for each in self._subscribers:
-            each.undeclare()
+            undeclare(each)
 
     # Out
 

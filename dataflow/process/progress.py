@@ -88,7 +88,8 @@ class Progress:
         self._dropped |= drops
         waits = {name: found for name, found in _waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
-        self.found |= {r.node.name: r.operator.finding() for r in (*self._driver.sources, *changed)}
+        every: list[SourceRunner | Runner] = [*self._driver.sources, *changed]
+        self.found |= {runner.node.name: runner.operator.finding() for runner in every}
         self.behind = self._live.behind()
         news = {"done": done, "counts": counts, "drops": drops, "waits": waits, "behind": self.behind}
         self._channel.send("progress", **news, first=_first(self._driver))

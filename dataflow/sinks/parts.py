@@ -1,7 +1,8 @@
 """The recorder of a run: writes one file, or parts one after the other, and goes on after a full disk.
 
-Each part is a recording by itself: it holds the run's metadata, the static messages, and for every operator, in front
-of its first record, one that stands in for those before (`dataflow.records.cuts`). So parts before it may be missing,
+Each part is a recording by itself: it holds the run's metadata, the static messages, the packets of video since the
+last key frame, and for every operator, in front of its first record, one that stands in for those before
+(`dataflow.records.cuts`). So parts before it may be missing,
 because they were deleted or because the disk was full, and all that are there join into one recording again.
 """
 
@@ -16,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dataflow.editing.joins import holding
 from dataflow.editing.spans import folded
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
@@ -24,9 +26,11 @@ from dataflow.recording import LogLine, RecordingError
 from dataflow.recording.layout import CUT
 from dataflow.recording.parts import Storage, part_path, parts_of
 from dataflow.recording.streams.cutting import Cut
+from dataflow.records.cuts import Held
 from dataflow.records.firing import CALLS, FiringRecord, consecutive, encode_batch
 from dataflow.sinks.outage import Lost, Outage
 from dataflow.sinks.recorder import GOES_ON, RecorderSink
+from dataflow.video.group import Groups
 
 SETTLES = 1.0
 """Seconds for which a full part stays open for what lies before its end: batches of firing records come later."""
@@ -35,11 +39,13 @@ SETTLES = 1.0
 @dataclass(slots=True)
 class Part:
     """One file. `start`: the stamp (ns) with which it begins, None for the beginning of the run; `ready`: when it may
-    be closed (s, steady); `messages` and `bytes`: what it holds, once it is closed."""
+    be closed (s, steady); `repeated`: messages in front that the part before holds, too; `messages` and `bytes`: what
+    it holds, once it is closed."""
 
     path: Path
     sink: RecorderSink
     start: int | None
+    repeated: Counter[str]
     ready: float = 0.0
     messages: int = 0
     bytes: int = 0
@@ -65,6 +71,9 @@ class PartsSink:
         """True where a part may follow: it needs the sum of the records before it."""
         self._static = {stream for stream in streams if graph.streams[stream].static}
         self._statics: dict[str, tuple[Message, int, int]] = {}
+        self._groups = Groups[tuple[Message, int, int]]()
+        self._held: dict[str, list[Held]] = {}
+        """By operator, the packets of video in front of the current part."""
         self._folded: dict[str, list[FiringRecord]] = {}
         self._introduced: set[str] = set()
         self._ends: dict[str, tuple[int | None, str]] = {}
@@ -90,6 +99,7 @@ class PartsSink:
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
         """Stores a message; begins the next part when it is time to."""
         self._given[stream] += 1
+        self._groups.begin(stream, message, incarnation)
         if stream in self._static:
             self._statics[stream] = message, seq, incarnation
         elif message.stamp > self._clock:
@@ -103,6 +113,7 @@ class PartsSink:
                 part.sink.message(stream, message, seq, incarnation)
             except RecordingError as error:
                 self._failed(part, error)
+        self._groups.add(stream, message, (message, seq, incarnation))
 
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Stores firing records; those of calls before the current part in the one before, while it is open."""
@@ -199,16 +210,26 @@ class PartsSink:
                 path.unlink(missing_ok=True)
             raise
         self._introduced.clear()
-        part = Part(path, sink, start)
+        self._held.clear()
+        part = Part(path, sink, start, Counter(self._statics.keys() if start is not None else ()))
         try:
             if start is not None:
                 sink.writer.add_metadata(CUT, Cut(self._path.name, start, None).metadata())
             for stream, (message, seq, incarnation) in self._statics.items():
                 sink.message(stream, message, seq, incarnation)
+            self._repeat_groups(part)
         except RecordingError:
             self._abandon(part)
             raise
         return part
+
+    def _repeat_groups(self, part: Part) -> None:
+        """Puts the packets since the last key frame of each video in front, so that the part decodes by itself."""
+        for stream, (packet, seq, incarnation) in self._groups:
+            part.sink.message(stream, packet, seq, incarnation)
+            part.repeated[stream] += 1
+            held = self._held.setdefault(self._graph.streams[stream].node, [])
+            held.append(Held(stream, incarnation, seq, packet.stamp, packet.digest()))
 
     def _free_name(self) -> Path:
         """The name of the next part. None is used twice, not even that of one that was deleted."""
@@ -278,9 +299,8 @@ class PartsSink:
 
     def _count(self, part: Part) -> None:
         saved = Counter({stream: part.sink.writer.saved(stream) for stream in self._streams})
-        repeated = Counter(self._statics.keys()) if part.start is not None else Counter()
-        self._saved += saved - repeated
-        part.messages, part.bytes = (saved - repeated).total(), part.sink.writer.saved_bytes
+        self._saved += saved - part.repeated
+        part.messages, part.bytes = (saved - part.repeated).total(), part.sink.writer.saved_bytes
         if part.messages or part.start is None:
             self._closed.append(part)
         else:  # the disk refused before it held anything
@@ -305,7 +325,7 @@ class PartsSink:
         else:
             if part is self._current and operator not in self._introduced:
                 self._introduced.add(operator)
-                for before in consecutive(self._folded.get(operator, ())):
+                for before in consecutive(holding(self._folded.get(operator, ()), self._held.get(operator, ()))):
                     told = partial(part.sink.firings, operator, part.start or 0, encode_batch(before))
                     self._store(part, told)
             self._store(part, lambda: part.sink.firings(operator, records[-1].stamp, payload, calls=calls))

@@ -41,6 +41,7 @@ from dataflow.supervision.nursery import Nursery, adopting
 from dataflow.supervision.plan import ProcessPlan
 from dataflow.supervision.rings import Rings
 from dataflow.transport import Bus, Fanout, reserve_endpoints
+from dataflow.transport.publisher import undeclare
 
 HELLO_EVERY = 0.25
 LEAVE_WITHIN = 2.0
@@ -104,7 +105,7 @@ class Agent:
                 if once:
                     break
             self._stopped = True
-            taken.undeclare()
+            undeclare(taken)
 
     def _started(self, sample: Any) -> None:
         run = msgpack.unpackb(sample.payload.to_bytes(), raw=False)["run"]

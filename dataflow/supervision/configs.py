@@ -27,18 +27,13 @@ def configurations(
             configs[label] = _operators(plan, process, common, endpoints, label == first)
             pairs = pairs_of(plan.graph, processes)
             configs[label][1]["rings_out"] = [
-                (may_drop(plan, processes, taker), list(keys))
+                (plan.live and taker in processes and processes[taker].sink is None, list(keys))  # a gate takes all
                 for (maker, taker), keys in pairs.items()
                 if maker == label
             ]
         else:
             configs[label] = _sink(plan, process, common)
     return configs
-
-
-def may_drop(plan: RunPlan, processes: Mapping[str, ProcessPlan], taker: str) -> bool:
-    """Returns whether messages may be dropped for a process that takes nothing; a gate always takes."""
-    return plan.live and taker in processes and processes[taker].sink is None
 
 
 def _common(plan: RunPlan, process: ProcessPlan, processes: Mapping[str, ProcessPlan]) -> dict[str, Any]:

@@ -42,6 +42,7 @@ class Remote:
         note: Callable[[str], None],
     ) -> None:
         """`endpoints`: by label, where the processes here and the link listen."""
+        self._live = plan.live
         self._plan, self._meeting, self._processes, self._pairs = plan, meeting, processes, pairs
         self._here, self._feed, self._printed, self._note = here, feed, printed, note
         self.machine_of = {
@@ -60,7 +61,7 @@ class Remote:
     def _link_config(self, endpoints: Mapping[str, str]) -> dict[str, Any]:
         graph = self._plan.graph
         return {
-            **link_of(self._plan.live, self._processes, self._pairs, gate_of(None)),
+            **link_of(self._live, self._processes, self._pairs, gate_of(None)),
             "endpoint": self._meeting.endpoint,
             "keys": None if self._meeting.keys is None else str(self._meeting.keys.absolute()),
             "listen": endpoints[LINK],
@@ -70,7 +71,7 @@ class Remote:
             "namespace": graph.namespace,
             "routes": self._routes().to_json(),
             "graph": graph.to_json(),
-            "live": self._plan.live,
+            "live": self._live,
         }
 
     def _routes(self, of: str = "") -> Routes:
@@ -128,10 +129,10 @@ class Remote:
             graph=graph.to_json() | {"network": asdict(Network())},
             processes=[asdict(self._processes[label]) for label in labels],
             pairs=[[*pair, list(keys)] for pair, keys in self._pairs.items() if {*labels, gate} & set(pair)],
-            gate=link_of(self._plan.live, self._processes, self._pairs, gate),
+            gate=link_of(self._live, self._processes, self._pairs, gate),
             routes=self._routes(machine).to_json(),
             threads={name: wanted[name] for name in THREADS},
-            live=self._plan.live,
+            live=self._live,
         )
 
     def _send_files(self, machine: str, lacking: list[str]) -> None:

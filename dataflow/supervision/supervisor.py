@@ -13,6 +13,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.threads import environment
@@ -28,10 +29,12 @@ from dataflow.supervision.core.report import RunFailed, RunReport, Status
 from dataflow.supervision.early_nursery import EarlyNursery
 from dataflow.supervision.nursery import Nursery, adopting
 from dataflow.supervision.plan import LINK, RunPlan, process_plans
-from dataflow.supervision.remote import Remote
 from dataflow.supervision.rings import Pairs, Rings, pairs_of
 from dataflow.transport import registry, reserve_endpoints
 from dataflow.transport.log_file import LogFile
+
+if TYPE_CHECKING:
+    from dataflow.supervision.remote import Remote
 
 TICK = 0.05
 PART_WITHIN = 4.0
@@ -61,6 +64,7 @@ class Supervisor:
         self._announced = contextlib.ExitStack()
         self._over: commands.Over | None = None
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._boxes = Boxes(plan.graph, self._processes, live=plan.live)
         self._remote: Remote | None = None
         self._stops = 0
         self._asked: deque[events.PlaybackAsked | events.TriggerAsked] = deque()
@@ -107,9 +111,8 @@ class Supervisor:
             stack.callback(self._words.close)
             self._selector = stack.enter_context(selectors.DefaultSelector())
             self._clock = AwakeClock()
-            boxes = Boxes(self.plan.graph, self._processes, live=self.plan.live)
             self._here = Children(
-                self._start_nursery(), self._selector, rings, boxes, self._clock, self._feed_here, self._heard
+                self._start_nursery(), self._selector, rings, self._boxes, self._clock, self._feed_here, self._heard
             )
             stack.callback(self._here.bury)
             self._selector.register(self._woken, selectors.EVENT_READ, None)
@@ -139,6 +142,8 @@ class Supervisor:
 
     def _meet(self, pairs: Pairs) -> None:
         """Waits (bounded) until the other machines of the graph are there and have what they need."""
+        from dataflow.supervision.remote import Remote  # most runs need no network
+
         meeting = self.plan.machines
         assert meeting is not None
         self._remote = Remote(

@@ -105,7 +105,7 @@ class ClassifierTask(ImageTask[ClassificationData]):
     ) -> None:
         super().__init__(data, size, seed, variation)
         self.architecture: Architecture = architecture
-        self.network = ClassifierNetwork(len(data.classes), architecture)
+        self.network: nn.Module = ClassifierNetwork(len(data.classes), architecture)
         labels = np.array([image.label for image in data.training], np.int64)
         self.class_weights = class_weights(labels, len(data.classes))
 

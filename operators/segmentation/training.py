@@ -43,8 +43,9 @@ class SegmenterTask(ImageTask[SegmentationData]):
     ) -> None:
         super().__init__(data, size, seed, variation)
         self.width, self.architecture = width, architecture
-        self.network = SegmentationNetwork(len(data.classes), backbone=BACKBONES[architecture](width))
-        self.backbone = self.network.backbone
+        network = SegmentationNetwork(len(data.classes), backbone=BACKBONES[architecture](width))
+        self.network: nn.Module = network
+        self.backbone = network.backbone
         self.class_weights = class_weights(data)
         if backbone is not None:
             load_backbone(self.backbone, backbone)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,17 +19,20 @@ PAGES = ["README.md", *(page for page in PAGES if page not in GENERATED)]
 
 
 @pytest.fixture(scope="module")
-def faults(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+def faults(once: Callable[..., Path]) -> dict[str, list[str]]:
     """What is wrong with the blocks of each page."""
     pytest.importorskip("pandas", reason="the extra [notebook] is not installed")
     runner = REPOSITORY / "tests" / "support" / "doc_pages.py"
     path = os.pathsep.join([str(REPOSITORY), *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore", "OMP_NUM_THREADS": "1"}
-    folder = tmp_path_factory.mktemp("pages")
-    command = [sys.executable, str(runner), str(folder), *PAGES]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=110)
-    assert done.returncode == 0, done.stderr
-    found: dict[str, list[str]] = json.loads((folder / "faults.json").read_text(encoding="utf-8"))
+
+    def make(folder: Path) -> None:
+        command = [sys.executable, str(runner), str(folder), *PAGES]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=110)
+        assert done.returncode == 0, done.stderr
+
+    text = (once("pages", make) / "faults.json").read_text(encoding="utf-8")
+    found: dict[str, list[str]] = json.loads(text)
     return found
 
 

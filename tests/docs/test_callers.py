@@ -28,6 +28,8 @@ CALLED_BY_OTHERS = {
     "on_playback_control_request",  # Foxglove's server tells its listener
     "on_subscribe",
     "on_unsubscribe",
+    "do_GET",  # http.server asks its handler
+    "log_message",
 }
 
 

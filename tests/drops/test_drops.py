@@ -27,9 +27,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return held_runs.recorded(held_runs.graph(STEPS), FAULTS, tmp_path_factory.mktemp("held") / "run.mcap")
 
 
-def cost(run: Path, worse: str, **settings: float) -> Cost:
+def cost(run: Path, worse: str, budget: float = 600.0) -> Cost:
     with Recording(run) as recording:
-        return Drops(recording, worse, **settings).find()
+        return Drops(recording, worse, budget=budget).find()
 
 
 def test_the_drop_and_the_late_message_that_cost_the_estimate_are_named(run: Path) -> None:

@@ -13,10 +13,11 @@ from mcap.writer import Writer
 from tampering import tampered
 
 from dataflow.editing.part import Part, write_part
-from dataflow.editing.spans import RunRecords, listed
+from dataflow.editing.spans import RunRecords, folded, listed
 from dataflow.interop.opening import is_foreign
 from dataflow.recording import Recording
 from dataflow.recording.streams.copying import Origin
+from dataflow.records.cuts import Taken, taken_by
 from dataflow.records.firing import CALLS, Emission, FiringRecord
 from dataflow.records.reading import FiringLog, recorded_firings, whole
 from dataflow.supervision.run import replay
@@ -219,3 +220,16 @@ def test_another_programs_file_keeps_its_writer_its_latched_topics_and_its_times
     assert (header.profile, header.library) == ("ros2", "another program")
     assert is_foreign(tmp_path / "part.mcap")
     assert (done.attachments, done.notes) == (1, [])
+
+
+def test_a_state_that_was_too_large_to_be_kept_stands_in_for_no_calls() -> None:
+    """Its record tells its size under the name that a `cut` has for calls: a recorder of parts ended with an error."""
+    large = record("op", 2, "snapshot", 2, detail={"left_out": 600_000_000})
+    records = [record("op", 0, "setup"), record("op", 1, "fire", 1), large]
+
+    assert taken_by(large) is None
+    setup, cut = folded(records)
+    assert (setup.kind, cut.kind, cut.index) == ("setup", "cut", 2)
+    assert taken_by(cut) == Taken(again=False, at_setup={}, since={}, state=None)
+    part = RunRecords({"op": listed(records)}, {}).of_span((), 2, None, lambda _: (2, None))
+    assert part.unknown == ("op",)

@@ -16,7 +16,7 @@ from dataflow.operator import In, Operator, Out, Param, Sampled, Source
 
 def numbers(stamp: int, value: float, size: int = 1) -> FeatureVector:
     """A message that holds the same number `size` times."""
-    return FeatureVector(stamp=stamp, model="test", labels=["x"], vectors=np.full((1, size), value, np.float32))
+    return FeatureVector(stamp=stamp, model="test", labels=("x",), vectors=np.full((1, size), value, np.float32))
 
 
 class Sensor(Source):

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 from joined_agents import HERE, end, join
-from relay import Relay
+from link_relay import Relay
 
 from dataflow.graph import load_text
 from dataflow.machines.keys import TOOLS, KeysError, issue, new_authority, settings

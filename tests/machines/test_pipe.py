@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import zenoh
 
 from dataflow.machines import pipe as pipes
 from dataflow.machines.pipe import Clocks, Pipe
@@ -37,7 +38,7 @@ class Link:
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> Link:
     monkeypatch.setattr(pipes, "BEAT_EVERY", 0.01)
-    monkeypatch.setattr(pipes.zenoh.handlers, "Callback", lambda callback, indirect: SimpleNamespace(callback=callback))
+    monkeypatch.setattr(zenoh.handlers, "Callback", lambda callback, indirect: SimpleNamespace(callback=callback))
     return Link()
 
 
@@ -73,7 +74,7 @@ def test_frames_of_a_link_that_loses_arrive_once_and_in_order(link: Link) -> Non
 
 def test_the_last_frame_is_missed_by_the_mark_that_follows_it(link: Link) -> None:
     taken: list[bytes] = []
-    lost = []
+    lost: list[bytes] = []
     link.loses = lambda payload: payload.endswith(b"last") and not lost and not lost.append(payload)  # type: ignore[func-returns-value]
     a, b = ends(link, taken)
 

@@ -24,6 +24,7 @@ from dataflow.records.reading import FiringLog
 from dataflow.sinks.parts import PartsSink
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
+from dataflow.video.decoder import PacketDecoder
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
@@ -228,3 +229,37 @@ def test_a_recording_is_readable_by_whom_it_is_meant_for(graph: Graph, tmp_path:
 
     (file,) = tmp_path.iterdir()
     assert file.stat().st_mode & 0o777 == mode
+
+
+VIDEO = """
+graph: cameras
+namespace: test
+operators:
+  camera: {use: video_operators:Cameras}
+  size: {use: video_operators:Bytes, inputs: {video: camera/front}}
+"""
+
+
+def test_the_video_of_each_part_is_decoded_by_itself(tmp_path: Path) -> None:
+    (tmp_path / "cameras.yaml").write_text(VIDEO)
+    graph = load_graph(tmp_path / "cameras.yaml")
+    run(graph, placement="one_process", record=tmp_path / "whole.mcap")
+    given = Given(tmp_path / "whole.mcap", graph, tmp_path / "run.mcap", Storage(Splitting(every=SECOND // 2)))
+    facts = given.all()
+
+    parts = parts_of(tmp_path / "run.mcap")
+    assert len(parts) == 4
+    assert facts["messages"] == 3 * 48
+    for part in parts:
+        with Recording(part) as recording:
+            for stream in ("test/camera/front", "test/camera/rear"):
+                decoder = PacketDecoder("h264")
+                for found in recording.messages([stream]):
+                    assert decoder.decode(found.message.data.tobytes(), found.stamp) is not None, decoder.lost
+                decoder.close()
+        assert verdicts(part) == {"size": "identical"}
+        assert all(s.whole and not s.unaccounted for s in verify(part, jobs=1).stand_ins)
+    again = joined(parts, tmp_path / "again.mcap")
+    with Recording(tmp_path / "whole.mcap") as was, Recording(again) as made:
+        assert made.digests() == was.digests()
+    assert verify(again, jobs=1).identical

@@ -111,13 +111,21 @@ def test_runs_in_processes_warn_before_they_start(
 
 
 @pytest.mark.parametrize(
-    ("name", "named"),
-    [("perception", []), ("perception_rgbd", ["perception/postures", "perception/people"])],
+    ("name", "recognize", "named"),
+    [
+        ("perception", True, []),
+        ("perception_rgbd", False, []),
+        ("perception_kitti", False, []),
+        ("perception_rgbd", True, ["perception/postures", "perception/people"]),
+    ],
 )
-def test_shipped_networks_are_named_at_real_cameras_alone(
-    name: str, named: list[str], repository: Path, caplog: pytest.LogCaptureFixture
+def test_networks_that_know_simulated_people_are_off_at_real_cameras_and_named_where_they_are_on(
+    name: str, recognize: bool, named: list[str], repository: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    warn_of_gap(load_graph(repository / "graphs" / f"{name}.yaml"))
+    settings = ["perception.recognize=true"] if recognize else []
+    graph = load_graph(repository / "graphs" / f"{name}.yaml", settings=settings)
+    assert ("perception/people" in graph.nodes) == recognize
+    warn_of_gap(graph)
     assert len(caplog.messages) == bool(named)
     assert all(each in caplog.text for each in named)
 

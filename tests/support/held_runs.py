@@ -205,10 +205,9 @@ def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None 
             emitter.message(stream, entry)
             due += 1
         still = {name for name, first, last in faults.still if first * 20 * MS <= now < last * 20 * MS}
-        for _ in range(50):
-            for runner in driver.operators:
-                if runner.node.name not in still:
-                    runner.step()
+        working = [runner for runner in driver.operators if runner.node.name not in still]
+        while sum(runner.step() for runner in working):
+            pass
     for stream, made in graph.streams.items():
         if graph.nodes[made.node].source and not made.static:
             emitter.end(stream, None, "end of source")
@@ -239,13 +238,13 @@ def _arrivals(graph: Graph, faults: Faults, emitter: Any, played: Recording | No
         emitter.end(entry.stream, None, "static")
     for step in steps:
         outputs = [_sent(step.get(port), stream, numbers[port]) for port, stream in node.outputs.items()]
-        for port, entry in zip(node.outputs, outputs, strict=True):
-            if entry is not None:
-                when = entry.stamp - STAMP + faults.late.get((port, numbers[port]), 0) * MS
+        for port, sent in zip(node.outputs, outputs, strict=True):
+            if sent is not None:
+                when = sent.stamp - STAMP + faults.late.get((port, numbers[port]), 0) * MS
                 latest[port] = when = max(when, latest[port])  # a stream keeps its order
-                found.append((when, entry.stream, entry))
+                found.append((when, sent.stream, sent))
                 numbers[port] += 1
-                last = entry.stamp
+                last = sent.stamp
         log.add("fire", last, 0, outputs=_emissions(outputs))
     log.add("finish", last, 0, outputs=(None,) * len(node.outputs))
     return sorted(found, key=lambda one: (one[0], one[2].stamp))

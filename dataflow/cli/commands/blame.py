@@ -221,7 +221,7 @@ def _print(chain: Chain, field: str) -> None:
     told = ", ".join(sensed[:MOST_ROWS]) + more or "nothing that was sensed: no input changes it"
     out.print(Text(f"decided by {told}"), soft_wrap=True)
     for operator, first, last in chain.unsplit:
-        text = f"the time was up among calls {first} to {last} of {operator}, before it was known which left a mark"
+        text = f"not known which of calls {first} to {last} of {operator} left a mark: the time, or the memory, was up"
         out.print(Text(text, style="yellow"), soft_wrap=True)
     if chain.left:
         names = ", ".join(map(_call, chain.left[:5]))

@@ -103,7 +103,7 @@ def run(
       dataflow run graphs/rgbd_perception.yaml --set data=FOLDER
       dataflow run graphs/synthetic_rgbd.yaml --process-each --rate 1 --json
       dataflow run graphs/simulated_robot.yaml --rate 1 --step --view spawn
-      dataflow run two_machines.yaml --live --listen tls/192.168.1.2:7447 --keys laptop
+      dataflow run robot.yaml --live --listen tls/192.168.1.2:7447 --keys laptop
       dataflow run robot.yaml --live --record "out/{time}.mcap" --keep-disk 20GB
       dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """

@@ -86,7 +86,7 @@ class DetectionData:
 
 
 def read_image(file: Path, how: int = cv2.IMREAD_COLOR_RGB) -> NDArray[Any]:
-    """The pixels (H, W, 3), RGB, of an image file, or as OpenCV's flag `how` says. Raises DataError."""
+    """The pixels (H, W, 3), RGB, of an image file, or as OpenCV's flag `how` has them. Raises DataError."""
     found = cv2.imread(str(file), how)
     if found is None:
         raise DataError(f"{file} cannot be read as an image")

@@ -91,6 +91,7 @@ def test_radar_gives_the_velocity_and_what_moves_is_refused(settings: dict[str, 
     assert played["odometry"]
 
 
+@pytest.mark.long
 def test_a_clock_that_is_off_is_made_up_for_by_the_offset() -> None:
     robot = Robot()
     shifted = [

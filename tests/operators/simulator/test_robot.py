@@ -203,6 +203,7 @@ def test_delay_shows_what_was_so_long_before() -> None:
     assert (sharp[0].data != sharp[2].data).mean() > 0.3  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_a_delay_of_the_inertial_unit_shifts_what_it_measures() -> None:
     quiet = {"rate": 100, "gyro_noise": 0, "gyro_walk": 0, "accel_noise": 0, "accel_walk": 0}
     sharp, late = (
@@ -215,6 +216,7 @@ def test_a_delay_of_the_inertial_unit_shifts_what_it_measures() -> None:
     assert np.abs(delayed - turning).max() > 1e-3
 
 
+@pytest.mark.long
 def test_black_depth_frames_have_no_return_and_black_pairs_no_light() -> None:
     dark = run(
         duration="400ms", movers=False, color_camera={"rate": 0, **SMALL}, truth=QUIET,

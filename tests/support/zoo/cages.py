@@ -10,8 +10,12 @@ from dataflow.graph import Graph, load_text
 REPEATS = (
     *("Hard", "KeptGenerator", "Pool", "Loop", "Views", "Draws", "States", "LazyLibrary", "LazyModule", "Command"),
     *("Fork", "Files", "Large", "FailsToClose", "OddTimer", "Decimals", "Sets", "Finalizers", "Bits"),
+    "Workers",
 )
-DOES_NOT = ("Race", "Clock", "LateClock", "Entropy", "OwnGenerator", "Process", "Background")
+DOES_NOT = (
+    *("Race", "Clock", "LateClock", "Entropy", "OwnGenerator", "Process", "Background"),
+    *("Sometimes", "Stamps", "ZeroSigns", "Sums", "ClockedState", "LastWord"),
+)
 
 
 @dataclass(frozen=True, slots=True)

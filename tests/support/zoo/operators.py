@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import decimal
 import itertools
+import multiprocessing
 import os
 import random
 import subprocess
@@ -331,6 +332,65 @@ class OwnGenerator(Hard):
 
     def work(self, x: FeatureVector) -> float:
         return float(self.generator.normal())
+
+
+class Sometimes(Hard):
+    """Emits by chance."""
+
+    def process(self, x: FeatureVector) -> FeatureVector | None:
+        return super().process(x) if os.urandom(1)[0] & 1 else None
+
+
+class Stamps(Hard):
+    """Stamps its messages by chance."""
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        return super().process(x).replace(stamp=x.stamp + os.urandom(2)[0] % 256)
+
+
+class ZeroSigns(Hard):
+    """Emits zeros whose signs are by chance."""
+
+    def work(self, x: FeatureVector) -> list[float]:
+        return [0.0 if byte & 1 else -0.0 for byte in os.urandom(8)]
+
+
+class Sums(Hard):
+    """Sums up with the clock: its calls repeat, what it says at the end does not."""
+
+    def summary(self) -> Mapping[str, Any]:
+        return {"at": time.time()}
+
+
+class ClockedState(Hard):
+    """Has the clock in its state, which nothing reads."""
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {"calls": self.calls, "at": time.time()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.calls = state["calls"]
+
+
+class LastWord(Hard):
+    """Emits the clock at the end."""
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        self.last = x.stamp
+        return super().process(x)
+
+    def finish(self) -> FeatureVector:
+        return numbers(self.last + 10**9, time.time() % 1000)
+
+
+class Workers(Hard):
+    """Divides its work among processes, now and then."""
+
+    def work(self, x: FeatureVector) -> float:
+        if self.calls % 40 != 1:
+            return 0.0
+        with multiprocessing.get_context("fork").Pool(2) as pool:
+            return float(sum(pool.map(abs, [-self.calls, 2])))
 
 
 class Process(Hard):

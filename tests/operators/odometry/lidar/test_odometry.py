@@ -250,6 +250,7 @@ def test_a_lidar_is_not_found_again_in_a_room_that_looks_alike_in_four_headings(
     assert all(text.startswith("lost: ambiguous") for text in states), states
 
 
+@pytest.mark.long
 def test_a_lidar_is_found_again_in_a_corridor_with_one_thing_in_it() -> None:
     cupboard = [(0, 3.0, (-1, -0.4), (-1, 1.2)), (0, 3.6, (-1, -0.4), (-1, 1.2)), (1, -0.4, (3.0, 3.6), (-1, 1.2))]
     states = carried_blind(CORRIDOR + cupboard)

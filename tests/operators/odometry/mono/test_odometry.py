@@ -97,6 +97,7 @@ def test_fusion_takes_no_metres_from_poses_without_scale() -> None:
     assert "mono/odometry linear, used" not in figures
 
 
+@pytest.mark.long
 def test_a_restored_operator_goes_on_with_the_same_bytes() -> None:
     given = streams(20, wheels=True)
     info, extrinsics = given["image_info"][0], given["extrinsics"][0]

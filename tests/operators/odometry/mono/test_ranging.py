@@ -123,6 +123,7 @@ def test_a_depth_camera_of_another_place_size_and_rate_gives_the_same_metres(bet
     assert scale_of(run(given), 20) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.long
 def test_depth_in_a_few_pixels_of_a_hundred_is_enough() -> None:
     rng = np.random.default_rng(5)
     sparse = {k: np.where(rng.random(SIZE[::-1]) < 0.03, measured(k), 0).astype(np.float32) for k in range(0, COUNT, 4)}

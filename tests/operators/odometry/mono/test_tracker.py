@@ -131,6 +131,7 @@ def test_a_view_of_something_else_is_lost_until_a_new_map_begins() -> None:
     assert Status.TRACKING not in [r.track.status for r in results[20:23]]
 
 
+@pytest.mark.long
 def test_the_same_images_give_the_same_bytes_also_from_a_snapshot() -> None:
     images = rendered(30)
     first = follow(images)
@@ -179,6 +180,7 @@ def test_an_adjustment_brings_disturbed_poses_and_points_back() -> None:
     assert found.squared.max() < 1e-3
 
 
+@pytest.mark.long
 def test_a_known_scale_yields_to_what_the_reference_says_now() -> None:
     results = follow(rendered(40), [se3.exp(np.array([0.0, 0, 0, 0, 0, 0])) @ T for T in aside(40)])
     sigma = results[-1].scale.sigma

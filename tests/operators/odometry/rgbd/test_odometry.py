@@ -217,6 +217,7 @@ def test_pure_rotation_is_followed() -> None:
     assert rotation < 0.005
 
 
+@pytest.mark.long
 def test_exposure_changes_are_followed() -> None:
     frames, poses = sequence(40)
     flicker = [
@@ -244,6 +245,7 @@ def test_covariance_covers_the_error_and_grows_with_the_way() -> None:
         assert np.linalg.eigvalsh(r.covariance)[0] > 0
 
 
+@pytest.mark.long
 def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() -> None:
     odometry = RgbdOdometry(camera())
     for i, frame in enumerate(sequence(25, 3.0)[0]):
@@ -288,6 +290,7 @@ def test_lost_depth_falls_back_to_features() -> None:
     assert errors(results, poses)[0] < 0.03
 
 
+@pytest.mark.long
 def test_blindness_is_bridged_and_recovered_from() -> None:
     frames, poses = sequence(40)
     frames = [black(without_depth(f)) if 10 <= i < 20 else f for i, f in enumerate(frames)]
@@ -608,6 +611,7 @@ def test_wrong_camera_or_configuration_is_refused() -> None:
 # -- determinism and state -----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_same_frames_give_the_same_bytes_after_other_random_draws() -> None:
     frames, _ = sequence(25, 3.0)
     first = digest(follow(frames))

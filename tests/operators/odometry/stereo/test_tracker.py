@@ -189,6 +189,7 @@ def infos() -> tuple[CameraInfo, CameraInfo]:
     return left, CameraInfo(stamp=0, frame="right", width=SIZE[0], height=SIZE[1], K=K, P=P)
 
 
+@pytest.mark.long
 def test_operator_goes_on_alike_from_a_recorded_state() -> None:
     pairs, _ = sequence(25)
 

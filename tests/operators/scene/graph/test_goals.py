@@ -72,14 +72,20 @@ def test_the_jitter_of_a_box_that_stands_still_says_nothing_against_any_goal() -
     assert shaken[1] == pytest.approx(still[1], abs=0.02)
 
 
-def test_a_person_in_a_graph_heads_for_what_it_walks_to() -> None:
-    table = Body(1, "table", np.array([1.0, 0.0, 0.4]), np.array([0.6, 1.6, 0.8]), 0.0, np.zeros(3), roles("table"))
-    door = thing(2, "door", -3.0, 0.0, size=1)
+@pytest.mark.parametrize(
+    ("space", "near", "far", "goal"), [("simulator", "table", "door", 1), ("coco", "dining table", "couch", -1)]
+)
+def test_a_person_heads_for_what_it_walks_to_where_the_label_space_has_goals(
+    space: str, near: str, far: str, goal: int
+) -> None:
+    own = LabelSpace.read(Path(labels_file(space))).roles
+    table = Body(1, near, np.array([1.0, 0.0, 0.4]), np.array([0.6, 1.6, 0.8]), 0.0, np.zeros(3), own(near))
+    other = Body(2, far, np.array([-3.0, 0.0, 0.8]), np.ones(3), 0.0, np.zeros(3), own(far))
     graph = LayeredGraph(GraphSettings())
     for k in range(10):
-        now = graph.update(k * STEP, [table, door, person(min(-1 + 0.15 * k, 0.3), 0.0)], None)
+        now = graph.update(k * STEP, [table, other, person(min(-1 + 0.15 * k, 0.3), 0.0)], None)
     (act,) = now.acts
-    assert act.goal == 1
+    assert act.goal == goal
 
 
 def test_a_restored_inference_goes_on_the_same() -> None:

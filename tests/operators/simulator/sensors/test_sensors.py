@@ -217,6 +217,7 @@ def test_the_depth_camera_can_be_turned_in_the_colour_camera() -> None:
     )
 
 
+@pytest.mark.long
 def test_the_stereo_pair_sees_from_its_own_mount() -> None:
     mount = (0.2, -0.1, 0.9, 0.05, 0.1, 0.4)
     size = {"width": 64, "height": 48}

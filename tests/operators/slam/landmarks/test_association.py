@@ -112,7 +112,8 @@ def test_odometry_noisier_than_told_is_reported_and_the_map_stays_whole() -> Non
     assert nearest.min(axis=1).max() < 0.5
 
 
-@pytest.mark.parametrize("half", [40, pytest.param(70, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("half", [40, 70])
 def test_a_snapshot_without_identities_goes_on_as_the_operator_would(half: int) -> None:
     messages = Walk(4).messages(known=False)
     whole = LandmarkSlam()

@@ -286,6 +286,7 @@ def test_bad_odometry_is_counted_and_the_next_tells_of_both_ways() -> None:
     assert counted["ignored, covariance of odometry: not finite or negative"] == 2
 
 
+@pytest.mark.long
 def test_odometry_that_begins_anew_is_a_jump_and_the_landmarks_place_the_robot_again() -> None:
     walk = Walk(2)
     messages = walk.messages()
