@@ -278,7 +278,7 @@ def _above(graph: Graph, operators: Sequence[str]) -> set[str]:
 
 
 def _firings(records: Sequence[FiringRecord]) -> list[tuple[Any, ...]]:
-    """What firings were given and made, without what a replay numbers otherwise."""
+    """Stamps, inputs and digests of the firings, which a replay with all losses gives alike."""
     return [
         (r.stamp, r.tick, dict(r.inputs), [e and e.digest for e in r.outputs])
         for r in records
