@@ -121,6 +121,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("debug:capture", MAKE),
     Command("blame:blame", MAKE),
     Command("blame:drops", MAKE),
+    Command("mcp:mcp", MAKE),
     Command("sweep:sweep", MAKE),
     Command("compare:compare", MAKE),
     Command("inspection:check", LOOK),
