@@ -52,7 +52,7 @@ def _served(tool: Callable[..., Any], jobs: Jobs) -> Callable[..., Awaitable[str
         except Refused as error:
             raise ToolError(str(error)) from None
 
-    del call.__wrapped__  # type: ignore[attr-defined]
+    del call.__wrapped__
     call.__name__ = tool.__name__.lstrip("_")
     call.__doc__ = inspect.cleandoc(tool.__doc__ or "")
     signature = inspect.signature(tool, eval_str=True)

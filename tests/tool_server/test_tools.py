@@ -78,6 +78,7 @@ def test_what_if_the_code_or_a_parameter_were_another(bugs: dict[str, str], monk
         ask("what_if", bugs["wrong"], operator="summ", call="3", params={"step": 2})
 
 
+@pytest.mark.long
 def test_a_fix_is_proven_when_it_changes_what_it_should_and_nothing_else(
     bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

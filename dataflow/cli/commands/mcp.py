@@ -15,7 +15,6 @@ def mcp() -> None:
     Examples:
 
       dataflow mcp
-      claude mcp add dataflow -- dataflow mcp
     """
     try:
         from dataflow.tool_server.server import serve
