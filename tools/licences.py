@@ -72,8 +72,8 @@ imports nothing that is under the GPL or AGPL, directly or through what it impor
 wheel brings FFmpeg with x264 and x265 (GPL-2.0): with them tests encode clips of made patterns. Neither `dataflow` nor
 `operators` imports one of the two: video is decoded by OpenCV's FFmpeg, which has no such encoders.
 
-`[ray]` and `[mcp]` are not in the table: Ray is under Apache-2.0, fsspec under BSD-3-Clause, the package mcp under MIT; what mcp
-brings is under MIT, Apache-2.0, BSD and PSF-2.0.
+`[ray]` and `[mcp]` are not in the table: Ray is under Apache-2.0, fsspec under BSD-3-Clause, mcp under MIT; what
+mcp brings is under MIT, Apache-2.0, BSD and PSF-2.0.
 """
 
 
