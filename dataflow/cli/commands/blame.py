@@ -125,7 +125,7 @@ def drops(
     Examples:
 
       dataflow drops run.mcap --worse "ate_rmse_m > 0.05"
-      dataflow drops run.mcap --worse "score.recall < 0.8 or score.precision < 0.8" --budget 300
+      dataflow drops run.mcap --worse "score.recall < 0.8" --budget 300
     """
     with friendly_errors():
         recording = existing_recording(recording)
