@@ -166,11 +166,13 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     from dataflow.client.attach import NotRunning
     from dataflow.graph import GraphError, OperatorImportError
     from dataflow.interop.mapping import MappingError
+    from dataflow.machines.keys import KeysError
     from dataflow.messages import MessageError
     from dataflow.operator import ParameterError
     from dataflow.recording import RecordingError
     from dataflow.reexecution.recorded_run import ReplayError
     from dataflow.supervision.core.report import RunFailed
+    from dataflow.transport import BusError, NetworkError
     from dataflow.transport.registry import RegistryError
 
     known = (
@@ -181,6 +183,9 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         OperatorImportError,
         NotRunning,
         RegistryError,
+        BusError,
+        KeysError,
+        NetworkError,
         ChaosError,
         MappingError,
     )
