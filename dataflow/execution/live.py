@@ -87,7 +87,7 @@ class LiveRunner(OperatorRunner):
         self._jumped: dict[str, int] = {}  # producer → incarnation since its clock jumped back
         self._changed: dict[str, Any] = {}
         self._code = code_now(type(self.operator))
-        """What it runs: a reload of another operator of the process changes what is imported, and not this."""
+        """The code that it runs: a reload of another operator of the process changes what is imported, and not this."""
         self._told = True
         """True when the aligner may have something to decide: it was told something since it had not."""
 

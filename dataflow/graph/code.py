@@ -46,7 +46,7 @@ class ReloadError(ValueError):
 
 @dataclass(frozen=True)
 class Code:
-    """A class of operators, and the source of its own modules by name."""
+    """A class of operators, and the source of the modules that are its own, by name."""
 
     operator: type[Operator]
     texts: Mapping[str, bytes]
@@ -160,7 +160,7 @@ class _Swap(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             for package, last in places
             if not isinstance(other := vars(package).get(last) if package else None, ModuleType | NoneType)
         ]
-        """What packages have by the name of one of the modules, such as a function: package, name and value."""
+        """Objects of packages by the name of one of the modules, such as functions: package, name and value."""
         self.late: set[str] = set()
         """Those that importing the operator did not import: they are imported within a function, if at all."""
         for name, module in self._before.items():
