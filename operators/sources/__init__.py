@@ -7,6 +7,7 @@ from dataflow.lazy import lazily
 if TYPE_CHECKING:
     from operators.sources.broad_imu import BroadImu
     from operators.sources.euroc_imu import EurocImu
+    from operators.sources.gnss import NmeaFile, NmeaGnss
     from operators.sources.kitti_odometry import KittiOdometry
     from operators.sources.kitti_raw import KittiRaw
     from operators.sources.recorded import (
@@ -28,6 +29,7 @@ else:  # most need a separate library, which a graph without them need not load
         {
             "broad_imu": ("BroadImu",),
             "euroc_imu": ("EurocImu",),
+            "gnss": ("NmeaFile", "NmeaGnss"),
             "kitti_odometry": ("KittiOdometry",),
             "kitti_raw": ("KittiRaw",),
             "recorded": (
@@ -51,6 +53,8 @@ __all__ = [
     "EurocImu",
     "KittiOdometry",
     "KittiRaw",
+    "NmeaFile",
+    "NmeaGnss",
     "RecordedCamera",
     "RecordedImu",
     "RecordedLidar",
