@@ -51,6 +51,7 @@ def row(recording: Recording, graph: Graph, name: str, jumps: int) -> str:
     opening = cpu(lambda: Debugger(recording, name, graph))
     debugger = Debugger(recording, name, graph)
     last = len(debugger.calls) - 1
+    debugger.goto(0)  # loads modules and libraries
     cold = []
     for number in random.Random(1).choices(range(last + 1), k=jumps):
         fresh = Debugger(recording, name, graph)

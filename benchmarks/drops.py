@@ -24,7 +24,6 @@ import held_runs  # noqa: E402
 from dataflow.drops.search import Cost, Drops  # noqa: E402
 from dataflow.graph import load_text  # noqa: E402
 from dataflow.recording import Recording  # noqa: E402
-from dataflow.records.figures import recorded_summaries  # noqa: E402
 
 STEPS = 400
 ODOMETRY = """
@@ -38,8 +37,8 @@ operators:
       color_camera: {rate: 10, width: 320, height: 240, output: jpeg}
       depth_camera: {rate: 10, output: png}
       truth: {poses: 10}
-  color: {use: 'operators.codec:ImageDecoder', inputs: {compressed: robot/image_jpeg}, live: {size: 2}}
-  depth: {use: 'operators.codec:DepthDecoder', inputs: {compressed: robot/depth_png}, live: {size: 2}}
+  color: {use: 'operators.codec:ImageDecoder', inputs: {compressed: robot/image_jpeg}, live: {queue: newest, size: 1}}
+  depth: {use: 'operators.codec:DepthDecoder', inputs: {compressed: robot/depth_png}, live: {queue: newest, size: 1}}
   odometry:
     use: operators.odometry:VisualOdometry
     inputs:
@@ -48,7 +47,7 @@ operators:
       image_info: robot/image_info
       depth_info: robot/depth_info
       extrinsics: robot/extrinsics
-    live: {size: 2, wait: 50ms}
+    live: {queue: newest, size: 1, wait: 50ms}
   trajectory_score:
     use: operators.evaluation:TrajectoryMetrics
     inputs: {estimate: odometry/odometry, ground_truth: robot/ground_truth}
@@ -81,8 +80,8 @@ def faults(seed: int) -> tuple[held_runs.Faults, int, str]:
 
 
 def made(seeds: range) -> int:
-    print("| seed | losses | injected | named | replays | calls made | seconds | CPU s |")
-    print("| ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: |")
+    print("| seed | losses | injected | named | replays | seconds | CPU s |")
+    print("| ---: | ---: | --- | ---: | ---: | ---: | ---: |")
     right = 0
     for seed in seeds:
         given, stamp, name = faults(seed)
@@ -93,7 +92,7 @@ def made(seeds: range) -> int:
                 cost = Drops(recording, "end_error_m > 5", budget=600.0).find()
             used = time.process_time() - began
         right += (stamp, name) in {(loss.stamp, loss.input) for loss in cost.named}
-        numbers = f"{len(cost.named)} | {cost.replays} | {cost.calls:,} | {cost.seconds:.1f} | {used:.1f}"
+        numbers = f"{len(cost.named)} | {cost.replays} | {cost.seconds:.1f} | {used:.1f}"
         print(
             f"| {seed} | {cost.losses} | {name} at {(stamp - held_runs.STAMP) * 1e-9:.1f} s | {numbers} |", flush=True
         )
@@ -108,15 +107,14 @@ def branch(path: Path) -> tuple[Cost, float]:
     still = [
         (name, k, k + 22) for name in ("color", "depth", "odometry") for k in range(60, 1000, 31) if draw.random() < 0.9
     ]
-    still.append(("odometry", 500, 580))
+    still.append(("odometry", 400, 700))
     graph = load_text(ODOMETRY)
     with tempfile.TemporaryDirectory() as folder:
         with Recording(path) as played:
             made = held_runs.recorded(graph, held_runs.Faults(late, still), Path(folder) / "run.mcap", played)
         began = time.process_time()
         with Recording(made) as recording:
-            error = float(recorded_summaries(recording, ["trajectory_score"])["trajectory_score"]["ate_rmse_m"])
-            cost = Drops(recording, f"ate_rmse_m > {0.7 * error}", budget=600.0).find()
+            cost = Drops(recording, "ate_rmse_m > 0.015", budget=600.0).find()
             return cost, time.process_time() - began
 
 

@@ -1,8 +1,8 @@
 """The chain of calls that decided a value: each with the inputs, and the state, that change it when they are others.
 
 Nothing is guessed: a call is made again from its state with an input nudged, taken from the message before, or left
-out; what comes out goes through all later calls on the chain, to the value. What changes it is on the chain, and the
-call that made it is looked into next, the latest first.
+out; the messages that come out go through all later calls on the chain, to the value. An input that changes it is on
+the chain, and the call that made it is looked into next, the latest first.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class BlameError(ReplayError):
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """What came of it when an input was another: `way`, the fields nudged, and the value then (None: none).
+    """The value (None: none) that came when an input was another; `way`: how, and the fields nudged.
 
     `together`: how many inputs, or calls, were others at once, none of which changes the value alone (a tie).
     """

@@ -29,7 +29,7 @@ class Spot(NamedTuple):
 
 
 class Lines:
-    """Makes a call, and tells `at_line` of each line of the operator's source that begins, with its number from 1.
+    """Makes a call, and calls `at_line` for each line of the operator's source that begins, with its number from 1.
 
     Sees the thread of the call; neither libraries nor the engine, nor modules that a call imports.
     """

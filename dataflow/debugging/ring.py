@@ -44,12 +44,12 @@ class Held:
         return call_of(self.record)
 
     def entries(self) -> Iterator[Entry]:
-        """What the call was given."""
+        """Yields the entries of all inputs."""
         for given in () if self.firing is None else self.firing.inputs.values():
             yield from entries_of(given)
 
     def messages(self) -> Iterator[Message]:
-        """What the call was given, and what it made."""
+        """Yields the messages of all inputs and outputs."""
         yield from chain((entry.value for entry in self.entries()), self.outputs.values())
 
 

@@ -106,7 +106,7 @@ class _Read:
         return self._recording.stamps(stream, start, end)
 
     def opening(self) -> Mapping[str, Any] | None:
-        """What another process opens it by."""
+        """Returns the values by which another process opens it."""
         return self._recording.opening()
 
     def close(self) -> None:
@@ -127,8 +127,8 @@ class _Keeping(HandOver):
 class HeldRunner(OperatorRunner):
     """Runs an operator without the messages and ticks that it lost, and with those that came late when they came.
 
-    A late message is given once the firing `until` is decided, which its input is forced to be; what its stream says
-    behind it waits as well.
+    A late message is given once the firing `until` is decided, which its input is forced to be; what comes behind it on
+    its stream waits as well.
     """
 
     def __init__(self, graph: Graph, player: Player, emitter: HandOver, held: Sequence[Loss]) -> None:
@@ -147,15 +147,15 @@ class HeldRunner(OperatorRunner):
         self._ticks = {loss.stamp for loss in held if loss.input == TICK}
 
     def push(self, stream: str, entry: Entry) -> None:
-        self._say(stream, entry)
+        self._take(stream, entry)
 
     def advance(self, stream: str, frontier: int) -> None:
-        self._say(stream, Promise(frontier))
+        self._take(stream, Promise(frontier))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        self._say(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
+        self._take(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
 
-    def _say(self, stream: str, arrival: Arrival) -> None:
+    def _take(self, stream: str, arrival: Arrival) -> None:
         if behind := self._behind.get(stream):
             behind.append(arrival)
         elif not self._pass_on(stream, arrival):

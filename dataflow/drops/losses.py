@@ -1,4 +1,4 @@
-"""What the operators of a recorded run did not get in time, by their firing records."""
+"""Losses of a recorded run by its firing records: messages that operators did not get, or not in time."""
 
 from __future__ import annotations
 

@@ -36,8 +36,8 @@ SHORT = 1_000_000
 messages imply the same frontier at once."""
 
 CPU_SPACING = 250_000_000
-"""ns of CPU time between two snapshots of an operator's state, where they are spaced by that: of its own time, and of
-what repeating it takes besides."""
+"""ns of CPU time between two snapshots of an operator's state, where they are spaced by that: of its calls, and of
+what repeating them takes besides."""
 REPEATING = 2_000_000
 """ns that repeating a call takes besides: reading, decoding, comparing (`benchmarks/debugging.md`)."""
 

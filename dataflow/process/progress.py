@@ -88,8 +88,8 @@ class Progress:
         self._dropped |= drops
         waits = {name: found for name, found in _waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
-        every: list[SourceRunner | Runner] = [*self._driver.sources, *changed]
-        self.found |= {runner.node.name: runner.operator.finding() for runner in every}
+        fired: list[SourceRunner | Runner] = [*self._driver.sources, *changed]
+        self.found |= {each.node.name: each.operator.finding() for each in fired}
         self.behind = self._live.behind()
         news = {"done": done, "counts": counts, "drops": drops, "waits": waits, "behind": self.behind}
         self._channel.send("progress", **news, first=_first(self._driver))

@@ -48,9 +48,7 @@ def show(
         str | None, typer.Option("--history", metavar="NODE", help="What happened to a node, such as 'mug 12', so far.")
     ] = None,
     stream: Annotated[str | None, typer.Option(help="The stream of the graph, where there are several.")] = None,
-    nodes: Annotated[
-        bool, typer.Option("--nodes", help="List nodes with position, size, tracks and relations.")
-    ] = False,
+    nodes: Annotated[bool, typer.Option("--nodes", help="List nodes with position, size, tracks, relations.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print nodes, relations and matches as JSON.")] = False,
     export: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Write it for Spark-DSG, which Hydra's tools open.")

@@ -269,6 +269,7 @@ def test_a_graph_says_what_its_flight_recorder_keeps(tmp_path: Path) -> None:
         ("{keep: 4s, when: [{stream: left/fast}]}", "when must be"),
         ("{keep: 4s, when: [{stream: left/fats, field: vectors, above: 1}]}", "left/fats"),
         ("{keep: 0s}", "more than 0"),
+        ("{keep: 4s, snapshots: cpu}", "a flight recorder needs a duration"),
     ],
 )
 def test_a_flight_recorder_that_cannot_be_is_refused_where_it_stands(tmp_path: Path, said: str, fault: str) -> None:

@@ -118,7 +118,7 @@ def drops(
 
     The operators between them and the figures are replayed with some of them undone: these messages come in time. What
     is named is a smallest set without which the figures are not worse: it suffices, and no part of it does. Another set
-    may, too. What sources dropped before they numbered it is not in the file.
+    may, too. Steps that sources dropped before they numbered them are not in the file.
 
     Exit code 0; 1: the time was up before the set was known to be a smallest; 2: it cannot be found, with the reason.
 

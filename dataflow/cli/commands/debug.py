@@ -34,6 +34,24 @@ EDITOR_COMES = 3600.0
 MOST_BYTES = 1_000_000
 """Of a captured call, which is to lie beside tests under version control."""
 
+ViewTarget = Annotated[
+    str | None,
+    typer.Option(
+        "--view",
+        metavar="TARGET",
+        help="Draw what calls were given and made: spawn, serve, rerun+http://HOST:PORT/proxy or FILE.rrd.",
+    ),
+]
+DapPort = Annotated[
+    float | None,
+    typer.Option(
+        "--dap",
+        metavar="PORT",
+        parser=number(0, 65535, "a port"),
+        help="Serve an editor's debugger there, on this machine only, in place of a prompt; 0: any free port.",
+    ),
+]
+
 if TYPE_CHECKING:
     from dataflow.cli.support.debug_shell import Shell
     from dataflow.debugging.debugger import Debugger
@@ -58,23 +76,8 @@ def debug(
     settings: Settings = None,
     path: ModuleFolders = None,
     live_effects: LiveEffects = False,
-    view: Annotated[
-        str | None,
-        typer.Option(
-            "--view",
-            metavar="TARGET",
-            help="Draw what calls were given and made: spawn, serve, rerun+http://HOST:PORT/proxy or FILE.rrd.",
-        ),
-    ] = None,
-    dap: Annotated[
-        float | None,
-        typer.Option(
-            "--dap",
-            metavar="PORT",
-            parser=number(0, 65535, "a port"),
-            help="Serve an editor's debugger there, on this machine only, in place of a prompt; 0: any free port.",
-        ),
-    ] = None,
+    view: ViewTarget = None,
+    dap: DapPort = None,
     json: Json = False,
 ) -> None:
     """Go to any recorded call of an operator: what it was given, what it made, its state before and after.

@@ -73,6 +73,22 @@ class Session:
         self._done = self._over = self._pauses = False
         self._checked: list[int] = []
         """Calls that gave what was recorded, since this was last said."""
+        self._handlers: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any] | None]] = {
+            "initialize": self._initialize,
+            "launch": self._launch,
+            "attach": self._launch,
+            "configurationDone": self._begin,
+            "setBreakpoints": self._set_breakpoints,
+            "setExceptionBreakpoints": self._set_exceptions,
+            "threads": self._threads,
+            "pause": self._pause,
+            "stackTrace": self._stack,
+            "scopes": self._scopes,
+            "variables": self._parts,
+            "evaluate": self._evaluate,
+            "disconnect": self._disconnect,
+            "terminate": self._disconnect,
+        }
 
     def serve(self) -> None:
         """Answers until the editor leaves. Raises `DebugError` and what else goes to a call."""
@@ -105,7 +121,7 @@ class Session:
             self._going = self._last_line(going.call + 1, "end of the recording")
 
     def _led(self) -> Going:
-        """Finds where a command leads. What it cannot do is said, and the call is begun again."""
+        """Finds where a command leads; of one that fails, prints the reason and begins the call again."""
         assert self._away is not None
         here, away, self._away = self._going.call, self._away, None
         try:
@@ -126,7 +142,7 @@ class Session:
         return self._debugger.goto(call, through)
 
     def _check(self, fired: Fired) -> None:
-        """Compares the outputs of a call with the recorded ones, and says so."""
+        """Compares the outputs of a call with the recorded ones, and prints a difference."""
         if fired.same:
             self._checked.append(fired.number)
             return
@@ -255,7 +271,7 @@ class Session:
                 moves()
                 self._wire.answer(request, {"allThreadsContinued": True} if name == "continue" else None)
                 return True
-            handler = getattr(self, f"_on_{name}", None)
+            handler = self._handlers.get(name)
             if handler is None:
                 self._wire.answer(request, error=f"{name} is not supported" if frame else f"{name}: the call runs")
                 return False
@@ -290,19 +306,17 @@ class Session:
 
     # ------------------------------------------------------------------------------------------------- requests
 
-    def _on_initialize(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _initialize(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return dict.fromkeys(CAPABILITIES, True)
 
-    def _on_launch(self, arguments: Mapping[str, Any]) -> None:
+    def _launch(self, arguments: Mapping[str, Any]) -> None:
         if not arguments.get("stopOnEntry", True):
             self._going = Going(self._going.call, self._breaks)
 
-    _on_attach = _on_launch
-
-    def _on_configurationDone(self, arguments: Mapping[str, Any]) -> None:
+    def _begin(self, arguments: Mapping[str, Any]) -> None:
         self._done = True
 
-    def _on_setBreakpoints(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _set_breakpoints(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         file = _real(arguments["source"]["path"])
         set_here: dict[int, Breakpoint] = {}
         told = []
@@ -322,16 +336,16 @@ class Session:
         self._breakpoints[file] = set_here
         return {"breakpoints": told}
 
-    def _on_setExceptionBreakpoints(self, arguments: Mapping[str, Any]) -> None:
+    def _set_exceptions(self, arguments: Mapping[str, Any]) -> None:
         """None are offered."""
 
-    def _on_threads(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _threads(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"threads": [{"id": THREAD, "name": self._where()}]}
 
-    def _on_pause(self, arguments: Mapping[str, Any]) -> None:
+    def _pause(self, arguments: Mapping[str, Any]) -> None:
         self._pauses = True
 
-    def _on_stackTrace(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _stack(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         frames = [
             {
                 "id": n,
@@ -346,17 +360,17 @@ class Session:
         most = arguments.get("levels") or len(frames)
         return {"stackFrames": frames[first : first + most], "totalFrames": len(frames)}
 
-    def _on_scopes(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _scopes(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         frame = self._frame(arguments)
         named = {"Locals": frame.f_locals, "Globals": frame.f_globals}
         scopes = [(name, SimpleNamespace(**{str(n): v for n, v in of.items()})) for name, of in named.items()]
         shown = [(name, self._variables.reference(of)) for name, of in scopes]
         return {"scopes": [{"name": n, "variablesReference": ref, "expensive": n == "Globals"} for n, ref in shown]}
 
-    def _on_variables(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _parts(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"variables": self._variables.parts(arguments["variablesReference"])}
 
-    def _on_evaluate(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _evaluate(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         text, frame = arguments["expression"], self._frame(arguments)
         typed = arguments.get("context") == "repl"
         if typed and text.startswith("goto "):
@@ -374,10 +388,8 @@ class Session:
         shown = self._variables.shown(text, value)
         return {"result": shown["value"], "type": shown["type"], "variablesReference": shown["variablesReference"]}
 
-    def _on_disconnect(self, arguments: Mapping[str, Any]) -> None:
+    def _disconnect(self, arguments: Mapping[str, Any]) -> None:
         self._over = True
-
-    _on_terminate = _on_disconnect
 
     # ------------------------------------------------------------------------------------------------- saying
 
