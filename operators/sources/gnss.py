@@ -64,10 +64,13 @@ class NmeaFile(_Nmea):
     """Reads a log of NMEA 0183 sentences. Positions are stamped with the receiver's UTC, its date from RMC sentences;
     those before the first date are left out.
 
-    Damaged sentences are counted. Dates are the receiver's, also where it is off by a rollover of its weeks.
+    Damaged sentences are counted, and positions of the past, which follow a correction of its clock, are left out and
+    counted. Dates are the receiver's, also where it is off by a rollover of its weeks.
     """
 
     input: str = Param(min_length=1, doc="the file")
+
+    _past = 0
 
     def setup(self) -> None:
         """Raises FileNotFoundError."""
@@ -76,11 +79,19 @@ class NmeaFile(_Nmea):
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         assert self._receiver is not None
+        last = -1
         with self._path.open("rb") as log:
             while data := log.read(65536):
                 for fix in self._receiver.feed(data, 0):
+                    if fix.stamp <= last:
+                        self._past += 1
+                        continue
+                    last = fix.stamp
                     yield {"fix": fix}
         self._receiver.cut()
+
+    def summary(self) -> Mapping[str, int | str]:
+        return {**super().summary(), "past": self._past}
 
 
 class NmeaGnss(_Nmea):

@@ -162,14 +162,14 @@ class Receiver:
         return "approximated", (error, error, 2 * error)
 
     def _stamp(self, arrival: int, time: str) -> int | None:
-        """The time of a position; None where the date is not known yet, or it is no later than the last."""
+        """The time of a position; None where the date is not known yet, or the last position has the same."""
         if self._clock == "machine":
             return arrival
         if self._utc is None or not time:
             self.undated += 1
             return None
         self._utc += (_time(time) - self._utc + DAY // 2) % DAY - DAY // 2
-        if self._utc <= self._last:
+        if self._utc == self._last:
             return None
         self._last = self._utc
         return self._utc

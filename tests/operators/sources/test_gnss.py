@@ -143,7 +143,7 @@ def test_damage_costs_its_sentence_alone(damage: bytes, bad: int, step: int) -> 
     assert receiver.bad == bad
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.lists(
         st.one_of(
@@ -163,7 +163,7 @@ def test_any_bytes_in_any_chunks_give_the_same_and_never_an_exception(data: byte
 
     assert [fix.digest() for fix in whole] == [fix.digest() for fix in parts]
     assert (first.bad, first.kinds, first.undated) == (second.bad, second.kinds, second.undated)
-    assert all(a.stamp < b.stamp for a, b in pairwise(whole))
+    assert all(a.stamp != b.stamp for a, b in pairwise(whole))
 
 
 def test_a_sentence_is_stamped_when_its_first_byte_came() -> None:
@@ -190,8 +190,21 @@ def test_a_log_gives_the_same_bits_and_its_figures(tmp_path: Path) -> None:
 
     assert first.digests() == second.digests()
     assert [m.stamp for m in first["fix"]] == [utc(1994, 3, 23, 12, 0, s) + 500_000_000 for s in range(60)]
-    assert source.summary() == {"clock": "receiver", "sentences": "GGA 60, RMC 60", "bad_sentences": 1}
+    assert source.summary() == {"clock": "receiver", "sentences": "GGA 60, RMC 60", "bad_sentences": 1, "past": 0}
     assert source.finding() == ""
+
+
+def test_a_receiver_whose_date_is_corrected_goes_on(tmp_path: Path) -> None:
+    wrong = b"".join(rmc(f"12000{s}", "230333") + gga(f"12000{s}") for s in range(3))
+    right = b"".join(rmc(f"12000{s}") + gga(f"12000{s}") for s in range(3, 6))
+    found, _ = read(wrong + right)
+    log = tmp_path / "drive.nmea"
+    log.write_bytes(wrong + right)
+    source = NmeaFile(input=str(log))
+
+    assert [fix.stamp - utc(1994, 3, 23, 12) for fix in found[3:]] == [3 * 10**9, 4 * 10**9, 5 * 10**9]
+    assert len(play(source)["fix"]) == 3  # a log has no live clock that may jump
+    assert source.summary()["past"] == 3
 
 
 @pytest.mark.parametrize(
