@@ -133,6 +133,7 @@ GOOD = gga("120000")
         (rmc("120000", "320394"), 1),
         (rmc("120000", "2303945"), 1),
         (sentence("PUBX,00,120000"), 0),  # proprietary
+        (sentence("PUBX," + "1" * LONGEST), 1),  # too long
     ],
 )
 @pytest.mark.parametrize("step", [1, 7, 10**9])
