@@ -128,6 +128,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("inspection:check", LOOK),
     Command("inspection:show", LOOK),
     Command("doctor:doctor", LOOK),
+    Command("doctor:devices", LOOK),
     Command("completion:completion", LOOK),
     Command("inspection:operators", LOOK),
     Command("inspection:messages", LOOK),
