@@ -259,10 +259,11 @@ class Stay:
         path = files.inside(self._agent.folder, fields["path"])
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(path.name + ".part")
-        with part.open("ab") as file:
-            if file.tell() + len(fields["data"]) > files.MOST_SENT:
-                raise files.FilesError(f"file {fields['path']!r} has more than {files.MOST_SENT / 1e9:.1f} GB")
+        if fields["at"] + len(fields["data"]) > files.MOST_SENT:
+            raise files.FilesError(f"file {fields['path']!r} has more than {files.MOST_SENT / 1e9:.1f} GB")
+        with part.open("ab" if fields["at"] else "wb") as file:
             file.write(fields["data"])
+        self._say("", "took")
         if not fields["last"]:
             return
         if files.digest_of(part) != fields["digest"]:
@@ -273,6 +274,9 @@ class Stay:
     def _begin(self) -> None:
         """Makes the links of the processes here, and is ready to start them."""
         wanted, stack = self._wanted, self._stack
+        lacks, _ = files.lacking(wanted["files"], self._agent.folder)
+        if lacks:
+            raise files.FilesError(f"files did not arrive: {', '.join(lacks)}")
         graph = Graph.from_json(wanted["graph"])
         processes = {fields["label"]: ProcessPlan(**fields) for fields in wanted["processes"]}
         gate = wanted["gate"]["label"]

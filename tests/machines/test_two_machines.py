@@ -66,12 +66,22 @@ def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
     monkeypatch.chdir(tmp_path)
     Path("models").mkdir()
     Path("models/factor.txt").write_text("3.5")
-    text = GRAPH.replace("  there: {", "  there: {params: {weights: models/factor.txt}, ")
+    with Path("models/large.bin").open("wb") as large:
+        large.truncate(70 << 20)  # more than the link's process is given at once
+    (robot.folder / "models").mkdir(parents=True, exist_ok=True)
+    (robot.folder / "models/factor.txt.part").write_text("of a run that was killed")
+    text = (
+        GRAPH.replace("  there: {", "  there: {params: {weights: models/factor.txt, other: models/large.bin}, ")
+        .replace("  here: {", f"  here: {{params: {{other: '{'no file ' * 40}'}}, ")
+        .replace("  beside: {", f"  beside: {{params: {{other: '{'no file ' * 40}'}}, ")
+    )
 
     report = two(robot, text)
 
     assert report.summaries["there"]["factor"] == 3.5
     assert (robot.folder / "models/factor.txt").read_text() == "3.5"
+    assert (robot.folder / "models/large.bin").stat().st_size == 70 << 20
+    assert not list((robot.folder / "models").glob("*.part"))
     theirs = robot.code / "machine_operators.py"
     before = theirs.read_text()
     theirs.write_text(before + "# changed there\n")
