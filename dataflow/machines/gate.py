@@ -49,6 +49,10 @@ class Routes:
         return Routes(data["keys"], data["takers"], frozenset(data["static"]), frozenset(data["raw"]))
 
 
+def _frame_of(word: Word) -> bytes:
+    return _KEY.pack(_CONTROL) + msgpack.packb(word, use_bin_type=True)
+
+
 class Gate:
     """Carries between the links of this machine's processes and the pipes to other machines."""
 
@@ -81,7 +85,11 @@ class Gate:
                 self._take_rings()
                 self.inbox.put(("say on", machine, word))
             case ("say on", machine, word):
-                self._pipes[machine].send(_KEY.pack(_CONTROL) + msgpack.packb(word, use_bin_type=True))
+                self._pipes[machine].send(_frame_of(word))
+
+    def say_now(self, machine: str, word: Word) -> None:
+        """Sends a control message that is soon out of date ahead of all that waits; it may be lost. On any thread."""
+        self._pipes[machine].send_with_beat(_frame_of(word))
 
     def _take_rings(self) -> None:
         """Takes what is in the rings into the inbox: what processes had sent before they reported something."""

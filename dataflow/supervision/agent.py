@@ -311,6 +311,8 @@ class Stay:
 
     def _feed(self, event: events.Event) -> None:
         match event:
+            case events.Said(label, "beat", fields):  # behind a slow link's messages it would come too late
+                self._gate.say_now(SUPERVISOR, (label, "said", {"kind": "beat", "fields": dict(fields)}))
             case events.Said(label, kind, fields):
                 self._say(label, "said", kind=kind, fields=dict(fields))
             case events.HungUp(label):

@@ -224,7 +224,10 @@ class Remote:
             case "another":
                 self._note_once(f"another machine joins as {machine!r}; it gets nothing while the first is there")
             case "anew":
-                raise RunFailed(f"machine {machine!r} was started anew: its operators are gone")
+                raise RunFailed(
+                    f"machine {machine!r} has left the run: its agent was started anew, or has not heard this machine "
+                    "for longer than its --timeout; its operators are gone"
+                )
 
     def _note_once(self, text: str) -> None:
         if text not in self._noted:
