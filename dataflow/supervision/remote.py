@@ -27,6 +27,9 @@ from dataflow.supervision.rings import Pairs, gate_of
 PIECES_ON_THE_WAY = 4
 """Pieces of files that were sent to a machine before it took the first of them."""
 
+OF_THE_AGENT = ("differs", "lacks", "took", "ready", "left", "failed")
+"""The words that are about a machine as a whole."""
+
 
 class Remote:
     """The machines that the processes of a plan name. `feed` takes events, `printed` the lines of processes, `note`
@@ -86,16 +89,19 @@ class Remote:
         one that others send to."""
         graph = self._plan.graph
         takers: dict[str, list[str]] = {}
-        for (maker, _), keys in self._pairs.items():
+        makers: dict[str, list[str]] = {}
+        for (maker, taker), keys in self._pairs.items():
             for machine in ("", *self._machines):
-                if maker == gate_of(machine or None):
+                gate, found = gate_of(machine or None), takers if maker == gate_of(machine or None) else makers
+                if gate in (maker, taker):
                     for key in keys:
-                        takers.setdefault(key, []).append(machine)
+                        found.setdefault(key, []).append(machine)
         raw = frozenset(firings_key(graph.namespace, node) for node in graph.nodes)
         takers = {key: sorted(set(machines)) for key, machines in takers.items()}
         if of:
             takers = {key: [""] if set(machines) - {of} else [] for key, machines in takers.items()}
-        return Routes(sorted(takers), takers, graph.static & takers.keys(), raw & takers.keys())
+            makers = {key: [""] for key in takers}
+        return Routes(sorted(takers), makers, takers, graph.static & takers.keys(), raw & takers.keys())
 
     # Before the run
 
@@ -242,6 +248,11 @@ class Remote:
             self._feed(events.LinkChanged(machine, labels, up))
 
     def _from(self, machine: str, label: str, kind: str, fields: dict[str, Any]) -> None:
+        """Takes a word of a machine, which may be about its own processes alone."""
+        about = [label] if label else fields.get("labels", [])
+        if any(self.machine_of.get(each) != machine for each in about) or (not label) != (kind in OF_THE_AGENT):
+            self._note_once(f"machine {machine!r} reports about processes that it does not have; it is not believed")
+            return
         match kind:
             case "said":
                 self._feed(events.Said(label, fields["kind"], fields["fields"]))

@@ -96,3 +96,16 @@ def test_a_file_that_was_not_offered_is_sent_to_no_machine(met: tuple[Orders, li
     with pytest.raises(RunFailed, match=r"machine 'robot' asks for files that it was not offered: arm\.bin"):
         says("robot", "lacks", files=["arm.bin"])
     assert orders.kinds("robot")["file"] == 0
+
+
+def test_a_machine_is_believed_about_its_own_processes_alone(met: tuple[Orders, list[events.Event], Says]) -> None:
+    _, fed, says = met
+
+    says("robot", "died", "right", code=1)
+    says("robot", "died", "sensor", code=1)
+    says("robot", "died", "", code=1)
+    says("robot", "left", labels=["right"], processes=["cat"])
+    assert not fed
+
+    says("robot", "died", "left", code=1)
+    assert fed == [events.Died("left", 1)]
