@@ -16,7 +16,7 @@ import msgpack
 import zenoh
 
 from dataflow.machines.gate import Gate, Routes, Word
-from dataflow.machines.keys import GRAPH_KEY, KEYS, access, settings
+from dataflow.machines.keys import GRAPH_KEY, KEYS, OVER_KEY, access, settings
 from dataflow.machines.pipe import AWAY_AFTER, Pipe
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.streams.inbox import Inbox
@@ -135,7 +135,8 @@ class Hub:
             )
             for name in config.machines
         ]
-        described = msgpack.packb({"graph": dict(config.graph), "started": time.time()}, use_bin_type=True)
+        self._started = time.time()
+        described = msgpack.packb({"graph": dict(config.graph), "started": self._started}, use_bin_type=True)
         self._bus.serve(GRAPH_KEY, lambda query: query.reply(GRAPH_KEY, described))
         key = runtime_key(config.namespace, "machines")
         self._bus.serve(key, lambda query: query.reply(key, msgpack.packb(self._states())))
@@ -224,6 +225,7 @@ class Hub:
 
     def close(self) -> dict[str, Any]:
         """Ends the pipes, once agents have taken what was said last (bounded), and the session."""
+        self._bus.session.put(OVER_KEY, msgpack.packb(self._started))
         for pipe in self._pipes.values():
             pipe.close(LEAVE_WITHIN if pipe.heard and pipe.silence < AWAY_AFTER else 0.0)
         self._bus.close()
