@@ -163,7 +163,7 @@ def interrupted_by_user(error: BaseException | None) -> bool:
 def _explained(error: Exception) -> tuple[str, str, int] | None:
     """(message, details, exit code) of an error that users can do something about; None for a bug."""
     from dataflow.chaos.plan import ChaosError
-    from dataflow.client.attach import NotRunning
+    from dataflow.client.attach import Lost, NotRunning
     from dataflow.graph import GraphError, OperatorImportError
     from dataflow.interop.mapping import MappingError
     from dataflow.machines.keys import KeysError
@@ -176,6 +176,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     from dataflow.transport.registry import RegistryError
 
     known = (
+        BusError,
         RecordingError,
         ReplayError,
         ParameterError,
@@ -199,6 +200,8 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
                 details = ""  # the message names the file; where in the operator it was opened does not help
             message = "\n".join((str(error), *getattr(error, "__notes__", ())))
             return message, details, INTERRUPTED if error.interrupted else DIFFERENT
+        case Lost():
+            return str(error), "", DIFFERENT
         case BrokenPipeError():
             return None
         case OSError() if error.strerror and error.filename:
