@@ -184,7 +184,6 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         OperatorImportError,
         NotRunning,
         RegistryError,
-        BusError,
         KeysError,
         NetworkError,
         ChaosError,
