@@ -15,12 +15,17 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.transport import NetworkError
+from dataflow.transport.keys import local_key, runtime_key
 
 TOOLS = "dataflow tools"
 KEYS = "dataflow-machines"
 """The first chunk of the keys of agents and their runs."""
 GRAPH_KEY = f"{KEYS}/graph"
 """Answers tools on other machines which graph runs."""
+OVER_KEY = f"{GRAPH_KEY}/over"
+"""Tells them when a run is over: by when it was started."""
+CONNECT_WITHIN = 3000
+"""Milliseconds that a tool tries to reach another machine."""
 DAYS = 3650
 _AUTHORITY, _CERTIFICATE, _KEY = "authority.pem", "certificate.pem", "key.pem"
 _AUTHORITY_KEY = "authority.key"
@@ -84,7 +89,13 @@ def _openssl(*words: str) -> None:
         os.umask(before)
 
 
-def settings(keys: Path | None, endpoint: str, *, tools: bool = False) -> dict[str, Any]:
+def tool_settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
+    """Returns the settings of a tool at such an endpoint: routers carry nothing from one peer to another, so it is a
+    client, which is opened when it is connected (bounded). Raises `NetworkError` as `settings`."""
+    return {"mode": "client", "connect/timeout_ms": CONNECT_WITHIN, **settings(keys, endpoint)}
+
+
+def settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
     """Returns the settings of Zenoh for an endpoint between machines. Raises `NetworkError` where it would be open.
 
     Without keys only a Unix socket is allowed: any user of a machine can reach its loopback.
@@ -111,22 +122,36 @@ def settings(keys: Path | None, endpoint: str, *, tools: bool = False) -> dict[s
 
 
 def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
-    """Returns the access control of a supervisor's machine: a machine gets its own keys, machines and tools
-    the graph's streams and requests, and every other certificate nothing."""
-    every = ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"]
-    every += ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
+    """Returns the access control of a supervisor's machine: a machine gets its own keys and what its processes answer
+    with, tools ask and follow, and every other certificate gets nothing. What is kept from other machines lies at
+    `local_key`s, which its own tools ask for."""
+    asking = ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"]
+    answering = ["put", "reply", "declare_queryable", "liveliness_token"]
+    every = [*asking, *answering, "delete"]
     both = {"permission": "allow", "flows": ["ingress", "egress"], "messages": every}
-    open_to_all = [f"{namespace}/**", *_runtime_keys(namespace), GRAPH_KEY]
-    rules = [{"id": "graph", **both, "key_exprs": open_to_all}, {"id": "all", **both, "key_exprs": ["**"]}]
+    graph = [f"{namespace}/**", *_runtime_keys(namespace)]
+    taps = [runtime_key(namespace, kind, "**") for kind in ("taps", "ack")]
+    comes = {"permission": "allow", "flows": ["ingress"]}
+    goes = {"permission": "allow", "flows": ["egress"], "messages": every}
+    here = local_key(namespace, "**")
+    rules = [
+        {"id": "asks", **comes, "messages": asking, "key_exprs": [*graph, GRAPH_KEY, OVER_KEY]},
+        {"id": "taps", **comes, "messages": answering, "key_exprs": taps},
+        {"id": "follows", **goes, "key_exprs": [*graph, GRAPH_KEY, OVER_KEY]},
+        {"id": "answers", **comes, "messages": answering, "key_exprs": [*graph, here]},
+        {"id": "is asked", **goes, "key_exprs": [here]},
+        {"id": "all", **both, "key_exprs": ["**", *graph, here]},
+    ]
+    tools = ["asks", "taps", "follows"]
     subjects = [
         {"id": "tools", "cert_common_names": [TOOLS]},
         {"id": "here", "link_protocols": ["unixsock-stream"]},
     ]
-    policies = [{"rules": ["graph"], "subjects": ["tools"]}, {"rules": ["all", "graph"], "subjects": ["here"]}]
+    policies = [{"rules": tools, "subjects": ["tools"]}, {"rules": ["all"], "subjects": ["here"]}]
     for name in machines:
         rules.append({"id": name, **both, "key_exprs": [f"{KEYS}/machine/{name}/**"]})
         subjects.append({"id": name, "cert_common_names": [name]})
-        policies.append({"rules": [name, "graph"], "subjects": [name]})
+        policies.append({"rules": [name, *tools, "answers", "is asked"], "subjects": [name]})
     return {
         "access_control": {
             "enabled": True,
@@ -140,4 +165,4 @@ def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
 
 def _runtime_keys(namespace: str) -> list[str]:
     """Returns the keys of requests: `**` matches no verbatim chunk."""
-    return [f"{namespace}/@/**", f"{namespace}/**/@/**"]
+    return [runtime_key(namespace, "**"), runtime_key(f"{namespace}/**", "**")]

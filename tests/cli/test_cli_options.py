@@ -61,6 +61,7 @@ TRIED: tuple[str, ...] = (
     "view RECORDING --to OUT.rrd --overwrite --stream left/* --without fast --start 0 --end 1 --clock auto",
     "logs RECORDING --last 3 --level info --operator sum --json",
     "list --json",
+    "devices --json",
     "new operator Near --kind timer --to OUT --json",
     "new graph near --to OUT --json",
     "new project near --to OUT --json",
