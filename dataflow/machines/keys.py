@@ -123,8 +123,8 @@ def settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
 
 def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
     """Returns the access control of a supervisor's machine: a machine gets its own keys and what its processes answer
-    with, tools ask and follow, and every other certificate gets nothing. What is kept from other machines lies at
-    `local_key`s, which its own tools ask for."""
+    with, tools ask and follow, and every other certificate gets nothing. `local_key`s are kept from other machines:
+    only tools on this one ask for them."""
     asking = ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"]
     answering = ["put", "reply", "declare_queryable", "liveliness_token"]
     every = [*asking, *answering, "delete"]

@@ -78,7 +78,7 @@ def blame(
     Examples:
 
       dataflow blame run.mcap --field "tracks.ids[3]@12.4"
-      dataflow blame run.mcap --field "tracks.boxes[2]@12.4" --budget 300
+      dataflow blame run.mcap --field "tracks.boxes[ids == 7]@12.4" --budget 300
       dataflow blame run.mcap --field odometry.position@3 --json
     """
     with friendly_errors():

@@ -56,8 +56,7 @@ def record(
 
     It is a plain subscriber: it comes and goes, and gets what is published meanwhile. So the recording holds no firing
     records: it replays, and cannot be verified. For that, run the graph with --record. Messages missed since
-    the first one of a stream are counted by their numbers. A live run is not slowed down by it; any other waits for
-    it.
+    the first one of a stream are counted by their numbers. A live run is not slowed down; any other waits for it.
 
     It ends with the graph, after --seconds, or at Ctrl-C; the file is complete in each case.
 
