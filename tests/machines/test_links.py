@@ -140,6 +140,16 @@ def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:
         new_authority(keys / "authority")
 
 
+def test_keys_that_could_not_be_made_leave_nothing_in_the_way(keys: Path, tmp_path: Path) -> None:
+    with pytest.raises(KeysError, match="openssl x509"):
+        issue(keys / "authority", tmp_path / "arm", "arm", serves=["not,a:host"])
+    assert not list(tmp_path.iterdir())
+
+    issue(keys / "authority", tmp_path / "arm", "arm", serves=["192.168.1.3"])
+
+    assert {path.name for path in (tmp_path / "arm").iterdir()} == {"authority.pem", "certificate.pem", "key.pem"}
+
+
 @pytest.mark.long
 def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(keys: Path, tmp_path: Path) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"
@@ -181,7 +191,7 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
     assert {row["operator"]: row["state"] for row in top["operators"]}["there"] == "running"
     robot_state = top["machines"]["robot"]
     assert robot_state["up"]
-    assert abs(robot_state["offset"]) <= robot_state["delay"]  # it is this machine's clock
+    assert abs(robot_state["offset"]) <= robot_state["delay"] / 2  # it is this machine's clock
     assert found["set"].returncode == 0, found["set"]
     assert found["record"].returncode == 0, found["record"]
     assert found["stranger"].returncode != 0
