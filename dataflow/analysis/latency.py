@@ -156,13 +156,13 @@ def latencies(graph: Graph, records: Mapping[str, Iterable[FiringRecord]]) -> li
 
 
 class Window(Generic[T]):
-    """What is known of the messages that may still be taken, by stream."""
+    """Holds what is known of the messages that may still be taken, by stream."""
 
     def __init__(self, streams: Iterable[str]) -> None:
         self._known: dict[str, dict[tuple[int, int], T]] = {stream: {} for stream in streams}
 
     def get(self, place: Place) -> T | None:
-        """What is known of a message; None where its firing is not known."""
+        """Returns what is known of a message; None where its firing is not known."""
         return self._known.get(place[0], {}).get(place[1:])
 
     def put(self, place: Place, value: T) -> None:

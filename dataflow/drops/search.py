@@ -145,6 +145,7 @@ class Drops:
         self.worse = Worse(worse, self._recorded)
         self._records = {name: list(self._log.ordered(self.graph.nodes[name])) for name in names}
         self.replays = 0
+        self._players: list[Player] = []
 
     def find(self) -> Cost:
         """Finds them."""
@@ -181,11 +182,12 @@ class Drops:
 
     def _branch(self, feeding: Feeding, losses: Sequence[Loss]) -> Branch:
         version = seeding_of(self._recording)
-        self._players = {
+        players = {
             name: Player(self.graph.nodes[name], self.graph.seed, version, self._records.get(name, ()))
             for name in feeding.operators
         }
-        return Branch(self._recording, self.graph, feeding, self._players, losses)
+        self._players += players.values()
+        return Branch(self._recording, self.graph, feeding, players, losses)
 
     def _search(self, branch: Branch, feeding: Feeding, losses: Sequence[Loss], began: float) -> Cost:
         before = self._replay(branch, ())
@@ -224,7 +226,7 @@ class Drops:
             best=self.worse.values(best),
             not_sent=self._not_sent(),
             replays=self.replays,
-            calls=sum(player.made for player in self._players.values()),
+            calls=sum(player.made for player in self._players),
             seconds=time.monotonic() - began,
         )
 
@@ -235,9 +237,10 @@ class Drops:
     def _check(self, branch: Branch, figures: Figures) -> None:
         """Raises `DropsError` where a replay with all losses is not what was recorded: then one without them would show
         nothing."""
+        made = {player.node.name for player in self._players}
         for name, records in branch.records.items():
             node = self.graph.nodes[name]
-            if node.source or name not in self._players:
+            if node.source or name not in made:
                 continue
             there, here = _firings(self._records[name]), _firings(records)
             while len(there) > len(here) and there[-1][1]:  # beats behind the end of all streams, by the clock
@@ -261,7 +264,7 @@ class Drops:
         return sum(n for detail in details for n in detail.values() if type(n) is int)
 
     def _close(self) -> None:
-        for player in self._players.values():
+        for player in self._players:
             player.close()
 
 

@@ -125,7 +125,7 @@ def test_a_reset_is_made_where_it_was(changed: Path) -> None:
 
 @pytest.mark.long
 def test_calls_that_give_something_else_apart_are_no_test(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dataflow.capture.capture._changes", lambda *_: {})
+    monkeypatch.setattr("dataflow.capture.capture.changes_between", lambda *_: {})
 
     with Recording(changed) as recording:
         found = capture(recording, Debugger(recording, "tuned"))

@@ -95,3 +95,23 @@ def test_memory_hardly_grows_with_the_length_of_a_run(
         assert done >= number // share
 
     assert (peaks[1] - peaks[0]) / (MANY - FEW) < 60  # bytes a step; the records of one take about a kilobyte
+
+
+def test_each_part_of_a_run_reads_little_more_than_its_own_records() -> None:
+    read = [0]
+
+    def counted(begin: Place) -> Iterator[FiringRecord]:
+        for record in Made("left", 8192).since(begin):
+            read[0] += 1
+            yield record
+
+    run = RunRecords({"left": counted}, {"left": ("test/left/fast",)})
+    counts = []
+    for parts in (2, 8):
+        read[0], each = 0, 8192 // parts
+        for k in range(parts):
+            start, end = k * each + 1, (k + 1) * each
+            found = run.of_span({"test/left/fast"}, start, end, lambda _, span=(start, end): span)  # type: ignore[misc]
+            assert sum(record.kind == "fire" for record in found.records["left"]) == each
+        counts.append(read[0])
+    assert counts[1] < 2 * counts[0]

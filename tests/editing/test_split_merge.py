@@ -17,8 +17,8 @@ from dataflow.recording import Recorded, Recording, RecordingError, RecordingWri
 from dataflow.recording.streams.copying import Origin
 from dataflow.recording.streams.ordering import Row
 from dataflow.recording.streams.streams import IndexedStream
-from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
+from dataflow.reexecution.recorded_run import recorded_graph
 from dataflow.verification.verify import verify
 
 pytestmark = pytest.mark.usefixtures("in_process")
@@ -55,31 +55,15 @@ def test_the_merge_of_a_split_is_the_whole(recorded: Path, tmp_path: Path, how: 
     assert verify(tmp_path / "whole.mcap").identical
 
 
-def test_of_firing_records_each_part_reads_little_more_than_its_own(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dataflow.editing.spans.SEGMENT", 4)
+def test_reading_begins_at_any_record(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dataflow.records.order.STEP", 1)
-    read: list[str] = []
-    decoded = FiringLog.decoded
-
-    def noting(log: FiringLog, operator: str, payload: bytes) -> tuple[FiringRecord, ...]:
-        read.append(operator)
-        return decoded(log, operator, payload)
-
-    monkeypatch.setattr(FiringLog, "decoded", noting)
     with Recording(recorded) as recording:
-        batches = recording.firing_batches()["left"]
-
-    counts = []
-    for number in (2, 8):
-        with Origin(recorded) as origin:
-            parts = list(split(origin, tmp_path / f"{number}", every=SECOND // number))
-        assert len(parts) >= number - 1
-        counts.append(read.count("left"))
-        read.clear()
-    assert batches > 8
-    assert counts[1] < 2 * counts[0]
+        graph = recorded_graph(recording)
+        for node in graph.nodes.values():
+            log = FiringLog.read(recording)
+            listed = list(log.ordered(node))
+            for k in range(0, len(listed), 17):
+                assert list(log.since(node, (listed[k].incarnation, listed[k].index))) == listed[k:]
 
 
 def test_messages_are_decoded_for_the_part_that_they_are_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
