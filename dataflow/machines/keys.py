@@ -7,10 +7,11 @@ it.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +41,9 @@ def new_authority(folder: Path) -> None:
     """Makes a folder with a new authority, which issues keys. Raises `KeysError` where there is one."""
     if (folder / _AUTHORITY_KEY).exists():
         raise KeysError(f"{folder} has an authority already: keys that it issued would be worthless with another")
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    made = ("-keyout", str(folder / _AUTHORITY_KEY), "-out", str(folder / _AUTHORITY))
-    _openssl("req", "-x509", *_CURVE, "-days", str(DAYS), "-subj", "/CN=dataflow authority", *made)
+    with _made_for(folder) as scratch:
+        made = ("-keyout", str(scratch / _AUTHORITY_KEY), "-out", str(scratch / _AUTHORITY))
+        _openssl("req", "-x509", *_CURVE, "-days", str(DAYS), "-subj", "/CN=dataflow authority", *made)
 
 
 def issue(authority: Path, folder: Path, name: str, *, serves: Iterable[str] = ()) -> None:
@@ -55,21 +56,31 @@ def issue(authority: Path, folder: Path, name: str, *, serves: Iterable[str] = (
         raise KeysError(f"{authority} has no {_AUTHORITY_KEY}; make an authority with: dataflow keys new {authority}")
     if (folder / _KEY).exists():
         raise KeysError(f"{folder} has keys already; name another folder")
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     served = list(serves)
     usage = "serverAuth,clientAuth" if served else "clientAuth"
     extensions = [f"extendedKeyUsage={usage}", "basicConstraints=CA:FALSE"]
     if served:
         extensions.append("subjectAltName=" + ",".join(f"{'IP' if _is_ip(s) else 'DNS'}:{s}" for s in served))
-    with tempfile.TemporaryDirectory() as scratch:
+    with _made_for(folder) as made, tempfile.TemporaryDirectory() as scratch:
         request, wanted = Path(scratch, "request"), Path(scratch, "extensions")
         wanted.write_text("\n".join(extensions) + "\n")
         subject = f"/CN={name}"
-        _openssl("req", "-new", *_CURVE, "-subj", subject, "-keyout", str(folder / _KEY), "-out", str(request))
+        _openssl("req", "-new", *_CURVE, "-subj", subject, "-keyout", str(made / _KEY), "-out", str(request))
         by = ("-CA", str(authority / _AUTHORITY), "-CAkey", str(authority / _AUTHORITY_KEY), "-CAcreateserial")
-        out = ("-extfile", str(wanted), "-out", str(folder / _CERTIFICATE), "-days", str(DAYS))
+        out = ("-extfile", str(wanted), "-out", str(made / _CERTIFICATE), "-days", str(DAYS))
         _openssl("x509", "-req", "-in", str(request), *by, *out)
-    (folder / _AUTHORITY).write_bytes((authority / _AUTHORITY).read_bytes())
+        (made / _AUTHORITY).write_bytes((authority / _AUTHORITY).read_bytes())
+
+
+@contextlib.contextmanager
+def _made_for(folder: Path) -> Iterator[Path]:
+    """Gives a folder to make keys in, whose files are moved to `folder` when all of them are made."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+        yield Path(scratch)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        for path in Path(scratch).iterdir():
+            path.replace(folder / path.name)
 
 
 def _is_ip(address: str) -> bool:
