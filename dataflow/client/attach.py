@@ -54,7 +54,7 @@ class Elsewhere:
     @cached_property
     def _bus(self) -> Bus:
         bus = Bus(NetworkConfig(connect=(self.endpoint,), zenoh=self._settings))
-        ended = zenoh.handlers.Callback(lambda sample: self._over.add(msgpack.unpackb(bytes(sample.payload))))
+        ended: Any = zenoh.handlers.Callback(lambda sample: self._over.add(msgpack.unpackb(bytes(sample.payload))))
         bus.session.declare_subscriber(OVER_KEY, ended)
         return bus
 

@@ -52,7 +52,8 @@ class Routes:
 
 
 def _frame_of(word: Word) -> bytes:
-    return _KEY.pack(_CONTROL) + msgpack.packb(word, use_bin_type=True)
+    packed: bytes = msgpack.packb(word, use_bin_type=True)
+    return _KEY.pack(_CONTROL) + packed
 
 
 class Gate:

@@ -67,7 +67,7 @@ def router(listen: Sequence[str], connect: Sequence[str], more: Mapping[str, Any
 
 
 class Claims:
-    """Which agent each machine of a run is: the first that came, as long as it is there."""
+    """The agent that each machine of a run is: the first that came, as long as it is there."""
 
     def __init__(self, run: str) -> None:
         self._run = run

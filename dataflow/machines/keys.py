@@ -134,8 +134,8 @@ def settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
 
 def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
     """Returns the access control of a supervisor's machine: a machine gets its own keys and what its processes answer
-    with, tools ask and follow, and every other certificate gets nothing. What is kept from other machines lies at
-    `local_key`s, which its own tools ask for."""
+    with, tools ask and follow, and every other certificate gets nothing. Tools of other machines reach no
+    `local_key`."""
     asking = ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"]
     answering = ["put", "reply", "declare_queryable", "liveliness_token"]
     every = [*asking, *answering, "delete"]
