@@ -15,6 +15,7 @@ from dataflow.machines.hub import machine_key, router
 from dataflow.machines.keys import GRAPH_KEY, TOOLS, access, issue, new_authority, settings, tool_settings
 from dataflow.transport import Bus, NetworkConfig
 from dataflow.transport.keys import local_key, runtime_key
+from dataflow.transport.publisher import undeclare
 
 SPACE = "test"
 WITHIN = 5.0
@@ -62,12 +63,8 @@ def puts_reach(sender: Bus, taker: Bus, key: str, *, closed: str = "") -> bool:
     """Returns whether what one puts comes to another: sent until it does, or, where it is to be refused, until what
     is put to `closed`, an open key, does."""
     came: list[str] = []
-    declared = [
-        taker.session.declare_subscriber(
-            each, zenoh.handlers.Callback(lambda sample: came.append(str(sample.key_expr)), indirect=False)
-        )
-        for each in filter(None, (key, closed))
-    ]
+    took: Any = zenoh.handlers.Callback(lambda sample: came.append(str(sample.key_expr)), indirect=False)
+    declared = [taker.session.declare_subscriber(each, took) for each in filter(None, (key, closed))]
 
     def sent() -> bool:
         for each in filter(None, (key, closed)):
@@ -77,7 +74,7 @@ def puts_reach(sender: Bus, taker: Bus, key: str, *, closed: str = "") -> bool:
     assert until(sent)
     time.sleep(0.05)
     for each in declared:
-        each.undeclare()
+        undeclare(each)
     return key in came
 
 

@@ -127,7 +127,12 @@ def test_what_waits_is_looked_at_seldom_however_much_of_it_may_not_be_dropped(
     monkeypatch.setattr(pipes, "MOST_WAITING", 10_000)
     looks: list[int] = []
     drop = Pipe._drop_oldest
-    monkeypatch.setattr(Pipe, "_drop_oldest", lambda pipe: (looks.append(1), drop(pipe)))
+
+    def look(pipe: Pipe) -> None:
+        looks.append(1)
+        drop(pipe)
+
+    monkeypatch.setattr(Pipe, "_drop_oldest", look)
     link.loses = lambda payload: True
     a, b = ends(link, [], bounded=True)
 
