@@ -87,9 +87,10 @@ class Debugger:
 
     # ------------------------------------------------------------------------------------------------- going
 
-    def goto(self, number: int, through: Through | None = None) -> Fired:
+    def goto(self, number: int, through: Through | None = None, touched: Callable[[], bool] = lambda: True) -> Fired:
         """Goes to the call of that number, counted from 0 (from the end if negative): makes it, and those that it needs
         before. One of the last calls that were made here is not made again, unless by `through`, which then makes it.
+        `touched` returns whether `through` may have changed something by hand: then nothing goes on from that call.
 
         Raises `DebugError` where there is none, or where it cannot be made again; `OperatorFailure`.
         """
@@ -99,8 +100,22 @@ class Debugger:
         held = self._ring.get(number)
         if held is None or held.stale or through is not None:
             held = self._made_again(number, through) or self._made_on_the_way(number, through)
+            if through not in (None, _plainly) and touched():
+                held.stale = True
+                if self._reached == number:
+                    self._leave()
         self.at = self._fired(held)
         return self.at
+
+    def each(self, first: int, last: int, through: Through) -> Iterator[Fired]:
+        """Makes the calls from one to another by `through`, one after the other. Raises as `goto` does."""
+        for number in range(first, last + 1):
+            held = self._made_again(number, through) if first == last else None
+            yield self._fired(held or self._made_on_the_way(number, through))
+
+    def begins(self, number: int) -> int:
+        """The number of the last call at or before `number` that needs none before."""
+        return number if self.node.operator.stateless else max(0, self._nearest_kept(number), self._nearest(number))
 
     def _made_on_the_way(self, number: int, through: Through | None) -> Held:
         """Makes a call by the records before it, going on from the last one where that lies near."""

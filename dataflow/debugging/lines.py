@@ -28,14 +28,18 @@ class Spot(NamedTuple):
     time: int
 
 
+Homes = tuple[Path, ...]
+"""Where the operator's source lies: the folders of its top package, or its file."""
+
+
 class Lines:
     """Makes a call, and calls `at_line` for each line of the operator's source that begins, with its number from 1.
 
     Sees the thread of the call; neither libraries nor the engine, nor modules that a call imports.
     """
 
-    def __init__(self, at_line: Callable[[FrameType, int], None]) -> None:
-        self._at_line = at_line
+    def __init__(self, at_line: Callable[[FrameType, int], None], homes: Homes) -> None:
+        self._at_line, self._homes = at_line, homes
         self._times: Counter[tuple[str, int]] = Counter()
         self.count = 0
 
@@ -54,7 +58,8 @@ class Lines:
         return Spot(*place, self._times[place])
 
     def _entered(self, frame: FrameType, event: str, arg: Any) -> Any:
-        return self._traced if frame.f_code.co_name != "<module>" and is_own(frame.f_code.co_filename) else None
+        code = frame.f_code
+        return self._traced if code.co_name != "<module>" and is_own(code.co_filename, self._homes) else None
 
     def _traced(self, frame: FrameType, event: str, arg: Any) -> Any:
         if event == "line":
@@ -64,20 +69,28 @@ class Lines:
         return self._traced
 
 
+def homes_of(module: str) -> Homes:
+    """Returns where the source lies of the package, or the module, that an operator's module belongs to."""
+    top = sys.modules[module.partition(".")[0]]
+    return tuple(Path(path).resolve() for path in getattr(top, "__path__", [top.__file__]) if path)
+
+
 @cache
-def is_own(file: str) -> bool:
-    """Returns whether a source file is an operator's: neither a library's nor the engine's."""
+def is_own(file: str, homes: Homes) -> bool:
+    """Returns whether a source file is an operator's: of its package wherever that is installed, else neither a
+    library's nor the engine's."""
     path = Path(file).resolve()
-    library = {"site-packages", "dist-packages"} & {*path.parts} or any(e in path.parents for e in (_ENGINE, _STANDARD))
-    return path.suffix == ".py" and not library
+    within = {path, *path.parents}
+    library = {"site-packages", "dist-packages"} & {*path.parts} or _STANDARD in within
+    return path.suffix == ".py" and _ENGINE not in within and not (library and within.isdisjoint(homes))
 
 
-def own_frames(frame: FrameType | None) -> Iterator[FrameType]:
+def own_frames(frame: FrameType | None, homes: Homes) -> Iterator[FrameType]:
     """The frames of the operator's source, the innermost first."""
     while frame is not None:
         if _ENGINE in Path(frame.f_code.co_filename).parents:
             return
-        if is_own(frame.f_code.co_filename):
+        if is_own(frame.f_code.co_filename, homes):
             yield frame
         frame = frame.f_back
 

@@ -25,7 +25,7 @@ class Held:
     out in place of the call.
 
     `changed`: parameters that were changed by then. `states`: None where they were not taken. `stale`: it was not made
-    to its end, or by source that has been edited since.
+    to its end, something may have been changed in it by hand, or its source has been edited since.
     """
 
     number: int

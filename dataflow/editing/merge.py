@@ -53,19 +53,20 @@ def merge(
     with ExitStack() as stack:
         if one_run:
             origins = sorted(origins, key=_begin)
+        copy = stack.enter_context(Copy(out, origins[0], compression=compression, overwrite=overwrite))
+        if one_run:
             kept = _taken_once(origins)
-            spool = stack.enter_context(Spool(out.parent, _joined_records(origins, stack)))
+            spool = stack.enter_context(Spool(out.parent, _joined_records(origins)))
             facts = _joined_metadata(origins, done, left_out=spool.left_out)
         else:
             _refuse_clashes(origins, prefixes)
             kept = [_all_of(origin, run=not k and not prefixes[0]) for k, origin in enumerate(origins)]
-            spool = stack.enter_context(Spool(out.parent, {} if prefixes[0] else _records_of(origins[0], stack)))
+            spool = stack.enter_context(Spool(out.parent, {} if prefixes[0] else _records_of(origins[0])))
             facts = {name: dict(v) for name, v in origins[0].metadata.items() if is_fact(origins[0], name)}
             _tell_clocks(origins, done)
             _tell_runs(origins, prefixes, done)
         done.firings = spool.calls
         total = sum(int(mask.sum()) for masks in kept for mask in masks.values())
-        copy = stack.enter_context(Copy(out, origins[0], compression=compression, overwrite=overwrite))
         for name, values in facts.items():
             copy.writer.add_metadata(name, values)
         take_over(copy, origins, [p.rstrip("/") for p in prefixes], done, joined=one_run)
@@ -97,14 +98,14 @@ def _further(watch: Watch, before: int, total: int) -> Watch:
     return lambda done, _: watch(before + done, total)
 
 
-def _records_of(origin: Origin, stack: ExitStack) -> Records:
-    """The firing records of a file, which stays open for them as long as `stack`."""
-    return as_stored(stack.enter_context(Recording(origin.path))) if origin.of_kind(Kind.FIRINGS) else {}
+def _records_of(origin: Origin) -> Records:
+    """The firing records of a file, read from it as long as it is open."""
+    return as_stored(Recording(origin.path, file=origin.file)) if origin.of_kind(Kind.FIRINGS) else {}
 
 
-def _joined_records(origins: Sequence[Origin], stack: ExitStack) -> Records:
-    """Those of all parts of a run, each once; the parts stay open for them as long as `stack`."""
-    recordings = [stack.enter_context(Recording(origin.path)) for origin in origins]
+def _joined_records(origins: Sequence[Origin]) -> Records:
+    """Those of all parts of a run, each once, read from them as long as they are open."""
+    recordings = [Recording(origin.path, file=origin.file) for origin in origins]
     graph = graph_of(recordings[0])
     logs = [FiringLog.read(recording) for recording in recordings]
     makers = {name: maker for log in logs for name, maker in makers_of(graph, log).items()}

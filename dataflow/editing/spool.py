@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import tempfile
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -21,10 +22,18 @@ BATCH = 64
 LATEST = 2**63 - 1
 
 
+@contextmanager
+def _refused(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise RecordingError(f"{folder} does not take the firing records that are to be sorted: {error}") from error
+
+
 class Spool:
     """Holds firing records of all operators until they are written in the order of stamps. A context manager.
 
-    `folder`: where there is room for them.
+    `folder`: where there is room for them. Raises `RecordingError` where there is none.
     """
 
     def __init__(self, folder: Path, records: Mapping[str, Iterable[FiringRecord]]) -> None:
@@ -34,16 +43,15 @@ class Spool:
         self._operators = sorted(records)
         self._named = list(records)
         self._stamps, self._places, self._makers = array("q"), array("q", [0]), array("q")
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed with this
+        with _refused(folder):
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed with this
         try:
-            for number, operator in enumerate(self._operators):
-                self._take(number, records[operator])
-        except BaseException as error:
+            with _refused(folder):
+                for number, operator in enumerate(self._operators):
+                    self._take(number, records[operator])
+                self._file.flush()
+        except BaseException:
             self._file.close()
-            if isinstance(error, OSError):
-                raise RecordingError(
-                    f"{folder} does not take the firing records that are to be sorted: {error}"
-                ) from error
             raise
 
     def _take(self, number: int, records: Iterable[FiringRecord]) -> None:

@@ -60,7 +60,7 @@ class Child:
 
     def __init__(self, command: Sequence[str], folder: Path, patience: float) -> None:
         """Starts it in `folder`. `patience`: seconds that one call may take. Raises `ProgramError`."""
-        self._name, self._patience = Path(command[0]).name, patience
+        self._name, self._patience, self._ended = Path(command[0]).name, patience, False
         try:
             self._process = subprocess.Popen(
                 list(command), cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0
@@ -81,6 +81,8 @@ class Child:
         Raises `ProgramError`; the program has ended then.
         """
         what = f"{kind.name.lower()}() at {stamp}" if kind in (CallKind.PROCESS, CallKind.FINISH) else kind.name.lower()
+        if self._ended:
+            raise ProgramError(f"{self._name} has ended: {what} is not made")
         deadline = time.monotonic() + self._patience
         try:
             parts: list[Bytes] = [_CALL.pack(kind, stamp, len(frames))]
@@ -92,7 +94,7 @@ class Child:
             if outcome not in tuple(Outcome) or count > _MOST_FRAMES:
                 raise ProgramError(f"{self._name}: {what}: no reply: outcome {outcome}, {count} frames")
             found = [self._frame(what, deadline) for _ in range(count)]
-        except ProgramError:
+        except BaseException:
             self.end(0.0)
             raise
         if outcome == Outcome.FAILED:
@@ -103,6 +105,7 @@ class Child:
 
     def end(self, seconds: float = _LEAVING) -> int:
         """Closes its input, kills it when it has not ended by then, and returns its exit code."""
+        self._ended = True
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()

@@ -100,11 +100,14 @@ def test_an_editor_is_served_until_it_leaves() -> None:
         assert server.stdout is not None
         host, port = server.stdout.readline().split()[5].split(":")
         with socket.create_connection((host, int(port)), timeout=60) as editor, editor.makefile("rwb") as stream:
+            told = ""
             for seq, command in enumerate(("initialize", "launch", "configurationDone", "threads", "disconnect")):
+                while command == "threads" and '"stopped"' not in told:
+                    told += stream.read(1).decode()
                 data = json.dumps({"seq": seq, "type": "request", "command": command}).encode()
                 stream.write(b"Content-Length: %d\r\n\r\n%s" % (len(data), data))
-            stream.flush()
-            told = stream.read().decode()
+                stream.flush()
+            told += stream.read().decode()
         assert server.wait(60) == 0
     assert host == "127.0.0.1"
     assert '"reason": "entry"' in told

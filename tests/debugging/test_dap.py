@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import select
 import socket
 import sys
 import threading
@@ -17,7 +18,11 @@ import pytest
 import dataflow
 from dataflow.debugging.dap.session import Session, listen
 from dataflow.debugging.debugger import Debugger
+from dataflow.debugging.fired import Probe
+from dataflow.debugging.lines import homes_of, is_own
+from dataflow.messages.base import Message
 from dataflow.recording import Recording
+from dataflow.sync import Firing
 
 SOURCE = '''
 from dataclasses import dataclass
@@ -86,10 +91,27 @@ class Client:
         return body
 
     def request(self, command: str, **arguments: Any) -> dict[str, Any]:
+        self._send(command, arguments)
+        self._stream.flush()
+        return self._answer()
+
+    def at_once(self, *commands: str) -> tuple[str, int]:
+        """The stop that comes of requests which are all there before the first one is answered."""
+        for command in commands:
+            self._send(command, {})
+        self._stream.flush()
+        self._seq -= len(commands)
+        for _ in commands:
+            self._seq += 1
+            assert self._answer()["success"]
+        return self.stopped()
+
+    def _send(self, command: str, arguments: dict[str, Any]) -> None:
         self._seq += 1
         data = json.dumps({"seq": self._seq, "type": "request", "command": command, "arguments": arguments}).encode()
         self._stream.write(b"Content-Length: %d\r\n\r\n" % len(data) + data)
-        self._stream.flush()
+
+    def _answer(self) -> dict[str, Any]:
         while (message := self._read())["type"] != "response":
             self._note(message)
         assert message["request_seq"] == self._seq
@@ -151,7 +173,8 @@ class Client:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Recording, Path]]:
-    folder = tmp_path_factory.mktemp("dap")
+    folder = tmp_path_factory.mktemp("dap") / "site-packages"
+    folder.mkdir()
     (folder / "stepped_adder.py").write_text(SOURCE)
     sys.path.insert(0, str(folder))
     module = importlib.import_module("stepped_adder")
@@ -398,6 +421,75 @@ def test_a_change_of_state_by_hand_is_told_when_the_call_is_made(recorded: tuple
         assert client.told[-1] == "call 2: not as recorded, differs in total"
 
 
+def test_the_call_behind_one_whose_state_was_changed_by_hand_has_the_recorded_state(
+    recorded: tuple[Recording, Path],
+) -> None:
+    with editing(recorded, first=2) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        client.value("setattr(self.state, 'total', 7.0)", context="repl")
+        client.breakpoints(TOTAL)
+        client.go("continue")
+        client.go("continue")
+        assert (client.call(), client.value("self.state.total")) == (3, str(float(sum(k + k * k for k in range(3)))))
+        client.go("continue")
+        assert client.told[-2:] == [
+            "call 2: not as recorded, differs in total",
+            "call 3: as recorded, digest by digest",
+        ]
+
+
+def test_a_pause_is_noticed_between_calls_of_few_lines_forwards_and_back(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, stopOnEntry=False) as client:
+        assert client.at_once("configurationDone", "pause")[0] == "pause"
+        assert client.call() == 0
+    with editing(recorded, first=11) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        assert client.at_once("reverseContinue", "pause")[0] == "pause"
+
+
+def test_calls_are_made_once_on_the_way_and_twice_back_to_the_beginning(
+    recorded: tuple[Recording, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    process = Probe.process
+
+    def counted(probe: Probe, firing: Firing) -> dict[str, Message]:
+        made.append(firing.stamp)
+        return process(probe, firing)
+
+    monkeypatch.setattr(Probe, "process", counted)
+    with editing(recorded, stopOnEntry=False) as client:
+        client.breakpoints(LINES["added = 0.0"])
+        client.ask("configurationDone")
+        for _ in range(11):
+            client.stopped()
+            client.value("self.state.total")
+            client.ask("continue")
+        client.stopped()
+        assert len(made) == 12
+    made.clear()
+    with editing(recorded, first=11) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        assert len(made) == 12
+        client.breakpoints()
+        assert client.go("reverseContinue") == ("entry", LINES["added = 0.0"])
+        assert len(made) < 12 + 2 * 12 + 4
+
+
+def test_source_is_the_operators_own_wherever_its_package_is_installed(recorded: tuple[Recording, Path]) -> None:
+    """The operator of this file lies among installed packages."""
+    engine, installed = Path(dataflow.__file__).resolve().parent, recorded[1].resolve()
+    assert homes_of("stepped_adder") == (installed,)
+    assert homes_of("dataflow.debugging.lines") == (engine,)
+    assert is_own(str(installed), (installed.parent,))
+    assert not is_own(str(installed), (installed.parent / "other",))
+    assert is_own(__file__, ())
+    assert not is_own(str(engine / "operator.py"), (engine,))
+
+
 def test_restart_takes_over_edited_source(recorded: tuple[Recording, Path]) -> None:
     file = recorded[1]
     with editing(recorded, first=6) as client:
@@ -416,10 +508,25 @@ def test_restart_takes_over_edited_source(recorded: tuple[Recording, Path]) -> N
         assert client.value("added") == "0.0"
 
 
-def test_what_is_no_message_of_the_protocol_ends_the_session(recorded: tuple[Recording, Path]) -> None:
+@pytest.mark.parametrize("head", ["GET / HTTP/1.1\r\nHost: here", "POST /a:b HTTP/1.1\r\nContent-Length: %d"])
+def test_what_is_no_message_of_the_protocol_ends_the_session(recorded: tuple[Recording, Path], head: str) -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        theirs.sendall(b"GET / HTTP/1.1\r\nHost: here\r\n\r\n")
+        body = json.dumps({"seq": 1, "type": "request", "command": "configurationDone"})
+        theirs.sendall(f"{head.replace('%d', str(len(body)))}\r\n\r\n{body}".encode())
+        theirs.shutdown(socket.SHUT_WR)
+        session = Session(ours, Debugger(recorded[0], "adder"), 0)
+        session.serve()
+        assert session._over
+        assert not select.select([theirs], [], [], 0)[0]  # nothing was answered
+
+
+def test_a_client_that_sends_nothing_ends_the_session(
+    recorded: tuple[Recording, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dataflow.debugging.dap.session.GREETS", 0.01)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
         session = Session(ours, Debugger(recorded[0], "adder"), 0)
         session.serve()
         assert session._over

@@ -15,7 +15,7 @@ import pytest
 import dataflow
 from dataflow.api.local import LocalRun
 from dataflow.debugging.debugger import DebugError, Debugger
-from dataflow.debugging.fired import SPACING, Probe
+from dataflow.debugging.fired import SPACING, Probe, Process
 from dataflow.execution.failure import OperatorFailure
 from dataflow.graph import Graph, load_graph
 from dataflow.graph.sections import Record
@@ -105,6 +105,21 @@ def test_a_state_goes_over_to_the_next_call_of_an_incarnation(kept: Recording, o
         follows = fired.call.incarnation == before.call.incarnation and fired.call.record == before.call.record + 1
         assert not follows or fired.before == before.after
         before = fired
+
+
+def test_nothing_goes_on_from_a_call_that_was_made_otherwise(kept: Recording) -> None:
+    debugger = Debugger(kept, "smooth")
+    debugger.goto(1)
+
+    def otherwise(process: Process, firing: Firing) -> dict[str, Message]:
+        process(firing)
+        return process(firing)
+
+    differs = [debugger.goto(2, otherwise), debugger.again(otherwise)]
+    assert not any(fired.same for fired in differs)
+    assert debugger.goto(3).same
+    assert debugger.goto(2).same
+    debugger.close()
 
 
 def test_a_call_is_found_by_its_time(kept: Recording) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from made_parts import cut, messages
 from dataflow.editing.merge import merge
 from dataflow.editing.part import Part, write_part
 from dataflow.editing.split import split
+from dataflow.editing.spool import Spool
 from dataflow.messages import Imu, Odometry
 from dataflow.recording import Recorded, Recording, RecordingError, RecordingWriter
 from dataflow.recording.streams.copying import Origin
@@ -116,6 +119,32 @@ def test_overlapping_parts_hold_everything_once(recorded: Path, tmp_path: Path) 
 
     assert messages(tmp_path / "both.mcap") == messages(recorded)
     assert verify(tmp_path / "both.mcap").identical
+
+
+def test_each_part_is_open_once_while_many_are_merged(kept: Path, tmp_path: Path) -> None:
+    opened: list[int] = []
+    with ExitStack() as stack:
+        origins = [stack.enter_context(Origin(kept)) for _ in range(8)]
+        before = len(os.listdir("/dev/fd"))
+        merge(origins, tmp_path / "all.mcap", watch=lambda done, total: opened.append(len(os.listdir("/dev/fd"))))
+
+    assert max(opened) <= before + 2  # the file that is written, and the records on their way to it
+    assert records(tmp_path / "all.mcap") == records(kept)
+
+
+def test_a_folder_that_takes_nothing_is_a_fault_of_the_recording(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="absent does not take the firing records"):
+        Spool(tmp_path / "absent", {})
+
+
+def test_a_file_that_exists_is_refused_before_records_are_read(
+    kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "out.mcap").write_text("mine")
+    monkeypatch.setattr("dataflow.editing.merge.Spool", None)
+    with pytest.raises(RecordingError, match="exists already"):
+        merged([kept, kept], tmp_path / "out.mcap")
+    assert [file.name for file in tmp_path.iterdir()] == ["out.mcap"]
 
 
 def test_streams_of_another_recording_join_a_run_that_still_verifies(stateful: Path, tmp_path: Path) -> None:

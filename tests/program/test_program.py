@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from dataflow.messages import Image, Number
 from dataflow.messages.base import Message, message_types
 from dataflow.operator import Batch, Context, In, OperatorDefinitionError, Out, OutputError
 from dataflow.program import Program, ProgramError
+from dataflow.program.child import Child
 from dataflow.state import StateError
 from dataflow.testing import play
 
@@ -180,6 +182,34 @@ def test_a_program_without_answer_is_killed_in_its_time() -> None:
     operator.setup()
     with pytest.raises(ProgramError, match=r"process\(\) at 7: no answer in 0.5 s"):
         call(operator, 7, number=number(7))
+    operator.close()
+
+
+def test_a_call_behind_the_end_writes_into_no_other_file(tmp_path: Path) -> None:
+    operator = faulty("half")()
+    operator.setup()
+    with pytest.raises(ProgramError, match="ended with exit code 3"):
+        call(operator, 7, number=number(7))
+    with ExitStack() as stack:
+        others = [stack.enter_context((tmp_path / str(k)).open("w+b")) for k in range(8)]
+        with pytest.raises(ProgramError, match=r"has ended: process\(\) at 8 is not made"):
+            call(operator, 8, number=number(8))
+        assert [other.seek(0, 2) for other in others] == [0] * 8
+    operator.close()
+
+
+def test_an_interrupted_call_ends_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    operator = faulty("none")()
+    operator.setup()
+    with monkeypatch.context() as patched:
+        patched.setattr(Child, "_read", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            call(operator, 7, number=number(7))
+    with pytest.raises(ProgramError, match="has ended"):
+        call(operator, 8, number=number(8))
     operator.close()
 
 

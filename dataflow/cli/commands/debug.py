@@ -286,12 +286,12 @@ def _serve(debugger: Debugger, port: int, first: int, shell: Shell) -> None:
         listening.settimeout(EDITOR_COMES)
         host, port = listening.getsockname()
         out.print(f'waits for an editor on {host}:{port} (launch.json: "debugServer": {port})', soft_wrap=True)
+        out.print("whoever can log in to this machine can connect there, and run code as you", soft_wrap=True)
         try:
             connection, _ = listening.accept()
         except TimeoutError:
             raise fail(f"no editor came to port {port} within {EDITOR_COMES:.0f} s") from None
     with connection:
-        connection.settimeout(None)
         Session(connection, debugger, first, shell.number).serve()
 
 

@@ -6,6 +6,7 @@ the call and makes it again, to a line event before; so does going to another ca
 
 from __future__ import annotations
 
+import ast
 import ctypes
 import os
 import socket
@@ -19,8 +20,8 @@ from typing import Any
 from dataflow.debugging.dap.variables import Variables
 from dataflow.debugging.dap.wire import Gone, Wire
 from dataflow.debugging.debugger import Debugger
-from dataflow.debugging.fired import Abandoned, Fired, Process
-from dataflow.debugging.lines import Lines, Spot, is_own, lines_of, own_frames
+from dataflow.debugging.fired import Abandoned, Fired, Process, Through
+from dataflow.debugging.lines import Lines, Spot, homes_of, is_own, lines_of, own_frames
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.messages.base import Message
 from dataflow.reexecution.recorded_run import ReplayError
@@ -35,8 +36,10 @@ CAPABILITIES = (
     "supportsRestartRequest",
     "supportsStepBack",
 )
+GREETS = 60.0
+"""Seconds that an editor that has connected may take for its first request."""
 LOOKS = 256
-"""Lines between two looks whether the editor asks for something while a call runs."""
+"""Lines of a call between two looks whether the editor asks for something."""
 
 Stops = Callable[[FrameType, int], str]
 """Returns why a line event, of that number in its call, is stopped at; empty where it is not."""
@@ -65,11 +68,15 @@ class Session:
     def __init__(
         self, connection: socket.socket, debugger: Debugger, first: int, number: Callable[[str], int] = int
     ) -> None:
-        self._wire, self._debugger, self._number = Wire(connection), debugger, number
+        connection.settimeout(GREETS)
+        self._connection, self._wire, self._debugger, self._number = connection, Wire(connection), debugger, number
         self._going = Going(first, self._first_line)
         self._breakpoints: dict[str, dict[int, Breakpoint]] = {}
         self._variables, self._frames = Variables(), list[FrameType]()
-        self._lines = Lines(self._at_line)
+        self._homes = homes_of(debugger.node.operator.__module__)
+        self._lines = Lines(self._at_line, self._homes)
+        self._touched = False
+        """True where what was evaluated in the call may have changed something."""
         self._away: Callable[[], Going] | None = None
         """Leads on once the call under way is abandoned."""
         self._done = self._over = self._pauses = False
@@ -107,7 +114,7 @@ class Session:
 
     def _go(self) -> None:
         """Makes one call under watch, and finds what is next."""
-        fired = self._made(self._going.call, self._at_line)
+        fired = self._debugger.goto(self._going.call, self._watched(self._at_line), lambda: self._touched)
         if self._away is not None:
             self._going = self._led()
             return
@@ -120,7 +127,7 @@ class Session:
             self._going = Going(going.call + 1, stops)
         else:
             self._say("this was the last call; at its last line again")
-            self._going = self._last_line(going.call + 1, "end of the recording")
+            self._going = self._end(going.call + 1)
 
     def _led(self) -> Going:
         """Finds where a command leads; of one that fails, prints the reason and begins the call again."""
@@ -132,16 +139,30 @@ class Session:
             self._say(str(error), "stderr")
             return Going(here, self._first_line)
 
-    def _made(self, call: int, at_line: Callable[[FrameType, int], None]) -> Fired:
-        self._lines = lines = Lines(at_line)
+    def _watched(self, at_line: Callable[[FrameType, int], None]) -> Through:
+        """Makes calls under watch; answers requests that are there when one begins, and on its way."""
+
+        def looking(frame: FrameType, count: int) -> None:
+            if not count % LOOKS:
+                self._look()
+            at_line(frame, count)
 
         def through(process: Process, firing: Firing) -> dict[str, Message]:
+            self._touched = False
+            self._look()
+            self._lines = lines = Lines(looking, self._homes)
             made = lines.through(process, firing)
             if self._away is not None or self._over:
                 raise Abandoned  # the operator has caught it
             return made
 
-        return self._debugger.goto(call, through)
+        return through
+
+    def _look(self) -> None:
+        while (request := self._wire.request(wait=False)) is not None:
+            self._answer(request, None)
+        if self._over:
+            raise Abandoned
 
     def _check(self, fired: Fired) -> None:
         """Compares the outputs of a call with the recorded ones, and prints a difference."""
@@ -155,11 +176,6 @@ class Session:
             self._say(fired.error, "stderr")
 
     def _at_line(self, frame: FrameType, count: int) -> None:
-        if not count % LOOKS:
-            while (request := self._wire.request(wait=False)) is not None:
-                self._answer(request, None)
-        if self._over:
-            raise Abandoned
         why = "pause" if self._pauses else self._going.stops(frame, count)
         if why:
             self._stop(frame, why)
@@ -180,7 +196,7 @@ class Session:
 
     def _over_from(self, start: FrameType, *, out: bool) -> Stops:
         """Stops at the next line of a frame (unless `out`), or of one that it returns to."""
-        inner = own_frames(start)
+        inner = own_frames(start, self._homes)
         outer = [*inner][1:]
 
         def stops(frame: FrameType, count: int) -> str:
@@ -192,51 +208,44 @@ class Session:
 
     # ------------------------------------------------------------------------------------------------- back
 
-    def _scanned(self, call: int, spot: Spot | None, wanted: Stops) -> tuple[int, list[int]]:
-        """Makes a call, up to a spot if there is one; returns the number of its last line event, that of the spot, and
-        the earlier ones at which `wanted` would stop."""
-        hits: list[int] = []
-        last = 0
+    def _last(self, first: int, last: int, wanted: Stops, spot: Spot | None = None) -> tuple[int, int] | None:
+        """Makes calls, up to a spot if there is one. Returns the last line event at which `wanted` would stop: its call
+        and its number in that."""
+        found = None
+        call = first
 
         def at_line(frame: FrameType, count: int) -> None:
-            nonlocal last
-            last = count
-            if spot is not None and self._lines.spot(frame) == spot:
+            nonlocal found
+            if self._pauses or (spot is not None and self._lines.spot(frame) == spot):
                 raise Abandoned
             if wanted(frame, count):
-                hits.append(count)
+                found = call, count
 
-        fired = self._made(call, at_line)
-        if not isinstance(fired.raised, Abandoned):
+        for fired in self._debugger.each(first, last, self._watched(at_line)):
+            if isinstance(fired.raised, Abandoned):
+                break
             self._check(fired)
-        return last, hits
+            call += 1
+        return found
 
-    def _one_back(self, call: int, spot: Spot) -> Going:
-        """One line event earlier, in this call or in the one before."""
-        last, _ = self._scanned(call, spot, _nowhere)
-        if last > 1:
-            return Going(call, _at(last - 1, "step"))
-        return self._last_line(call, "step") if call else Going(0, self._first_line)
+    def _back(self, call: int, spot: Spot | None, wanted: Stops, why: str) -> Going:
+        """The last line event before, in this call or in earlier ones, at which `wanted` would stop; else the beginning
+        of the first one. A pause leads to the calls that are being looked at."""
+        found = None if spot is None else self._last(call, call, wanted, spot)
+        width = 1
+        while found is None and call > 0 and not (self._over or self._pauses):
+            first = self._debugger.begins(max(0, call - width))
+            found = self._last(first, call - 1, wanted)
+            call, width = first, 2 * width
+        return Going(call, self._first_line) if found is None else Going(found[0], _at(found[1], why))
 
-    def _last_line(self, before: int, why: str) -> Going:
-        """The last line event of the calls in front of one; else the beginning. Ends the session where no call has
-        any."""
-        for call in range(before - 1, -1, -1):
-            last, _ = self._scanned(call, None, _nowhere)
-            if last:
-                return Going(call, _at(last, why))
-        self._over = before == len(self._debugger.calls)
-        if self._over:
+    def _end(self, calls: int) -> Going:
+        """The last line event of the recording. Ends the session where no call has any."""
+        going = self._back(calls, None, _everywhere, "end of the recording")
+        if going.stops == self._first_line and not (self._over or self._pauses):
+            self._over = True
             self._say("no call runs a line of the operator's source", "stderr")
-        return Going(0, self._first_line)
-
-    def _hit_before(self, call: int, spot: Spot | None) -> Going:
-        """The last hit of a breakpoint before, in this call or in earlier ones; else the beginning of the first one."""
-        _, hits = self._scanned(call, spot, self._breaks)
-        while not hits and call > 0:
-            call -= 1
-            _, hits = self._scanned(call, None, self._breaks)
-        return Going(call, _at(hits[-1], "breakpoint") if hits else self._first_line)
+        return going
 
     def _anew(self, call: int) -> Going:
         """The same call from its beginning, with the source as it was edited since."""
@@ -254,7 +263,7 @@ class Session:
 
     def _stop(self, frame: FrameType, why: str) -> None:
         """Answers requests until one goes on, or away."""
-        self._frames, self._variables, self._pauses = list(own_frames(frame)), Variables(), False
+        self._frames, self._variables, self._pauses = list(own_frames(frame, self._homes)), Variables(), False
         self._say_checked()
         self._wire.event("stopped", reason=why, threadId=THREAD, allThreadsStopped=True, description=self._where())
         while not self._answer(self._wire.request(wait=True), frame):
@@ -295,13 +304,13 @@ class Session:
         call, spot = self._going.call, self._lines.spot(frame)
         on = {
             "continue": self._breaks,
-            "stepIn": lambda frame, count: "step",
+            "stepIn": _everywhere,
             "next": self._over_from(frame, out=False),
             "stepOut": self._over_from(frame, out=True),
         }
         away = {
-            "stepBack": partial(self._one_back, call, spot),
-            "reverseContinue": partial(self._hit_before, call, spot),
+            "stepBack": partial(self._back, call, spot, _everywhere, "step"),
+            "reverseContinue": partial(self._back, call, spot, self._breaks, "breakpoint"),
             "restart": partial(self._anew, call),
         }
         if name in on:
@@ -311,6 +320,7 @@ class Session:
     # ------------------------------------------------------------------------------------------------- requests
 
     def _initialize(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        self._connection.settimeout(None)
         return dict.fromkeys(CAPABILITIES, True)
 
     def _launch(self, arguments: Mapping[str, Any]) -> None:
@@ -329,7 +339,9 @@ class Session:
             try:
                 line = min(n for n in lines_of(file) if n >= each["line"])
                 condition = compile(text, "<condition>", "eval") if text else None
-                problem = "" if is_own(file) else "breakpoints are for the operator's source, not for libraries"
+                problem = (
+                    "" if is_own(file, self._homes) else "breakpoints are for the operator's source, not for libraries"
+                )
             except (OSError, SyntaxError, ValueError) as error:
                 problem = f"no code there: {readable(error)}"
             if problem:
@@ -381,7 +393,9 @@ class Session:
             self._away = partial(self._to, text.removeprefix("goto ").strip())
             return {"result": "", "variablesReference": 0}
         try:
-            value = _evaluated(text, frame, statements=typed)
+            tree = _parsed(text, statements=typed)
+            self._touched = self._touched or _may_change(tree)
+            value = _evaluated(tree, frame)
         except (Exception, SystemExit) as error:
             raise ValueError(readable(error)) from error
         shown = self._variables.shown(text, value)
@@ -412,7 +426,7 @@ class Session:
 
     def _say_checked(self) -> None:
         if self._checked:
-            first, last = self._checked[0], self._checked[-1]
+            first, last = min(self._checked), max(self._checked)
             calls = f"call {first}" if first == last else f"{len(self._checked)} calls, {first} to {last}"
             self._say(f"{calls}: as recorded, digest by digest")
             self._checked.clear()
@@ -421,18 +435,27 @@ class Session:
 _real = cache(os.path.realpath)
 
 
-def _evaluated(text: str, frame: FrameType, *, statements: bool) -> Any:
-    """Returns the value of an expression in a frame; None for `statements`, which may assign to its variables. Raises
-    what the text raises."""
-    names = frame.f_locals
+def _parsed(text: str, *, statements: bool) -> ast.Expression | ast.Module:
+    """Returns an expression; if need be and wanted, statements. Raises SyntaxError, ValueError."""
     try:
-        code = compile(text, "<console>", "eval")
+        return ast.parse(text, mode="eval")
     except SyntaxError:
         if not statements:
             raise
-        code = compile(text, "<console>", "exec")
+        return ast.parse(text)
+
+
+def _may_change(tree: ast.Expression | ast.Module) -> bool:
+    """Returns whether more than names, attributes, items and arithmetic is evaluated."""
+    return isinstance(tree, ast.Module) or any(isinstance(n, ast.Call | ast.NamedExpr) for n in ast.walk(tree))
+
+
+def _evaluated(tree: ast.Expression | ast.Module, frame: FrameType) -> Any:
+    """Returns the value of an expression in a frame; None for statements, which may assign to its variables. Raises
+    what is raised there."""
+    code = compile(tree, "<console>", "exec" if isinstance(tree, ast.Module) else "eval")
     try:
-        return eval(code, frame.f_globals, names)
+        return eval(code, frame.f_globals, frame.f_locals)
     finally:
         if sys.version_info < (3, 13):  # `f_locals` is a copy there
             ctypes.pythonapi.PyFrame_LocalsToFast(ctypes.py_object(frame), ctypes.c_int(0))
@@ -442,8 +465,8 @@ def _at(wanted: int, why: str) -> Stops:
     return lambda frame, count: why if count == wanted else ""
 
 
-def _nowhere(frame: FrameType, count: int) -> str:
-    return ""
+def _everywhere(frame: FrameType, count: int) -> str:
+    return "step"
 
 
 def listen(port: int) -> socket.socket:

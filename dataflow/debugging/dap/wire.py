@@ -11,6 +11,8 @@ from typing import Any
 
 MOST_BYTES = 2**24
 """Of a request."""
+FIELDS = {b"Content-Length", b"Content-Type"}
+"""Of the head of a message; the head of a page's request has others."""
 
 
 class Gone(ConnectionError):
@@ -62,6 +64,8 @@ class Wire:
             return None
         try:
             fields = dict(line.split(b":", 1) for line in head.split(b"\r\n"))
+            if not fields.keys() <= FIELDS:
+                raise ValueError(f"a head of {sorted(fields)}")
             length = int(fields[b"Content-Length"])
             if not 0 < length <= MOST_BYTES:
                 raise ValueError(f"{length} bytes")

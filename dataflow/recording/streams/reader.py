@@ -44,12 +44,13 @@ class Recording:
     MCAP or is damaged.
     """
 
-    def __init__(self, path: str | Path, *, watch: Watch | None = None) -> None:
-        """`watch` is called before every read of the file: a sign of progress while a long one is opened or read."""
+    def __init__(self, path: str | Path, *, watch: Watch | None = None, file: McapFile | None = None) -> None:
+        """`watch` is called before every read of the file: a sign of progress while a long one is opened or read.
+        `file`: the same, opened already; it is closed with this."""
         self.path = Path(path)
         parts = parts_in(self.path) if self.path.is_dir() else []
         self._file: McapFile | PartedFile = (
-            PartedFile(self.path, parts, watch=watch) if parts else McapFile(self.path, watch=watch)
+            PartedFile(self.path, parts, watch=watch) if parts else file or McapFile(self.path, watch=watch)
         )
         try:
             self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
