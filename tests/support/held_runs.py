@@ -21,7 +21,7 @@ from dataflow.graph.model import Node
 from dataflow.messages import FeatureVector, Message
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 from dataflow.recording import Recording
-from dataflow.records.firing import Emission
+from dataflow.records.firing import Emission, FiringRecord
 from dataflow.sync import NEVER, Entry
 
 STAMP, MS = 10**18, 1_000_000
@@ -171,6 +171,16 @@ class Faults:
     still: Sequence[tuple[str, int, int]] = ()
 
 
+class RestartRecorder(Recorder):
+    """Records operators that are started again, too: a batch is of one incarnation."""
+
+    def record(self, record: FiringRecord) -> None:
+        held = self._records.get(record.operator)
+        if held and held[-1].incarnation != record.incarnation:
+            self._flush(record.operator)
+        super().record(record)
+
+
 def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None = None) -> Path:
     """Makes and records the run: time goes on by 5 ms, messages arrive, operators that do not stand still work.
 
@@ -179,7 +189,7 @@ def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None 
     clock = [0.0]
     driver = Driver()
     emitter = Emitting(driver)
-    emitter.recorder = Recorder(
+    emitter.recorder = RestartRecorder(
         path, graph, set(graph.streams), {"metadata": metadata_of(graph, "run"), "overwrite": False}
     )
     for node in graph.nodes.values():
