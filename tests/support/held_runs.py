@@ -126,6 +126,18 @@ class Beat(Operator, every="100ms"):
         return {"beats": self._beats}
 
 
+class Count(Operator):
+    """Adds up; its state is declared."""
+
+    step: In[FeatureVector]
+    out: Out[FeatureVector]
+    state: Sum
+
+    def process(self, step: FeatureVector) -> FeatureVector:
+        self.state.value += float(step.vectors[0, 0])
+        return vector(step.stamp, self.state.value)
+
+
 class HalfSmooth(Smooth):
     """Another version, which gives something else."""
 
@@ -138,6 +150,34 @@ class Chancy(Score):
 
     def summary(self) -> Mapping[str, float]:
         return {**super().summary(), "end_error_m": 10.0 + time.perf_counter()}
+
+
+class Undecided(Score):
+    """An error of middle size is not a number."""
+
+    def summary(self) -> Mapping[str, float]:
+        figures = super().summary()
+        return figures | ({"end_error_m": float("nan")} if 1 < figures["end_error_m"] < 25 else {})
+
+
+class Silent(Score):
+    """An error of middle size is left out."""
+
+    def summary(self) -> Mapping[str, float]:
+        figures = super().summary()
+        return {} if 1 < figures["end_error_m"] < 25 else figures
+
+
+class Scaled(Operator):
+    """A value times a parameter that may change; stateless."""
+
+    at: In[FeatureVector]
+    out: Out[FeatureVector]
+    gain: float = Param(1.0, doc="factor", tunable=True)
+    stateless = True
+
+    def process(self, at: FeatureVector) -> FeatureVector:
+        return vector(at.stamp, float(at.vectors[0, 0]) * self.gain)
 
 
 TEXT = """
