@@ -186,7 +186,10 @@ class Blame:
         else:
             raise BlameError(f"{stream} has no message at or before {self._field.seconds:g} s")
         target, record = Call(maker, number), line.records[number]
-        self._reach(target, number)
+        try:
+            self._reach(target, number)
+        except _OutOfTime:
+            raise BlameError(f"the inputs of call {number} of {maker} take more than {MOST_BYTES:,} bytes") from None
         self._port = list(node.outputs)[port]
         shot = line.shots.get(number)
         if shot is None or shot.here.get(self._port) != emission.digest:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import dataflow
+from dataflow.blame import chain as chain_module
 from dataflow.blame.chain import Blame, BlameError, Chain
 from dataflow.blame.field import Field, differ
 from dataflow.blame.line import Line
@@ -71,6 +72,20 @@ def test_what_the_time_does_not_suffice_for_is_named(kept: tuple[blamed_graphs.C
 
     assert not chain.whole
     assert chain.left == [chain.target]
+
+
+def test_the_inputs_of_all_operators_together_are_bounded(two: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = Field.parse(blamed_graphs.at(40, "scale/out"))
+    monkeypatch.setattr("dataflow.blame.line.AHEAD", 0)
+
+    with Recording(two) as recording:
+        monkeypatch.setattr(chain_module, "MOST_BYTES", 16)
+        chain = Blame(recording, field).find()
+        monkeypatch.setattr(chain_module, "MOST_BYTES", 1)
+        with pytest.raises(BlameError, match="the inputs of call 40 of scale take more than 1 bytes"):
+            Blame(recording, field).find()
+
+    assert chain.left == [("keep", 40)]
 
 
 @pytest.mark.parametrize(
