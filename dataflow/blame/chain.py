@@ -109,6 +109,35 @@ class Chain:
         """Returns the links to messages that no call made."""
         return [link for link in self.links if link.input and link.maker is None]
 
+    def as_json(self) -> dict[str, Any]:
+        """Returns it as JSON values; a value that is no number is as the message holds it."""
+        return {
+            "value": self.value,
+            "call": [*self.target],
+            "stamp": self.stamp,
+            "links": [
+                {
+                    "call": [*link.call],
+                    "stamp": link.stamp,
+                    "input": link.input or None,
+                    "message": None if link.message is None else [*link.message],
+                    "from": None if link.maker is None else [*link.maker],
+                    "effects": [
+                        {"way": e.way, "fields": e.fields, "value": e.value, "together": e.together}
+                        for e in link.effects
+                    ],
+                }
+                for link in self.links
+            ],
+            "sensed": [[*place] for place in dict.fromkeys(link.message for link in self.sensed) if place is not None],
+            "whole": self.whole,
+            "not_looked_into": [[*call] for call in self.left],
+            "not_taken_apart": [[*each] for each in self.unsplit],
+            "not_tried_before": dict(self.ended),
+            "calls_made": self.made,
+            "seconds": self.seconds,
+        }
+
 
 class _OutOfTime(Exception):
     pass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -121,11 +122,13 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("debug:capture", MAKE),
     Command("blame:blame", MAKE),
     Command("blame:drops", MAKE),
+    Command("mcp:mcp", MAKE),
     Command("sweep:sweep", MAKE),
     Command("compare:compare", MAKE),
     Command("inspection:check", LOOK),
     Command("inspection:show", LOOK),
     Command("doctor:doctor", LOOK),
+    Command("doctor:devices", LOOK),
     Command("completion:completion", LOOK),
     Command("inspection:operators", LOOK),
     Command("inspection:messages", LOOK),
@@ -241,9 +244,12 @@ class Commands(MutableMapping[str, Any]):
 def paragraphs(text: str) -> str:
     """A docstring with the lines of each paragraph joined, so that it wraps where the terminal ends; lists stay.
 
+    Its brackets are escaped, once: they are no markup, and commands that are looked up twice come here twice.
+
     An empty paragraph follows the first: Typer takes the rest for a docstring and would strip the indentation of
     examples that stand alone in it.
     """
     first, *rest = (block for block in inspect.cleandoc(text).split("\n\n") if block.strip())
     blocks = (first, "", *rest) if rest else (first,)
-    return "\n\n".join(block if block.startswith(" ") else " ".join(block.split("\n")) for block in blocks)
+    joined = "\n\n".join(block if block.startswith(" ") else " ".join(block.split("\n")) for block in blocks)
+    return re.sub(r"(?<!\\)(?=\[[a-z#/@])", r"\\", joined)

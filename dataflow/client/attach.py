@@ -6,23 +6,26 @@ import contextlib
 import time
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import msgpack
+import zenoh
 
 from dataflow.graph.model import Graph
-from dataflow.machines.keys import GRAPH_KEY, settings
+from dataflow.machines.keys import GRAPH_KEY, OVER_KEY, tool_settings
 from dataflow.messages.base import message_type
 from dataflow.messages.declaration import known_type
-from dataflow.transport import Bus, NetworkConfig, TapClient, TapWindow
+from dataflow.transport import Bus, BusError, NetworkConfig, TapClient, TapWindow
 from dataflow.transport.codec import TypeOf
 from dataflow.transport.registry import RunningGraph, running
 from dataflow.transport.tap_client import held_statics
 
 POLL = 0.1
 AGAIN_AFTER = 0.005
-ELSEWHERE_WITHIN = 3.0
-"""Seconds that a tool tries to reach another machine."""
+LOST_AFTER = 30.0
+"""Seconds for which a tool waits for another machine that it had reached."""
 CONNECT_WITHIN = 1.0
 """Seconds that a tool waits for processes that do not answer: they are starting again, stopped, or hang."""
 
@@ -31,17 +34,75 @@ class NotRunning(LookupError):
     """No running graph matches, or several do; the message lists those that run."""
 
 
-_elsewhere: ContextVar[tuple[str, Path | None] | None] = ContextVar("elsewhere", default=None)
+class Lost(RuntimeError):
+    """A machine that runs a graph was not heard for too long; the message names it."""
+
+
+class Elsewhere:
+    """An endpoint of another machine, which is asked over one connection as long as a tool runs."""
+
+    def __init__(self, endpoint: str, keys: Path | None) -> None:
+        self.endpoint, self._keys = endpoint, keys
+        self._over: set[float] = set()
+        """When the runs were started that have ended since."""
+        self._heard_at = 0.0
+
+    @cached_property
+    def _settings(self) -> dict[str, Any]:
+        return tool_settings(self._keys, self.endpoint)
+
+    @cached_property
+    def _bus(self) -> Bus:
+        bus = Bus(NetworkConfig(connect=(self.endpoint,), zenoh=self._settings))
+        ended = zenoh.handlers.Callback(lambda sample: self._over.add(msgpack.unpackb(bytes(sample.payload))))
+        bus.session.declare_subscriber(OVER_KEY, ended)
+        return bus
+
+    def graphs(self) -> list[RunningGraph]:
+        """Returns the graph that runs there; waits (bounded) for a connection."""
+        try:
+            return self._ask()
+        except BusError:  # nothing answers there, or these keys are not let in
+            return []
+
+    def still_runs(self, found: RunningGraph) -> bool:
+        """Returns whether that run goes on, as far as is known. Raises `Lost` when that is not known for too long."""
+        if found.started in self._over:
+            return False
+        if answers := self._ask():
+            return any(each.started == found.started for each in answers)
+        silence = time.monotonic() - self._heard_at
+        if silence > LOST_AFTER:
+            raise Lost(f"{self.endpoint} was not heard for {silence:.0f} s: whether {found.name} goes on is not known")
+        return True
+
+    def _ask(self) -> list[RunningGraph]:
+        found = []
+        for answer in self._bus.ask(GRAPH_KEY, timeout=1.0):
+            said = msgpack.unpackb(answer, raw=False)
+            graph, at = said["graph"], (self.endpoint,)
+            name, space = graph["name"], graph["namespace"]
+            found.append(RunningGraph(name, space, 0, 0.0, at, said["started"], graph, self._settings))
+            self._heard_at = time.monotonic()
+        return found
+
+    def close(self) -> None:
+        if "_bus" in vars(self):
+            self._bus.close()
+
+
+_elsewhere: ContextVar[Elsewhere | None] = ContextVar("elsewhere", default=None)
 
 
 @contextlib.contextmanager
 def elsewhere(endpoint: str, keys: Path | None) -> Iterator[None]:
     """Looks for running graphs at an endpoint of another machine, with these keys, as long as the block runs."""
-    token = _elsewhere.set((endpoint, keys))
-    try:
-        yield
-    finally:
-        _elsewhere.reset(token)
+    with contextlib.closing(Elsewhere(endpoint, keys)) as place:
+        token = _elsewhere.set(place)
+        try:
+            yield
+        finally:
+            _elsewhere.reset(token)
 
 
 def network_of(found: RunningGraph) -> NetworkConfig:
@@ -52,21 +113,7 @@ def network_of(found: RunningGraph) -> NetworkConfig:
 def _graphs() -> list[RunningGraph]:
     """Returns the graphs that run on this machine, or at the endpoint of `elsewhere`."""
     place = _elsewhere.get()
-    if place is None:
-        return running()
-    endpoint, keys = place
-    reached = settings(keys, endpoint)
-    with Bus(NetworkConfig(connect=(endpoint,), zenoh=reached)) as bus:
-        deadline = time.monotonic() + ELSEWHERE_WITHIN
-        while not (answers := bus.ask(GRAPH_KEY, timeout=1.0)) and time.monotonic() < deadline:
-            time.sleep(POLL)
-    found = []
-    for answer in answers:
-        said = msgpack.unpackb(answer, raw=False)
-        graph = said["graph"]
-        at = (endpoint,)
-        found.append(RunningGraph(graph["name"], graph["namespace"], 0, 0.0, at, said["started"], graph, reached))
-    return found
+    return running() if place is None else place.graphs()
 
 
 def find_running(name: str | None, *, wait: float = 0.0) -> RunningGraph:
@@ -83,7 +130,7 @@ def find_running(name: str | None, *, wait: float = 0.0) -> RunningGraph:
         if time.monotonic() >= deadline:
             listed = ", ".join(g.name for g in graphs) or "none"
             place = _elsewhere.get()
-            where = "on this machine" if place is None else f"at {place[0]}, or these keys are not let in,"
+            where = "on this machine" if place is None else f"at {place.endpoint}, or these keys are not let in,"
             wanted = f"no graph runs {where}" if name is None else f"no graph {name!r} runs {where}"
             raise NotRunning(f"{wanted} (running: {listed}); start one with: dataflow run GRAPH")
         time.sleep(POLL)
@@ -104,8 +151,10 @@ def types_of(graph: Graph) -> TypeOf:
 
 
 def still_runs(found: RunningGraph) -> bool:
-    """Tells whether that very run goes on."""
-    return any(g.pid == found.pid and g.started == found.started for g in _graphs())
+    """Tells whether that very run goes on. Raises `Lost` for one of another machine that is not heard for too long."""
+    if (place := _elsewhere.get()) is not None:
+        return place.still_runs(found)
+    return any(g.pid == found.pid and g.started == found.started for g in running())
 
 
 @contextlib.contextmanager

@@ -46,15 +46,16 @@ class Metrics:
         self._samples.setdefault(family, []).append((labels, value))
 
     def add_graph(self, found: RunningGraph, operators: Iterable[str], statuses: Sequence[ProcessStatus]) -> None:
-        """Adds a running graph by what its processes answer."""
-        self.add("dataflow_graph_up", 1, graph=found.name)
-        self.add("dataflow_graph_started_seconds", found.started, graph=found.name)
+        """Adds a running graph by what its processes answer. The label `run` keeps runs of one graph apart."""
+        labels = {"graph": found.name, "run": str(found.pid)}
+        self.add("dataflow_graph_up", 1, **labels)
+        self.add("dataflow_graph_started_seconds", found.started, **labels)
         told = {operator: status for status in statuses for operator in status.restarts}
         for name in operators:
             status = told.get(name)
-            self.add("dataflow_operator_up", status is not None, graph=found.name, operator=name)
+            self.add("dataflow_operator_up", status is not None, **labels, operator=name)
             if status is not None:
-                self._add_operator(name, status, {"graph": found.name, "operator": name})
+                self._add_operator(name, status, {**labels, "operator": name})
 
     def _add_operator(self, name: str, status: ProcessStatus, labels: dict[str, str]) -> None:
         self.add("dataflow_restarts_total", status.restarts[name], **labels)
@@ -94,7 +95,7 @@ def collect(graphs: Iterable[RunningGraph], folders: Iterable[Path]) -> str:
         with processes_of(found) as processes:
             processes.connected(len(found.endpoints), ANSWER_WITHIN)
             metrics.add_graph(found, graph_of(found).nodes, processes.statuses(ANSWER_WITHIN))
-    for folder in folders:
+    for folder in dict.fromkeys(folders):
         if folder.exists():
             metrics.add("dataflow_disk_free_bytes", shutil.disk_usage(folder).free, folder=str(folder))
     return metrics.text()

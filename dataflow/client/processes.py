@@ -15,7 +15,7 @@ from dataflow.messages import Message
 from dataflow.transport import Bus, Envelope, Kind
 from dataflow.transport.bounded import within
 from dataflow.transport.codec import encode
-from dataflow.transport.keys import runtime_key
+from dataflow.transport.keys import local_key, runtime_key
 from dataflow.transport.publisher import BusError
 from dataflow.transport.registry import RunningGraph
 
@@ -111,7 +111,7 @@ class Processes:
         wanted = list(operators)
         key = wanted[0] if len(wanted) == 1 else "**"
         answers: dict[str, dict[str, Parameter]] = {}
-        for said in self._until(key, {"get": True}, timeout):
+        for said in self._until(runtime_key(self._namespace, "param", key), {"get": True}, timeout):
             answers[said["operator"]] = {name: Parameter(**given) for name, given in said["value"].items()}
             if answers.keys() >= set(wanted):
                 break
@@ -119,10 +119,11 @@ class Processes:
 
     def set_parameter(self, operator: str, name: str, value: Any, timeout: float) -> Any:
         """Changes a parameter; the value as the operator took it. Raises `Refused`, `NoAnswer`."""
-        return self._answered(operator, {"name": name, "value": value}, timeout, "the change is made")
+        key = runtime_key(self._namespace, "param", operator)
+        return self._answered(key, operator, {"name": name, "value": value}, timeout, "the change is made")
 
-    def _answered(self, operator: str, request: Mapping[str, Any], timeout: float, then: str) -> Any:
-        for said in self._until(operator, request, timeout):
+    def _answered(self, key: str, operator: str, request: Mapping[str, Any], timeout: float, then: str) -> Any:
+        for said in self._until(key, request, timeout):
             if not said["ok"]:
                 raise Refused(said["error"])
             return said["value"]
@@ -136,7 +137,8 @@ class Processes:
 
         Raises `Refused`, `NoAnswer`.
         """
-        return dict(self._answered(operator, {"reload": True}, timeout, "it is reloaded"))
+        key = local_key(self._namespace, "reload", operator)
+        return dict(self._answered(key, operator, {"reload": True}, timeout, "it is reloaded"))
 
     def takers(self, timeout: float) -> dict[str, Taker]:
         """The sources that take messages from outside, by name."""
@@ -155,12 +157,12 @@ class Processes:
             return int(said["stamp"])
         raise NoAnswer(f"{operator!r} did not answer within {timeout:g} s: whether it has the message is not known")
 
-    def _until(self, operator: str, request: Mapping[str, Any], timeout: float) -> Iterator[dict[str, Any]]:
+    def _until(self, key: str, request: Mapping[str, Any], timeout: float) -> Iterator[dict[str, Any]]:
         """Yields the answers to a request, which is repeated while no process takes it."""
         deadline = time.monotonic() + timeout
         payload = msgpack.packb(request)
         while (left := deadline - time.monotonic()) > 0:
-            for answer in self._bus.ask(runtime_key(self._namespace, "param", operator), payload, timeout=left):
+            for answer in self._bus.ask(key, payload, timeout=left):
                 yield msgpack.unpackb(answer, raw=False)
             time.sleep(AGAIN_AFTER)
 

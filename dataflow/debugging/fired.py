@@ -108,6 +108,37 @@ class Fired:
             "error": self.error,
         }
 
+    def as_json(self, operator: str, origin: int) -> dict[str, Any]:
+        """Returns the call of an operator as JSON values; the stamps of messages are counted from `origin` (ns)."""
+        return {
+            "operator": operator,
+            "number": self.number,
+            **self.call._asdict(),
+            "same": self.same,
+            "injected": self.injected,
+            "inputs": {name: described(value, origin) for name, value in self.inputs.items()},
+            "outputs": {m.port: {"same": m.same, "fields": [f.as_json() for f in m.fields]} for m in self.made},
+            "changed": self.changed(),
+            "error": self.error,
+            "recorded_error": self.recorded_error,
+        }
+
+
+def described(value: Any, origin: int) -> str:
+    """Returns what an input or an output holds, in words; stamps are counted from `origin` (ns)."""
+    match value:
+        case None:
+            return "nothing"
+        case Message():
+            return f"{value.SCHEMA} at {(value.stamp - origin) * 1e-9:.3f} s"
+        case Mapping():
+            return (
+                "; ".join(f"{stream}: {described(message, origin)}" for stream, message in value.items()) or "nothing"
+            )
+        case _:
+            last = f", the last {described(value[-1], origin)}" if value else ""
+            return f"{len(value):,} message{'' if len(value) == 1 else 's'}{last}"
+
 
 SPACING = 250_000_000
 """ns of CPU time of an operator between two states that are taken on the way."""

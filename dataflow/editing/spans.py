@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from dataflow.editing.joins import holding
-from dataflow.records.cuts import Held, Taken, cut_record, held_by, is_known, taken_by
+from dataflow.records.cuts import Held, Taken, code_in, cut_record, held_by, is_known, taken_by
 from dataflow.records.firing import CALLS, WITHHELD, FiringRecord
 from dataflow.records.order import Place
 from dataflow.records.reading import Repeatable
@@ -457,7 +457,7 @@ def _changed(known: Taken, record: FiringRecord, *, first: bool) -> Taken:
     """The changed parameters of an operator behind a record, of those in front of it."""
     taken = taken_by(record)
     if record.kind == "setup" and not first:
-        return Taken(True, {**known.at_setup, **known.since}, {}, None)
+        return Taken(True, {**known.at_setup, **known.since}, {}, None, code_in(record))
     if record.kind == "param" and record.outcome == "ok":
         return known._replace(since={**known.since, record.detail["name"]: record.detail["value"]})
     return known if taken is None else taken._replace(state=None)

@@ -96,12 +96,10 @@ class Judge:
         changed = [file for file, digest in now.items() if (PurePath(file).name, digest) not in known]
         self.result.files_changed = sorted(changed)
 
-    def code(self, record: FiringRecord, now: Mapping[str, str]) -> None:
+    def code(self, then: Mapping[str, str], now: Mapping[str, str]) -> None:
         """Notes modules whose code is not as recorded; a recording from before these were noted has none."""
-        then = record.detail.get("code")
-        if then is not None:
-            changed = {name for name in then.keys() | now.keys() if then.get(name) != now.get(name)}
-            self.result.code_changed = sorted(changed.union(self.result.code_changed))
+        changed = {name for name, digest in then.items() if now.get(name) != digest}
+        self.result.code_changed = sorted(changed.union(self.result.code_changed))
 
     def differ(self, record: FiringRecord, port: str, expected: str, got: str) -> None:
         """Notes one difference."""

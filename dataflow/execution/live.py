@@ -24,7 +24,7 @@ from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
 from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
-from dataflow.graph.code import ReloadError, Replaced, digest_of
+from dataflow.graph.code import ReloadError, Replaced, code_now
 from dataflow.graph.model import Node, OperatorImportError
 from dataflow.graph.sections import Snapshots
 from dataflow.operator import Operator, OperatorSpec
@@ -86,6 +86,8 @@ class LiveRunner(OperatorRunner):
         self._seen: dict[str, tuple[int, int]] = {}  # stream → incarnation, last stamp that the aligner was given
         self._jumped: dict[str, int] = {}  # producer → incarnation since its clock jumped back
         self._changed: dict[str, Any] = {}
+        self._code = code_now(type(self.operator))
+        """The code that it runs: a reload of another operator of the process changes what is imported, and not this."""
         self._told = True
         """True when the aligner may have something to decide: it was told something since it had not."""
 
@@ -251,7 +253,7 @@ class LiveRunner(OperatorRunner):
     def _start_again(self) -> None:
         """A fresh operator in the place of the failed one, with the parameters as they were last set."""
         self.restarts.begun()
-        old, self.operator = self.operator, self.node.make()
+        old, self.operator = self.operator, self._code.operator(**self.node.params)
         self.calls.operator = self.operator
         self._begin_incarnation()
         try:
@@ -259,7 +261,7 @@ class LiveRunner(OperatorRunner):
             self._change_again()
             started = time.time_ns()
             self.calls.setup()  # its static streams go on as they are
-            self.records.add_setup(self.operator, started, (None,) * len(self.ports.states))
+            self.records.add_setup(self.operator, started, (None,) * len(self.ports.states), self._code)
         except OperatorFailure as failure:
             if not self.restarts.failed():
                 raise
@@ -272,23 +274,22 @@ class LiveRunner(OperatorRunner):
         stamp = max(self.done, NEVER + 1)
         try:
             state = None if failed else self.calls.snapshot((self.records.incarnation, stamp))
-            code = Replaced(self.node)
+            code = Replaced(self.node, self._code)
         except (OperatorFailure, OperatorImportError) as error:
             raise ReloadError(str(error)) from error
         try:
-            if what := _declares_other_ports(self.spec, code.operator.spec):
+            if what := _declares_other_ports(self.spec, code.now.operator.spec):
                 raise ReloadError(f"its {what} are declared otherwise now: end the run and start it again")
-            started, calls, kept = self._set_up(code.operator, state, stamp)
+            started, calls, kept = self._set_up(code.now.operator, state, stamp)
         except Exception as error:
             code.put_back()
             raise ReloadError(str(error)) from error
         if failed:
             self.restarts.begun()
         close_quietly(self.operator)
-        self.operator, self.calls = calls.operator, calls
+        self.operator, self.calls, self._code = calls.operator, calls, code.now
         self._begin_incarnation()
-        replaced = {name: digest_of(text) for name, text in code.before.items()}
-        self.records.add_setup(self.operator, started, (None,) * len(self.ports.states), replaced)
+        self.records.add_setup(self.operator, started, (None,) * len(self.ports.states), code.now)
         if kept == KEPT_STATE:
             shown = state if state is not None and len(state) <= MAX_STATE_BYTES else None
             self.records.add("restore", stamp, started, detail={"state": shown, "before": stamp})

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dataflow.execution.ports import Emitter
-from dataflow.graph.code import code_digests
+from dataflow.graph.code import Code, code_now
 from dataflow.operator import Operator
 from dataflow.records.firing import Emission, FiringRecord, Kind, Outcome
 from dataflow.sync import NEVER, Drop, Firing, InputRef, input_refs
@@ -101,17 +101,14 @@ class FiringLog:
         operator: Operator,
         started: int,
         emissions: tuple[Emission | None, ...],
-        replaced: Mapping[str, str] | None = None,
+        code: Code | None = None,
     ) -> None:
-        """The record of `setup()`: parameters, files, code and static messages; where it begins after a reload, the
-        digests of the code `replaced`."""
+        """The record of `setup()`: parameters, files, code (by default that which is there) and static messages."""
         detail: dict[str, Any] = {
             "params": operator.params.model_dump(mode="json"),
             "files": dict(operator.files),
-            "code": code_digests(type(operator)),
+            "code": (code or code_now(type(operator))).digests,
         }
-        if replaced is not None:
-            detail["replaced"] = dict(replaced)
         self.add("setup", NEVER + 1, started, outputs=emissions, detail=detail)
 
 

@@ -19,12 +19,12 @@ from dataflow.execution.memory import WATCHED, MemoryGuard
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
 from dataflow.execution.restarts import close_quietly
-from dataflow.graph.code import code_digests, stored_operator
+from dataflow.graph.code import code_now, stored_operator
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import Operator, ParameterError
 from dataflow.records.comparison import Verification
-from dataflow.records.cuts import is_known, parameters_at, taken_by
+from dataflow.records.cuts import code_in, is_known, parameters_at, taken_by
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import Digests
 from dataflow.records.repetition import Repetition
@@ -113,7 +113,7 @@ class RecordedRunner(Runner):
             statics = self._make_anew(again[-1].incarnation)
             if again[-1].kind == "setup":
                 self.judge.statics(again[-1], statics)
-                self._look_at_code(again[-1])
+            self._look_at_code(again[-1])
         self._change(changes, again[-1].incarnation if again else 0)
         if before and is_known(last := before[-1]):
             self.calls.restore(last.detail["state"], (last.incarnation, last.stamp))
@@ -210,7 +210,8 @@ class RecordedRunner(Runner):
     def _look_at_code(self, record: FiringRecord) -> None:
         """Notes code that is not as it was, unless what a reload has replaced runs."""
         if not self._as_it_was:
-            self.judge.code(record, code_digests(type(self.operator)))
+            then = code_in(record) or {}
+            self.judge.code(then, code_now(type(self.operator), then).digests)
 
     def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
         """A fresh operator, with the parameters as they were last set; its static messages."""
@@ -228,6 +229,7 @@ class RecordedRunner(Runner):
         self.changed |= taken.at_setup
         if taken.again or self.result.verified:
             self._make_anew(record.incarnation)
+            self._look_at_code(record)
         else:
             self._change(taken.at_setup, record.incarnation)
         self._change(taken.since, record.incarnation)

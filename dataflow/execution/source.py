@@ -17,7 +17,7 @@ from dataflow.execution.generators.shared_generators import AT_WORK, SharedGener
 from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import Emitter, OutputPorts
 from dataflow.execution.work import Work
-from dataflow.graph.code import ReloadError
+from dataflow.graph.code import ReloadError, code_now
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import OutputError, Source, outputs_of
@@ -38,6 +38,7 @@ class SourceRunner:
         self.operator = node.make() if operator is None else operator
         assert isinstance(self.operator, Source)
         self.source: Source = self.operator
+        self._code = code_now(type(self.operator))
         self.ports = OutputPorts(node, self.operator.spec, emitter, lossy=live)
         self._live, self._pulled, self._tripwire = live, 0, Tripwire()
         self.refused: Counter[str] = Counter()
@@ -223,7 +224,7 @@ class SourceRunner:
         except Exception as error:  # the first failure is known
             print(f"{self.node.name}: close() after a failure: {readable(error)}", file=sys.stderr)
         try:
-            self.operator = self.node.make()
+            self.operator = self._code.operator(**self.node.params)
             assert isinstance(self.operator, Source)
             self.source = self.operator
             self._change(self._changed)
@@ -231,7 +232,7 @@ class SourceRunner:
             raise OperatorFailure(self.node.name, "construction", error) from error
         started = time.time_ns()
         Calls(self.node, self.operator, self.seed).setup()  # its static streams go on as they are
-        self.records.add_setup(self.operator, started, (None,) * len(self.ports.states))
+        self.records.add_setup(self.operator, started, (None,) * len(self.ports.states), self._code)
         self._begin_stream()
 
     def _change(self, changed: Mapping[str, Any]) -> None:

@@ -1,7 +1,7 @@
 """The code of an operator: the modules that it is made of, their digests, and how it is loaded again.
 
-Its own modules are that of its class and those that this one imports, directly or through others, as far as they are
-files outside of the standard library, of installed packages and of the engine.
+Its own modules are that of its class and those that this one imports, directly or through others, at once or in a
+function, as far as they are files outside of the standard library, of installed packages and of the engine.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ import re
 import sys
 import sysconfig
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
-from types import FunctionType, ModuleType
-from typing import TYPE_CHECKING, Any
+from types import FunctionType, ModuleType, NoneType
+from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 from dataflow.graph.model import Node, OperatorImportError, current_path, import_operator
@@ -29,19 +31,38 @@ if TYPE_CHECKING:
 _ENGINE = __name__.partition(".")[0]
 _INSTALLED = ("/site-packages/", "/dist-packages/")
 _STANDARD = tuple(f"{sysconfig.get_path(kind)}/" for kind in ("stdlib", "platstdlib"))
+_NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
+_DIGEST = re.compile("[0-9a-f]{64}")
 _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^#\n]*)|import[ \t]+([^#\n]*))", re.M)
+_FOR_TYPES = re.compile(r"^if (?:\w+\.)?TYPE_CHECKING:.*\n(?:[ \t]+.*\n|[ \t]*\n)*", re.M)
+"""Imports that a type checker makes, and no program."""
 _texts: WeakKeyDictionary[ModuleType, bytes] = WeakKeyDictionary()
 """The source of modules as they were loaded, from the first look at them on."""
-_imported: WeakKeyDictionary[ModuleType, tuple[set[str], set[str]]] = WeakKeyDictionary()
 
 
 class ReloadError(ValueError):
     """The code of an operator cannot be replaced; the message has the reason."""
 
 
-def code_digests(operator: type[Operator]) -> dict[str, str]:
-    """Returns the SHA-256 of each of an operator's own modules, as loaded, by the module's name."""
-    return {name: digest_of(_text(module)) for name, module in sorted(_own_modules(operator).items())}
+@dataclass(frozen=True)
+class Code:
+    """A class of operators, and the source of the modules that are its own, by name."""
+
+    operator: type[Operator]
+    texts: Mapping[str, bytes]
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """The SHA-256 of each module."""
+        return {name: digest_of(text) for name, text in sorted(self.texts.items())}
+
+
+def code_now(operator: type[Operator], also: Iterable[str] = ()) -> Code:
+    """Returns the code of a class: of modules that are loaded as they were then, of others as their files are.
+
+    `also`: modules that are looked at as well, where there are any of that name.
+    """
+    return Code(operator, _own_texts(operator.__module__, *also))
 
 
 def digest_of(text: bytes) -> str:
@@ -49,19 +70,24 @@ def digest_of(text: bytes) -> str:
 
 
 class Replaced:
-    """An operator's code, loaded again from its files. `before` are the texts of the modules until then."""
+    """An operator's code, loaded again from its files."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, before: Code) -> None:
         """Imports the modules of the operator whose files have changed, those that depend on them, and its own one.
 
-        Raises `ReloadError` where they declare message types, `OperatorImportError` for what fails.
+        `before`: the code that it runs. Raises `ReloadError` where they declare message types or are not its own,
+        `OperatorImportError` for what fails.
         """
-        own = _own_modules(node.operator)
-        now = {name: _read(module) for name, module in own.items()}
-        self.before = {name: _text(module) for name, module in own.items()}
-        changed = {name for name, text in now.items() if text != self.before[name]}
-        self._swap = _Swap({name: now[name] for name in _with_dependents(changed, node, own)})
-        self.operator = self._swap.load(node)
+        home, offers = before.operator.__module__, _offers(node)
+        own = _own_texts(home, offers)
+        now = {name: text for name in own if (text := _file_text(name)) is not None}
+        if home not in now:
+            raise ReloadError(f"module {home!r} is no file outside of installed packages and the engine")
+        changed = {n for n, text in now.items() if n in sys.modules and not text == own[n] == before.texts.get(n)}
+        again = _with_dependents({*changed, home, offers}, own)
+        self.before = before
+        self._swap = _Swap({name: now[name] for name in again & now.keys()})
+        self.now = code_now(self._swap.load(node))
 
     def put_back(self) -> None:
         """Makes the code before the current one again."""
@@ -71,7 +97,7 @@ class Replaced:
         """Stores the code before, by its digests, for re-executions of what it did. Raises `OSError`."""
         folder = store()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for text in self.before.values():
+        for text in self.before.texts.values():
             file = folder / digest_of(text)
             if not file.exists():
                 partial = file.with_suffix(f".{os.getpid()}")
@@ -82,33 +108,43 @@ class Replaced:
 def stored_operator(node: Node, digests: Mapping[str, str]) -> type[Operator] | None:
     """Returns the class of an operator with the code of these digests by module, out of what reloads here have stored;
     None where it is not there. The modules that others import stay as they are."""
-    own = _own_modules(node.operator)
-    differing = {n for n, digest in digests.items() if n not in own or digest_of(_text(own[n])) != digest}
+    home, offers = node.operator.__module__, _offers(node)
+    own = _own_texts(home, offers)
+    now = {**own, **code_now(node.operator, digests).texts}
+    differing = {name for name, digest in digests.items() if name not in now or digest_of(now[name]) != digest}
     if not differing:
         return node.operator
     texts = {}
     for name in differing:
-        try:
-            texts[name] = (store() / digests[name]).read_bytes()
-        except OSError:
+        text = _stored(digests[name])
+        if text is None or not _NAME.fullmatch(name) or (name in sys.modules and name not in now):
             return None
-        if digest_of(texts[name]) != digests[name]:
-            return None
-    for name in _with_dependents(differing, node, own) - differing:
-        texts[name] = _text(own[name])
+        texts[name] = text
+    again = _with_dependents({*differing, home, offers}, own)
     try:
-        swap = _Swap(texts)
+        swap = _Swap({name: own[name] for name in again & own.keys()} | texts)
         found = swap.load(node)
     except (ReloadError, OperatorImportError):  # it may need what is no longer here
         return None
     swap.put_back()
-    return found
+    return None if swap.late & differing else found
 
 
 def store() -> Path:
     """The folder of this user's code that reloads have replaced: `$XDG_DATA_HOME/dataflow/code`."""
     home = os.environ.get("XDG_DATA_HOME")
     return (Path(home) if home else Path.home() / ".local" / "share") / "dataflow" / "code"
+
+
+def _stored(digest: str) -> bytes | None:
+    """Returns what is stored under a digest, which a recording of others may hold: it may be any text."""
+    if not _DIGEST.fullmatch(digest):
+        return None
+    try:
+        text = (store() / digest).read_bytes()
+    except OSError:
+        return None
+    return text if digest_of(text) == digest else None
 
 
 class _Swap(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -118,6 +154,15 @@ class _Swap(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         """Raises `ReloadError` for modules that declare message types: objects of both classes would meet."""
         self._texts = dict(texts)
         self._before = {name: sys.modules.get(name) for name in texts}
+        places = [(sys.modules.get(package), last) for package, _, last in (name.rpartition(".") for name in texts)]
+        self._others = [
+            (package, last, other)
+            for package, last in places
+            if not isinstance(other := vars(package).get(last) if package else None, ModuleType | NoneType)
+        ]
+        """Objects of packages by the name of one of the modules, such as functions: package, name and value."""
+        self.late: set[str] = set()
+        """Those that importing the operator did not import: they are imported within a function, if at all."""
         for name, module in self._before.items():
             if declared := [] if module is None else _message_types(module):
                 raise ReloadError(
@@ -132,6 +177,10 @@ class _Swap(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         sys.meta_path.insert(0, self)
         try:
             found = import_operator(node.use)
+            self.late = self._texts.keys() - sys.modules.keys()
+            for name in sorted(self.late):
+                if self._before[name] is not None:
+                    _import(name)
         except BaseException:
             self.put_back()
             raise
@@ -149,12 +198,14 @@ class _Swap(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         self._rebind()
 
     def _rebind(self) -> None:
-        """Sets the modules as attributes of their packages, as imports do."""
-        names = [n for n in sys.modules if any(n == m or n.startswith(f"{m}.") for m in self._texts)]
-        for name in names:
+        """Sets the modules as attributes of their packages, as imports do, where nothing else has their names."""
+        for name in [n for n in sys.modules if any(n == m or n.startswith(f"{m}.") for m in self._texts)]:
             package, _, last = name.rpartition(".")
-            if package in sys.modules:
-                setattr(sys.modules[package], last, sys.modules[name])
+            holder = sys.modules.get(package)
+            if holder is not None and isinstance(vars(holder).get(last), ModuleType | NoneType):
+                setattr(holder, last, sys.modules[name])
+        for holder, last, other in self._others:
+            setattr(holder, last, other)
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if fullname not in self._texts:
@@ -174,84 +225,134 @@ class _Swap(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         _texts[module] = self._texts[name]
 
 
+def _import(name: str) -> None:
+    try:
+        importlib.import_module(name)
+    except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
+        raise ReloadError(f"cannot import {name!r}: {type(error).__name__}: {error}") from error
+
+
+class _Source(NamedTuple):
+    """An own module; the text of a package without a file is None."""
+
+    text: bytes | None
+    package: bool
+
+
+def _source(name: str) -> _Source | None:
+    """Returns an own module as it is loaded, else as its file is; None for any other."""
+    if name.partition(".")[0] in (_ENGINE, *sys.builtin_module_names) or not _NAME.fullmatch(name):
+        return None
+    module = sys.modules.get(name)
+    if module is None:
+        spec = _spec_of(name)
+        file, package = (None, False) if spec is None else (spec.origin, spec.submodule_search_locations is not None)
+    else:
+        file, package = getattr(module, "__file__", None), hasattr(module, "__path__")
+    if file is None:
+        return _Source(None, True) if package else None
+    if not file.endswith(".py") or any(part in file for part in _INSTALLED) or file.startswith(_STANDARD):
+        return None
+    return _Source(_read(file) if module is None else _text(module), package)
+
+
+def _spec_of(name: str) -> ModuleSpec | None:
+    """Finds a module without importing the packages that it is in."""
+    whole, spec, places = "", None, None
+    for part in name.split("."):
+        whole = f"{whole}.{part}" if whole else part
+        spec = PathFinder.find_spec(whole, places)
+        if spec is None:
+            return None
+        places = spec.submodule_search_locations or []
+    return spec
+
+
 def _text(module: ModuleType) -> bytes:
     if module not in _texts:
-        _texts[module] = _read(module)
+        _texts[module] = _read(module.__file__ or "") or b""
     return _texts[module]
 
 
-def _read(module: ModuleType) -> bytes:
+def _file_text(name: str) -> bytes | None:
+    module = sys.modules.get(name)
+    if module is not None:
+        return _read(module.__file__ or "")
+    source = _source(name)
+    return None if source is None else source.text
+
+
+def _read(file: str) -> bytes | None:
     try:
-        return Path(module.__file__ or "").read_bytes()
+        return Path(file).read_bytes()
     except OSError:  # deleted, or within an archive
-        return b""
+        return None
 
 
-def _own_modules(operator: type[Operator]) -> dict[str, ModuleType]:
-    """By name. Of a package through which a class or function is imported its own file alone counts."""
-    found: dict[str, ModuleType] = {}
-    ahead, followed = {operator.__module__}, set[str]()
+def _offers(node: Node) -> str:
+    """The module by which the graph names an operator: that of its class, or a package that offers it."""
+    return current_path(node.use).partition(":")[0]
+
+
+def _own_texts(home: str, *also: str) -> dict[str, bytes]:
+    """The texts by name of the own modules from `home` on, and of others. Of a package through which a class or
+    function is imported its own file alone counts."""
+    found: dict[str, bytes] = {}
+    ahead, followed, alone = {home}, set[str](), set(also)
     while ahead:
         name = ahead.pop()
         followed.add(name)
-        if (module := _own(name)) is not None:
-            used, offering = _imports(module)
-            found |= {name: module} | {n: own for n in offering if (own := _own(n)) is not None}
+        source = _source(name)
+        if source is not None and source.text is not None:
+            used, offering = _imports(name, source)
+            found[name] = source.text
+            alone |= offering
             ahead |= used - followed
-    return found
+    sources = {name: source for name in alone - found.keys() if (source := _source(name)) is not None}
+    return found | {name: source.text for name, source in sources.items() if source.text is not None}
 
 
-def _own(name: str) -> ModuleType | None:
-    module = sys.modules.get(name)
-    return module if module is not None and _is_own(name, getattr(module, "__file__", None)) else None
-
-
-def _is_own(name: str, file: str | None) -> bool:
-    if not file or not file.endswith(".py") or name.partition(".")[0] == _ENGINE:
-        return False
-    return not any(part in file for part in _INSTALLED) and not file.startswith(_STANDARD)
-
-
-def _imports(module: ModuleType) -> tuple[set[str], set[str]]:
+def _imports(name: str, source: _Source) -> tuple[set[str], set[str]]:
     """The names of the modules that a module imports, and of the packages that only offered it what others define."""
-    if module not in _imported:
-        _imported[module] = _imports_in(module)
-    return _imported[module]
-
-
-def _imports_in(module: ModuleType) -> tuple[set[str], set[str]]:
     used, offering = set[str](), set[str]()
-    here = module.__name__ if hasattr(module, "__path__") else module.__name__.rpartition(".")[0]
-    for start, names, whole in _IMPORT.findall(_text(module).decode(errors="replace")):
+    here = name if source.package else name.rpartition(".")[0]
+    values = vars(sys.modules[name]) if name in sys.modules else {}
+    for start, names, whole in _statements(source.text or b""):
         used |= {each.split()[0] for each in whole.split(",") if each.strip()}
         if not start:
             continue
         try:
-            source = importlib.util.resolve_name(start, here) if start.startswith(".") else start
+            origin = importlib.util.resolve_name(start, here) if start.startswith(".") else start
         except ImportError:  # a sentence in a docstring
             continue
-        if not hasattr(sys.modules.get(source), "__path__"):
-            used.add(source)
+        there = _source(origin)
+        if there is None or not there.package:
+            used.add(origin)
             continue
         for each in names.strip("()").split(","):
-            name, *alias = each.split()[::2] or [""]
-            value = vars(module).get((alias or [name])[0])
-            if f"{source}.{name}" in sys.modules and (value is None or isinstance(value, ModuleType)):
-                used.add(f"{source}.{name}")
-            elif isinstance(value, type | FunctionType):
+            what, *alias = each.split()[::2] or [""]
+            value = values.get((alias or [what])[0])
+            if isinstance(value, type | FunctionType):
                 used.add(value.__module__)
-                offering.add(source)
+                offering.add(origin)
+            elif isinstance(value, ModuleType | NoneType) and _source(f"{origin}.{what}") is not None:
+                used.add(f"{origin}.{what}")
             else:
-                used.add(source)
+                used.add(origin)
     return used, offering - used
 
 
-def _with_dependents(names: Iterable[str], node: Node, own: Mapping[str, ModuleType]) -> set[str]:
-    """The modules to import again: these, the operator's, the one that offers it, and what depends on them."""
-    offers = current_path(node.use).partition(":")[0]
-    own = {**own, offers: sys.modules[offers]}
-    found = {*names, node.operator.__module__, offers}
-    used = {name: set[str]().union(*_imports(module)) for name, module in own.items()}
+@lru_cache(maxsize=1024)
+def _statements(text: bytes) -> list[tuple[str, str, str]]:
+    """The imports of a module: where from and which names, or the modules."""
+    return _IMPORT.findall(_FOR_TYPES.sub("", text.decode(errors="replace")))
+
+
+def _with_dependents(found: Iterable[str], own: Mapping[str, bytes]) -> set[str]:
+    """These modules, and those of `own` that depend on them."""
+    found = set(found)
+    sources = {name: source for name in own if (source := _source(name)) is not None}
+    used = {name: set[str]().union(*_imports(name, source)) for name, source in sources.items()}
     while more := {name for name, others in used.items() if name not in found and others & found}:
         found |= more
     return found

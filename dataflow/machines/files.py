@@ -7,6 +7,7 @@ named by an absolute path must lie there already, with the same content.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import importlib.util
 import sys
@@ -73,7 +74,7 @@ def files_of(parameters: Iterable[Mapping[str, Any]], folder: Path) -> Digests:
     total = 0
     for text in sorted({text for params in parameters for text in _texts(dict(params))}):
         path = Path(text)
-        if len(text) > 4096 or "\0" in text or not (folder / path).is_file():
+        if not is_file(folder / path):
             continue
         if not path.is_absolute():
             if ".." in path.parts:
@@ -104,13 +105,23 @@ def lacking(wanted: Mapping[str, str], folder: Path) -> tuple[list[str], list[st
     sent, wrong = [], []
     for text, digest in wanted.items():
         path = inside(folder, text) if not Path(text).is_absolute() else Path(text)
-        if path.is_file() and digest_of(path) == digest:
+        if is_file(path) and digest_of(path) == digest:
             continue
         if Path(text).is_absolute():
-            wrong.append(f"{text} {'differs' if path.is_file() else 'is missing'} (only relative paths are sent)")
+            wrong.append(f"{text} {'differs' if is_file(path) else 'is missing'} (only relative paths are sent)")
         else:
             sent.append(text)
     return sent, wrong
+
+
+def is_file(path: Path) -> bool:
+    """Returns whether a file is there; what no file can be called, as any long text, is none."""
+    try:
+        return path.is_file()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return False
+        raise
 
 
 def inside(folder: Path, text: str) -> Path:
@@ -121,13 +132,13 @@ def inside(folder: Path, text: str) -> Path:
     return path
 
 
-def pieces(path: Path) -> Iterator[tuple[bytes, bool]]:
-    """Yields the content of a file in pieces, each with whether it is the last one."""
+def pieces(path: Path) -> Iterator[tuple[int, bytes, bool]]:
+    """Yields the content of a file in pieces: where each begins, its bytes, and whether it is the last one."""
     with path.open("rb") as file:
-        piece = file.read(PIECE)
+        at, piece = 0, file.read(PIECE)
         while True:
             following = file.read(PIECE)
-            yield piece, not following
+            yield at, piece, not following
             if not following:
                 return
-            piece = following
+            at, piece = at + len(piece), following

@@ -33,20 +33,26 @@ Word = tuple[str, str, dict[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Routes:
-    """The keys that pass between machines, and by key the machines that take it. `static`: those of static streams;
-    `raw`: those whose content is no envelope (firing records)."""
+    """The keys that pass between machines, and by key the machines that it comes from and those that take it. `static`:
+    those of static streams; `raw`: those whose content is no envelope (firing records)."""
 
     keys: Sequence[str]
+    makers: Mapping[str, Sequence[str]]
     takers: Mapping[str, Sequence[str]]
     static: frozenset[str]
     raw: frozenset[str]
 
     def to_json(self) -> dict[str, Any]:
-        return {"keys": self.keys, "takers": self.takers, "static": sorted(self.static), "raw": sorted(self.raw)}
+        lists = {"static": sorted(self.static), "raw": sorted(self.raw)}
+        return {"keys": self.keys, "makers": self.makers, "takers": self.takers, **lists}
 
     @staticmethod
     def from_json(data: Mapping[str, Any]) -> Routes:
-        return Routes(data["keys"], data["takers"], frozenset(data["static"]), frozenset(data["raw"]))
+        return Routes(data["keys"], data["makers"], data["takers"], frozenset(data["static"]), frozenset(data["raw"]))
+
+
+def _frame_of(word: Word) -> bytes:
+    return _KEY.pack(_CONTROL) + msgpack.packb(word, use_bin_type=True)
 
 
 class Gate:
@@ -81,7 +87,11 @@ class Gate:
                 self._take_rings()
                 self.inbox.put(("say on", machine, word))
             case ("say on", machine, word):
-                self._pipes[machine].send(_KEY.pack(_CONTROL) + msgpack.packb(word, use_bin_type=True))
+                self._pipes[machine].send(_frame_of(word))
+
+    def say_now(self, machine: str, word: Word) -> None:
+        """Sends a control message that is soon out of date ahead of all that waits; it may be lost. On any thread."""
+        self._pipes[machine].send_with_beat(_frame_of(word))
 
     def _take_rings(self) -> None:
         """Takes what is in the rings into the inbox: what processes had sent before they reported something."""
@@ -149,9 +159,11 @@ class Gate:
                 self._said(machine, (label, kind, fields))
                 return
             key = self._routes.keys[number]
+            if machine not in self._routes.makers.get(key, ()):
+                raise ValueError(f"it does not make {key}")
             payload = frame[_KEY.size :]
             head = None if key in self._routes.raw else decode_head(payload)
-        except (DecodeError, ValueError, IndexError, struct.error) as error:
+        except (DecodeError, ValueError, TypeError, LookupError, struct.error) as error:
             self.malformed += 1
             print(f"dropped a malformed frame from machine {machine!r}: {error}", file=sys.stderr)
             return

@@ -16,7 +16,7 @@ import msgpack
 import zenoh
 
 from dataflow.machines.gate import Gate, Routes, Word
-from dataflow.machines.keys import GRAPH_KEY, KEYS, access, settings
+from dataflow.machines.keys import GRAPH_KEY, KEYS, OVER_KEY, access, settings
 from dataflow.machines.pipe import AWAY_AFTER, Pipe
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.streams.inbox import Inbox
@@ -66,6 +66,31 @@ def router(listen: Sequence[str], connect: Sequence[str], more: Mapping[str, Any
     return Bus(NetworkConfig(tuple(listen), tuple(connect), exposed=True, zenoh={**common, **more}))
 
 
+class Claims:
+    """Which agent each machine of a run is: the first that came, as long as it is there."""
+
+    def __init__(self, run: str) -> None:
+        self._run = run
+        self._agents: dict[str, tuple[bytes, float]] = {}  # by machine, its agent, and when that last said hello
+
+    def answer(self, name: str, agent: bytes, run: str, silence: float | None, now: float) -> str:
+        """Returns what an agent's hello calls for: "offer" it the run, "busy" with another run, "another" agent of that
+        name, one that has left the run or was started "anew", or "" for nothing.
+
+        `run`: that which it takes part in; `silence` (s): that of the machine's pipe, None if it was never heard.
+        """
+        first, said_at = self._agents.get(name, (agent, now))
+        left = silence is not None and silence > AWAY_AFTER
+        if first != agent and not left and (silence is not None or now - said_at < AWAY_AFTER):
+            return "another"
+        if left and (first != agent or run != self._run):
+            return "anew"
+        self._agents[name] = (agent, now)
+        if run == self._run:
+            return ""
+        return "busy" if run else "offer"
+
+
 class Hub:
     """Runs the link until it is told to leave."""
 
@@ -79,7 +104,7 @@ class Hub:
         self.config, self._channel, self._inbox = config, channel, inbox
         self._fanout = Fanout(outgoing, pool_bytes=POOL_BYTES)
         self._up = dict.fromkeys(config.machines, False)
-        self._agents: dict[str, bytes] = {}
+        self._claims = Claims(config.run)
         self._reported = 0.0
         self._left = False
 
@@ -110,7 +135,8 @@ class Hub:
             )
             for name in config.machines
         ]
-        described = msgpack.packb({"graph": dict(config.graph), "started": time.time()}, use_bin_type=True)
+        self._started = time.time()
+        described = msgpack.packb({"graph": dict(config.graph), "started": self._started}, use_bin_type=True)
         self._bus.serve(GRAPH_KEY, lambda query: query.reply(GRAPH_KEY, described))
         key = runtime_key(config.namespace, "machines")
         self._bus.serve(key, lambda query: query.reply(key, msgpack.packb(self._states())))
@@ -137,6 +163,8 @@ class Hub:
                 word = (fields["label"], fields["kind"], fields["fields"])
                 self._gate.handle(("say", fields["machine"], word))
             case ("control", "leave", _):
+                self._inbox.put(("leave",))  # behind the words that are on their way to the pipes
+            case ("leave",):
                 self._left = True
             case ("control", "lost", _):
                 raise ChannelClosed("the supervisor is gone")
@@ -146,20 +174,18 @@ class Hub:
                 self._gate.handle(item)
 
     def _meet(self, name: str, said: bytes) -> None:
-        """Offers the run to an agent that has none; a second agent of that name is named, and gets nothing."""
+        """Offers the run to an agent that has none; one that gets nothing is reported."""
         try:
             hello = msgpack.unpackb(said, raw=False)
             agent, run = hello["agent"], hello["run"]
         except (ValueError, TypeError, KeyError):
             return  # no agent of ours
-        if self._agents.setdefault(name, agent) != agent:
-            gone = self._pipes[name].heard and self._pipes[name].silence > AWAY_AFTER
-            self._channel.send("anew" if gone else "another", machine=name)
-        elif run == "":
+        pipe = self._pipes[name]
+        answer = self._claims.answer(name, agent, run, pipe.silence if pipe.heard else None, time.monotonic())
+        if answer in ("offer", "busy"):
             self._offers[name].put(msgpack.packb({"run": self.config.run}))
-        elif run != self.config.run:
-            self._offers[name].put(msgpack.packb({"run": self.config.run}))
-            self._channel.send("busy", machine=name)
+        if answer not in ("", "offer"):
+            self._channel.send(answer, machine=name)
 
     def _said(self, machine: str, word: Word) -> None:
         """Passes on a word of an agent. What its process had sent before it closed has arrived first."""
@@ -199,6 +225,7 @@ class Hub:
 
     def close(self) -> dict[str, Any]:
         """Ends the pipes, once agents have taken what was said last (bounded), and the session."""
+        self._bus.session.put(OVER_KEY, msgpack.packb(self._started))
         for pipe in self._pipes.values():
             pipe.close(LEAVE_WITHIN if pipe.heard and pipe.silence < AWAY_AFTER else 0.0)
         self._bus.close()

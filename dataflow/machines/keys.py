@@ -7,20 +7,26 @@ it.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from dataflow.transport import NetworkError
+from dataflow.transport.keys import local_key, runtime_key
 
 TOOLS = "dataflow tools"
 KEYS = "dataflow-machines"
 """The first chunk of the keys of agents and their runs."""
 GRAPH_KEY = f"{KEYS}/graph"
 """Answers tools on other machines which graph runs."""
+OVER_KEY = f"{GRAPH_KEY}/over"
+"""Tells them when a run is over: by when it was started."""
+CONNECT_WITHIN = 3000
+"""Milliseconds that a tool tries to reach another machine."""
 DAYS = 3650
 _AUTHORITY, _CERTIFICATE, _KEY = "authority.pem", "certificate.pem", "key.pem"
 _AUTHORITY_KEY = "authority.key"
@@ -35,9 +41,9 @@ def new_authority(folder: Path) -> None:
     """Makes a folder with a new authority, which issues keys. Raises `KeysError` where there is one."""
     if (folder / _AUTHORITY_KEY).exists():
         raise KeysError(f"{folder} has an authority already: keys that it issued would be worthless with another")
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    made = ("-keyout", str(folder / _AUTHORITY_KEY), "-out", str(folder / _AUTHORITY))
-    _openssl("req", "-x509", *_CURVE, "-days", str(DAYS), "-subj", "/CN=dataflow authority", *made)
+    with _made_for(folder) as scratch:
+        made = ("-keyout", str(scratch / _AUTHORITY_KEY), "-out", str(scratch / _AUTHORITY))
+        _openssl("req", "-x509", *_CURVE, "-days", str(DAYS), "-subj", "/CN=dataflow authority", *made)
 
 
 def issue(authority: Path, folder: Path, name: str, *, serves: Iterable[str] = ()) -> None:
@@ -50,21 +56,31 @@ def issue(authority: Path, folder: Path, name: str, *, serves: Iterable[str] = (
         raise KeysError(f"{authority} has no {_AUTHORITY_KEY}; make an authority with: dataflow keys new {authority}")
     if (folder / _KEY).exists():
         raise KeysError(f"{folder} has keys already; name another folder")
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     served = list(serves)
     usage = "serverAuth,clientAuth" if served else "clientAuth"
     extensions = [f"extendedKeyUsage={usage}", "basicConstraints=CA:FALSE"]
     if served:
         extensions.append("subjectAltName=" + ",".join(f"{'IP' if _is_ip(s) else 'DNS'}:{s}" for s in served))
-    with tempfile.TemporaryDirectory() as scratch:
+    with _made_for(folder) as made, tempfile.TemporaryDirectory() as scratch:
         request, wanted = Path(scratch, "request"), Path(scratch, "extensions")
         wanted.write_text("\n".join(extensions) + "\n")
         subject = f"/CN={name}"
-        _openssl("req", "-new", *_CURVE, "-subj", subject, "-keyout", str(folder / _KEY), "-out", str(request))
+        _openssl("req", "-new", *_CURVE, "-subj", subject, "-keyout", str(made / _KEY), "-out", str(request))
         by = ("-CA", str(authority / _AUTHORITY), "-CAkey", str(authority / _AUTHORITY_KEY), "-CAcreateserial")
-        out = ("-extfile", str(wanted), "-out", str(folder / _CERTIFICATE), "-days", str(DAYS))
+        out = ("-extfile", str(wanted), "-out", str(made / _CERTIFICATE), "-days", str(DAYS))
         _openssl("x509", "-req", "-in", str(request), *by, *out)
-    (folder / _AUTHORITY).write_bytes((authority / _AUTHORITY).read_bytes())
+        (made / _AUTHORITY).write_bytes((authority / _AUTHORITY).read_bytes())
+
+
+@contextlib.contextmanager
+def _made_for(folder: Path) -> Iterator[Path]:
+    """Gives a folder to make keys in, whose files are moved to `folder` when all of them are made."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+        yield Path(scratch)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        for path in Path(scratch).iterdir():
+            path.replace(folder / path.name)
 
 
 def _is_ip(address: str) -> bool:
@@ -84,7 +100,13 @@ def _openssl(*words: str) -> None:
         os.umask(before)
 
 
-def settings(keys: Path | None, endpoint: str, *, tools: bool = False) -> dict[str, Any]:
+def tool_settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
+    """Returns the settings of a tool at such an endpoint: routers carry nothing from one peer to another, so it is a
+    client, which is opened when it is connected (bounded). Raises `NetworkError` as `settings`."""
+    return {"mode": "client", "connect/timeout_ms": CONNECT_WITHIN, **settings(keys, endpoint)}
+
+
+def settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
     """Returns the settings of Zenoh for an endpoint between machines. Raises `NetworkError` where it would be open.
 
     Without keys only a Unix socket is allowed: any user of a machine can reach its loopback.
@@ -111,22 +133,36 @@ def settings(keys: Path | None, endpoint: str, *, tools: bool = False) -> dict[s
 
 
 def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
-    """Returns the access control of a supervisor's machine: a machine gets its own keys, machines and tools
-    the graph's streams and requests, and every other certificate nothing."""
-    every = ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"]
-    every += ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
+    """Returns the access control of a supervisor's machine: a machine gets its own keys and what its processes answer
+    with, tools ask and follow, and every other certificate gets nothing. What is kept from other machines lies at
+    `local_key`s, which its own tools ask for."""
+    asking = ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"]
+    answering = ["put", "reply", "declare_queryable", "liveliness_token"]
+    every = [*asking, *answering, "delete"]
     both = {"permission": "allow", "flows": ["ingress", "egress"], "messages": every}
-    open_to_all = [f"{namespace}/**", *_runtime_keys(namespace), GRAPH_KEY]
-    rules = [{"id": "graph", **both, "key_exprs": open_to_all}, {"id": "all", **both, "key_exprs": ["**"]}]
+    graph = [f"{namespace}/**", *_runtime_keys(namespace)]
+    taps = [runtime_key(namespace, kind, "**") for kind in ("taps", "ack")]
+    comes = {"permission": "allow", "flows": ["ingress"]}
+    goes = {"permission": "allow", "flows": ["egress"], "messages": every}
+    here = local_key(namespace, "**")
+    rules = [
+        {"id": "asks", **comes, "messages": asking, "key_exprs": [*graph, GRAPH_KEY, OVER_KEY]},
+        {"id": "taps", **comes, "messages": answering, "key_exprs": taps},
+        {"id": "follows", **goes, "key_exprs": [*graph, GRAPH_KEY, OVER_KEY]},
+        {"id": "answers", **comes, "messages": answering, "key_exprs": [*graph, here]},
+        {"id": "is asked", **goes, "key_exprs": [here]},
+        {"id": "all", **both, "key_exprs": ["**", *graph, here]},
+    ]
+    tools = ["asks", "taps", "follows"]
     subjects = [
         {"id": "tools", "cert_common_names": [TOOLS]},
         {"id": "here", "link_protocols": ["unixsock-stream"]},
     ]
-    policies = [{"rules": ["graph"], "subjects": ["tools"]}, {"rules": ["all", "graph"], "subjects": ["here"]}]
+    policies = [{"rules": tools, "subjects": ["tools"]}, {"rules": ["all"], "subjects": ["here"]}]
     for name in machines:
         rules.append({"id": name, **both, "key_exprs": [f"{KEYS}/machine/{name}/**"]})
         subjects.append({"id": name, "cert_common_names": [name]})
-        policies.append({"rules": [name, "graph"], "subjects": [name]})
+        policies.append({"rules": [name, *tools, "answers", "is asked"], "subjects": [name]})
     return {
         "access_control": {
             "enabled": True,
@@ -140,4 +176,4 @@ def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
 
 def _runtime_keys(namespace: str) -> list[str]:
     """Returns the keys of requests: `**` matches no verbatim chunk."""
-    return [f"{namespace}/@/**", f"{namespace}/**/@/**"]
+    return [runtime_key(namespace, "**"), runtime_key(f"{namespace}/**", "**")]

@@ -4,7 +4,8 @@ Frames are numbered. Zenoh keeps their order on one link, and a link that resets
 sees the next number (or the sender's mark) ahead of what it expects, and asks for everything from there on, as a new
 *round*. Frames of earlier rounds that are still on their way are ignored, so nothing is resent because a link is slow.
 Beats go both ways besides, of a higher priority: what was taken, the round that is wanted, and the time, by which the
-offset of the other machine's clock is measured (as NTP does, from the exchange with the shortest delay).
+offset of the other machine's clock is measured (as NTP does, from the exchange with the shortest delay). A word that
+is soon out of date may go with a beat: it overtakes the frames, and is lost with a link.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ class Pipe:
         self._changed = threading.Condition()
         self._waiting: deque[tuple[bytes, bool]] = deque()
         self._waiting_bytes = 0
+        self._look_beyond = 0  # bytes that wait before what waits is looked at again: much of it may not be dropped
         self._sent: deque[bytes] = deque()
         self._sent_bytes = 0
         self._base, self._next = 0, 0  # numbers: of the first frame in `_sent`, and of the next one to go out (again)
@@ -97,9 +99,13 @@ class Pipe:
         with self._changed:
             self._waiting.append((frame, droppable))
             self._waiting_bytes += len(frame)
-            if self.bounded and self._waiting_bytes > MOST_WAITING:
+            if self.bounded and self._waiting_bytes > max(MOST_WAITING, self._look_beyond):
                 self._drop_oldest()
             self._changed.notify_all()
+
+    def send_with_beat(self, word: bytes) -> None:
+        """Sends a frame ahead of all that waits; it may be lost. On any thread."""
+        self._beat(word)
 
     @property
     def heard(self) -> bool:
@@ -131,14 +137,17 @@ class Pipe:
     # Out
 
     def _drop_oldest(self) -> None:
+        """Drops down to nine tenths of the bound, so that the next frames need no look at all that waits."""
+        room = MOST_WAITING // 10
         kept: deque[tuple[bytes, bool]] = deque()
         for frame, droppable in self._waiting:
-            if droppable and self._waiting_bytes > MOST_WAITING:
+            if droppable and self._waiting_bytes > MOST_WAITING - room:
                 self._waiting_bytes -= len(frame)
                 self.dropped += 1
             else:
                 kept.append((frame, droppable))
         self._waiting = kept
+        self._look_beyond = self._waiting_bytes + room
 
     def _send_frames(self) -> None:
         while True:
@@ -164,6 +173,7 @@ class Pipe:
         if self._next == self._base + len(self._sent):
             frame, _ = self._waiting.popleft()
             self._waiting_bytes -= len(frame)
+            self._look_beyond = min(self._look_beyond, self._waiting_bytes + MOST_WAITING // 10)
             self._sent.append(frame)
             self._sent_bytes += len(frame)
         number, self._next = self._next, self._next + 1
@@ -202,19 +212,21 @@ class Pipe:
 
     def _on_beat(self, sample: Any) -> None:
         data, now = sample.payload.to_bytes(), time.time_ns()
-        if len(data) != _BEAT.size or self._closed:
+        if len(data) < _BEAT.size or self._closed:
             return
-        wanted, taken, sent_at, ours, taken_at = _BEAT.unpack(data)
+        wanted, taken, sent_at, ours, taken_at = _BEAT.unpack_from(data)
         self._heard_at = time.monotonic()
         self._heard = (sent_at, now)
         if ours:
             self.clocks.exchanged(ours, taken_at, sent_at, now)
         self._taken(taken, wanted)
+        if word := data[_BEAT.size :]:
+            self._take(word)
 
-    def _beat(self) -> None:
+    def _beat(self, word: bytes = b"") -> None:
         self._unsaid = 0
         try:
-            self._beats.put(_BEAT.pack(self._wanted, self._expected, time.time_ns(), *self._heard))
+            self._beats.put(_BEAT.pack(self._wanted, self._expected, time.time_ns(), *self._heard) + word)
         except zenoh.ZError:  # the session is being closed
             self._closed = True
 

@@ -303,8 +303,8 @@ class OperatorProcess:
             self.live.take(item[1], item[2], item[3])
         elif kind == "source_failed":
             self.live.failed(item[1], item[2])
-        elif kind == "param":
-            self.requests.answer_parameter(item[1], item[2])
+        elif kind in ("param", "reload"):
+            self.requests.answer_parameter(item[1], item[2], here=kind == "reload")
         elif kind == "playback":
             self.requests.answer_playback(item[2])
 

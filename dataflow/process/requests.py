@@ -23,7 +23,7 @@ from dataflow.remote import Remote
 from dataflow.transport import Bus
 from dataflow.transport.codec import decode
 from dataflow.transport.envelope import DecodeError
-from dataflow.transport.keys import runtime_key
+from dataflow.transport.keys import local_key, runtime_key
 
 LIVE = "it is a live run: devices and the clock do not wait; runs without --live, and replays, can be paused"
 
@@ -51,6 +51,7 @@ class Requests:
         """Declares what is answered."""
         for name in self._config.nodes:
             bus.serve(runtime_key(namespace, "param", name), _to_inbox(inbox, name))
+            bus.serve(local_key(namespace, "reload", name), _to_inbox(inbox, name, "reload"))
         for maker in self._driver.sources:
             if isinstance(maker.source, Remote):
                 bus.serve(runtime_key(namespace, "pub", maker.node.name), partial(self.answer_publication, maker))
@@ -67,15 +68,18 @@ class Requests:
         playback = self._feeding.playback
         self._channel.send("playback", paused=playback.paused, speed=playback.speed)
 
-    def answer_parameter(self, name: str, query: Any) -> None:
+    def answer_parameter(self, name: str, query: Any, *, here: bool = False) -> None:
         """Answers a request to change a parameter with the value as validated, or with an error.
 
         A request `{"get": true}` is answered with the values of all, and whether they can change now; with
-        `{"reload": true}` the operator goes on with its code as it is in its files now (`Runner.reload`).
+        `{"reload": true}`, from `here` alone, the operator goes on with its code as it is in its files now
+        (`Runner.reload`).
         """
         with query:
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
+                if asked.get("reload") and not here:
+                    raise ValueError("only a tool of this machine can have code loaded again")
                 value = self._value_asked(self._driver[name], asked)
                 answer = {"ok": True, "operator": name, "value": value}
             except (ParameterError, KeyError, TypeError, ValueError, AttributeError) as error:

@@ -5,6 +5,7 @@ The detail of a `cut` record holds
 - `left_out`: how many calls were left out just before it; absent where none were;
 - `state`: the operator's state there, packed; absent where it is not known;
 - `params`: the parameters that were changed by then: [before the last `setup()`, since];
+- `code`: the digests, by module, of the code that it ran since its last `setup()`, where that is left out;
 - `again`: whether the operator had been set up more than once by then;
 - `held`: messages of the operator that the part holds although the calls that made them are not in it:
   [stream, incarnation, seq, stamp, digest] each.
@@ -37,12 +38,14 @@ class Held(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """Place where an operator is to be taken up: its changed parameters, and its state (None: not known)."""
+    """Place where an operator is to be taken up: its changed parameters, its state (None: not known), and the code of
+    its last `setup()` if that is left out."""
 
     again: bool
     at_setup: Mapping[str, Any]
     since: Mapping[str, Any]
     state: bytes | None
+    code: Mapping[str, str] | None = None
 
 
 def cut_record(
@@ -54,6 +57,8 @@ def cut_record(
         detail |= {"left_out": left_out, "again": taken.again, "params": [dict(taken.at_setup), dict(taken.since)]}
         if taken.state is not None:
             detail["state"] = taken.state
+        if taken.code is not None:
+            detail["code"] = dict(taken.code)
     return FiringRecord(before.operator, before.incarnation, before.index, "cut", stamp, detail=detail)
 
 
@@ -70,7 +75,15 @@ def taken_by(record: FiringRecord) -> Taken | None:
     if record.kind != "cut" or "left_out" not in detail:  # that of a snapshot is the size of one too large to be kept
         return None
     at_setup, since = detail["params"]
-    return Taken(bool(detail["again"]), at_setup, since, detail.get("state"))
+    return Taken(bool(detail["again"]), at_setup, since, detail.get("state"), code_in(record))
+
+
+def code_in(record: FiringRecord) -> Mapping[str, str] | None:
+    """Returns the digests, by module, of the code that an operator ran from here on; None where the record has none."""
+    code = record.detail.get("code")
+    if not isinstance(code, Mapping) or not all(isinstance(word, str) for pair in code.items() for word in pair):
+        return None
+    return code
 
 
 def parameters_at(records: Iterable[FiringRecord]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from dataflow.records.cuts import Knowledge, is_known
+from dataflow.records.cuts import Knowledge, code_in, is_known
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import Repeatable, note_taken
 from dataflow.sync import Uses
@@ -38,13 +38,12 @@ class Repetition:
         self.calls = self.lost = self.unknown = 0
         self.uses = Uses()
         self.needed: dict[str, tuple[int, int]] = {}
-        self._replaced: dict[int, Mapping[str, str]] = {}
+        self._code: dict[int, Mapping[str, str]] = {}
 
     def code_of(self, incarnation: int) -> Mapping[str, str] | None:
-        """Returns the digests, by module, of the code that an incarnation ran, where a reload has replaced it since;
-        else None."""
-        after = [at for at in self._replaced if at > incarnation]
-        return self._replaced[min(after)] if after else None
+        """Returns the digests, by module, of an incarnation's code where that of the last one differs; else None."""
+        at = max((each for each in self._code if each <= incarnation), default=None)
+        return None if at is None or self._code[at] == self._code[max(self._code)] else self._code[at]
 
     def __iter__(self) -> Iterator[FiringRecord]:
         knowledge = Knowledge()
@@ -77,8 +76,8 @@ class Repetition:
                 self.began = "stateless" if self._stateless else "snapshot"
         knowledge = Knowledge()
         for number, record in self._numbered():
-            if "replaced" in record.detail:
-                self._replaced[record.incarnation] = record.detail["replaced"]
+            if (code := code_in(record)) is not None:
+                self._code[record.incarnation] = code
             if number is None:
                 self.lost += record.kind in CALLS
             elif number < 0:

@@ -434,6 +434,6 @@ WantedBy=multi-user.target
 """)
 
 SERVICE_FILES = Template("""\
-# systemd-tmpfiles: deletes recordings of $name older than $days days; a run itself bounds its files
-d $out - - - ${days}d
+# systemd-tmpfiles: deletes recordings of $name older than $days days, and makes no folder; a run bounds its files
+e $out - - - ${days}d
 """)

@@ -7,6 +7,7 @@ the supervisor is not heard for too long.
 from __future__ import annotations
 
 import contextlib
+import gc
 import math
 import os
 import queue
@@ -99,6 +100,7 @@ class Agent:
                     time.sleep(TICK)
                     continue
                 self._run, self._offered = self._offered, ""
+                gc.collect()  # the links of the stay before, whose pipe refers to it
                 Stay(self, bus, self._run, reserved.endpoints[0]).last()
                 self._over.add(self._run)
                 self._run = ""
@@ -153,7 +155,8 @@ class Stay:
         self._pipe = Pipe(
             bus, machine_key(agent.name, run, "up"), machine_key(agent.name, run, "down"), self._came, bounded=False
         )
-        self._gate = self._gate_of(Inbox(), Fanout([]), Routes([], {}, frozenset(), frozenset()))
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._gate = self._gate_of(Inbox(self._wake), Fanout([]), Routes([], {}, {}, frozenset(), frozenset()))
 
     def _gate_of(self, inbox: Inbox, fanout: Fanout, routes: Routes) -> Gate:
         return Gate(inbox, fanout, {SUPERVISOR: self._pipe}, routes, self._heard)
@@ -162,30 +165,36 @@ class Stay:
         """Does what the supervisor orders until the run is over, or it is not heard any more."""
         with adopting(), contextlib.ExitStack() as stack:
             self._stack = stack
-            for each in (self._woken, self._waking):
+            for each in (self._woken, self._waking, self._wake):
                 stack.callback(os.close, each)
+            stack.callback(self._gate.inbox.close)
             self._clock = AwakeClock()
             self._selector = stack.enter_context(selectors.DefaultSelector())
             self._selector.register(self._woken, selectors.EVENT_READ, None)
             carrying = threading.Thread(target=self._carry, name="gate", daemon=True)
             carrying.start()
-            stack.callback(carrying.join, LEAVE_WITHIN)
-            began = time.monotonic()
-            stopped_at = math.inf
-            while not self._over:
-                self._turn()
-                now = time.monotonic()
-                if self._agent.stopped and stopped_at == math.inf:
-                    stopped_at = now
-                    self._say("", "failed", why="its agent was stopped")
-                silence = self._pipe.silence if self._pipe.heard else now - began
-                if now - stopped_at > END_WITHIN:
-                    break
-                if silence > self._agent.patience or (self._agent.wanted_elsewhere and silence > AWAY_AFTER):
-                    self._agent.notice(f"the supervisor was not heard for {silence:.0f} s: its operators are ended")
-                    break
-            self._over = True
-        self._pipe.close()
+            try:
+                self._take_part()
+            finally:
+                self._over = True
+                carrying.join(LEAVE_WITHIN)
+                self._pipe.close()  # nothing is carried any more when the links close
+
+    def _take_part(self) -> None:
+        began = time.monotonic()
+        stopped_at = math.inf
+        while not self._over:
+            self._turn()
+            now = time.monotonic()
+            if self._agent.stopped and stopped_at == math.inf:
+                stopped_at = now
+                self._say("", "failed", why="its agent was stopped")
+            silence = self._pipe.silence if self._pipe.heard else now - began
+            if now - stopped_at > END_WITHIN:
+                break
+            if silence > self._agent.patience or (self._agent.wanted_elsewhere and silence > AWAY_AFTER):
+                self._agent.notice(f"the supervisor was not heard for {silence:.0f} s: its operators are ended")
+                break
 
     def _turn(self) -> None:
         for key, mask in self._selector.select(TICK):
@@ -259,10 +268,11 @@ class Stay:
         path = files.inside(self._agent.folder, fields["path"])
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(path.name + ".part")
-        with part.open("ab") as file:
-            if file.tell() + len(fields["data"]) > files.MOST_SENT:
-                raise files.FilesError(f"file {fields['path']!r} has more than {files.MOST_SENT / 1e9:.1f} GB")
+        if fields["at"] + len(fields["data"]) > files.MOST_SENT:
+            raise files.FilesError(f"file {fields['path']!r} has more than {files.MOST_SENT / 1e9:.1f} GB")
+        with part.open("ab" if fields["at"] else "wb") as file:
             file.write(fields["data"])
+        self._say("", "took")
         if not fields["last"]:
             return
         if files.digest_of(part) != fields["digest"]:
@@ -273,6 +283,9 @@ class Stay:
     def _begin(self) -> None:
         """Makes the links of the processes here, and is ready to start them."""
         wanted, stack = self._wanted, self._stack
+        lacks, _ = files.lacking(wanted["files"], self._agent.folder)
+        if lacks:
+            raise files.FilesError(f"files did not arrive: {', '.join(lacks)}")
         graph = Graph.from_json(wanted["graph"])
         processes = {fields["label"]: ProcessPlan(**fields) for fields in wanted["processes"]}
         gate = wanted["gate"]["label"]
@@ -281,7 +294,10 @@ class Stay:
         stack.callback(rings.close)
         given = take_descriptors(rings.handed(gate), wanted["gate"])
         fanout = Fanout(given.outgoing, pool_bytes=POOL_BYTES)
-        self._gate = self._gate_of(Inbox(given.wake, given.incoming), fanout, Routes.from_json(wanted["routes"]))
+        stack.callback(fanout.close)
+        inbox = Inbox(given.wake, given.incoming)
+        stack.callback(inbox.close)
+        self._gate = self._gate_of(inbox, fanout, Routes.from_json(wanted["routes"]))
         reserved = stack.enter_context(contextlib.closing(reserve_endpoints(len(processes))))
         self._endpoints = dict(zip(processes, reserved.endpoints, strict=True))
         nursery = Nursery(environment(graph.threads))
@@ -307,6 +323,8 @@ class Stay:
 
     def _feed(self, event: events.Event) -> None:
         match event:
+            case events.Said(label, "beat", fields):  # behind a slow link's messages it would come too late
+                self._gate.say_now(SUPERVISOR, (label, "said", {"kind": "beat", "fields": dict(fields)}))
             case events.Said(label, kind, fields):
                 self._say(label, "said", kind=kind, fields=dict(fields))
             case events.HungUp(label):

@@ -7,7 +7,7 @@ that differs ends the run, files that it lacks are sent.
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,12 @@ from dataflow.supervision.core import events
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.plan import LINK, Meeting, ProcessPlan, RunPlan
 from dataflow.supervision.rings import Pairs, gate_of
+
+PIECES_ON_THE_WAY = 4
+"""Pieces of files that were sent to a machine before it took the first of them."""
+
+OF_THE_AGENT = ("differs", "lacks", "took", "ready", "left", "failed")
+"""The words that are about a machine as a whole."""
 
 
 class Remote:
@@ -51,6 +57,10 @@ class Remote:
         self._machines = sorted(set(self.machine_of.values()))
         self._missing: dict[str, str] = dict.fromkeys(self._machines, "did not join")
         """By machine, why the run cannot begin yet."""
+        self._files: dict[str, files.Digests] = {}
+        self._pieces: dict[str, Iterator[dict[str, Any]]] = {}
+        self.taken = 0
+        """Pieces of files that machines took."""
         self._noted: set[str] = set()
         self._ending = False
         self.ended = False
@@ -79,16 +89,19 @@ class Remote:
         one that others send to."""
         graph = self._plan.graph
         takers: dict[str, list[str]] = {}
-        for (maker, _), keys in self._pairs.items():
+        makers: dict[str, list[str]] = {}
+        for (maker, taker), keys in self._pairs.items():
             for machine in ("", *self._machines):
-                if maker == gate_of(machine or None):
+                gate, found = gate_of(machine or None), takers if maker == gate_of(machine or None) else makers
+                if gate in (maker, taker):
                     for key in keys:
-                        takers.setdefault(key, []).append(machine)
+                        found.setdefault(key, []).append(machine)
         raw = frozenset(firings_key(graph.namespace, node) for node in graph.nodes)
         takers = {key: sorted(set(machines)) for key, machines in takers.items()}
         if of:
             takers = {key: [""] if set(machines) - {of} else [] for key, machines in takers.items()}
-        return Routes(sorted(takers), takers, graph.static & takers.keys(), raw & takers.keys())
+            makers = {key: [""] for key in takers}
+        return Routes(sorted(takers), makers, takers, graph.static & takers.keys(), raw & takers.keys())
 
     # Before the run
 
@@ -115,7 +128,7 @@ class Remote:
         gate = gate_of(machine)
         wanted = environment(graph.threads)
         try:
-            self._files = files.files_of((node.params for node in nodes), Path.cwd())
+            self._files[machine] = files.files_of((node.params for node in nodes), Path.cwd())
         except files.FilesError as error:
             raise RunFailed(str(error)) from error
         self._missing[machine] = "is being given its files"
@@ -124,7 +137,7 @@ class Remote:
             "prepare",
             code=files.code_of(node.use for node in nodes),
             python=files.python(),
-            files=self._files,
+            files=self._files[machine],
             uses=[node.use for node in nodes],
             graph=graph.to_json() | {"network": asdict(Network())},
             processes=[asdict(self._processes[label]) for label in labels],
@@ -136,10 +149,30 @@ class Remote:
         )
 
     def _send_files(self, machine: str, lacking: list[str]) -> None:
-        for text in lacking:
-            for data, last in files.pieces(Path.cwd() / text):
-                self._say(machine, "file", path=text, data=data, last=last, digest=self._files[text])
-        self._say(machine, "begin")
+        """Begins to send what a machine lacks: a few pieces, then one more for each that it took."""
+        digests = self._files.get(machine, {})
+        if unknown := [text for text in lacking if Path(text).is_absolute() or text not in digests]:
+            raise RunFailed(f"machine {machine!r} asks for files that it was not offered: {', '.join(unknown)}")
+        self._pieces[machine] = (
+            {"path": text, "at": at, "data": data, "last": last, "digest": digests[text]}
+            for text in lacking
+            for at, data, last in files.pieces(Path.cwd() / text)
+        )
+        for _ in range(PIECES_ON_THE_WAY):
+            self._send_piece(machine)
+
+    def _send_piece(self, machine: str) -> None:
+        if (pieces := self._pieces.get(machine)) is None:
+            return
+        try:
+            piece = next(pieces, None)
+        except OSError as error:
+            raise RunFailed(f"a file for machine {machine!r} cannot be read: {error}") from error
+        if piece is not None:
+            self._say(machine, "file", **piece)
+        else:
+            del self._pieces[machine]
+            self._say(machine, "begin")
 
     # Orders
 
@@ -174,6 +207,10 @@ class Remote:
                 raise RunFailed(f"the link to other machines failed: {fields['summary']}", fields["traceback"])
             case events.Said(_, kind, fields):
                 self._heard(kind, fields)
+            case events.NotReading(_, seconds, waiting, True) if not self._ending:
+                raise RunFailed(
+                    f"the link to other machines has read nothing for {seconds:.1f} s; {waiting} words wait"
+                )
             case events.Died():
                 self.ended = True
                 if not self._ending:
@@ -193,7 +230,10 @@ class Remote:
             case "another":
                 self._note_once(f"another machine joins as {machine!r}; it gets nothing while the first is there")
             case "anew":
-                raise RunFailed(f"machine {machine!r} was started anew: its operators are gone")
+                raise RunFailed(
+                    f"machine {machine!r} has left the run: its agent was started anew, or has not heard this machine "
+                    "for longer than its --timeout; its operators are gone"
+                )
 
     def _note_once(self, text: str) -> None:
         if text not in self._noted:
@@ -208,6 +248,11 @@ class Remote:
             self._feed(events.LinkChanged(machine, labels, up))
 
     def _from(self, machine: str, label: str, kind: str, fields: dict[str, Any]) -> None:
+        """Takes a word of a machine, which may be about its own processes alone."""
+        about = [label] if label else fields.get("labels", [])
+        if any(self.machine_of.get(each) != machine for each in about) or (not label) != (kind in OF_THE_AGENT):
+            self._note_once(f"machine {machine!r} reports about processes that it does not have; it is not believed")
+            return
         match kind:
             case "said":
                 self._feed(events.Said(label, fields["kind"], fields["fields"]))
@@ -229,6 +274,9 @@ class Remote:
                 raise RunFailed(f"machine {machine!r} cannot take part: {what}")
             case "lacks":
                 self._send_files(machine, fields["files"])
+            case "took":
+                self.taken += 1
+                self._send_piece(machine)
             case "ready":
                 del self._missing[machine]
             case "failed":

@@ -158,11 +158,14 @@ class Supervisor:
             self.core.run.note,
         )
         self.core.run.note(f"waits for {', '.join(self._remote.waits_for)}; on each: {self._remote.advice()}")
-        deadline = self._clock() + self.plan.start_timeout
+        deadline, taken = self._clock() + self.plan.start_timeout, 0
         while self._remote.waits_for:
             self.status.waiting = self._remote.waits_for
             self._wait(TICK)
+            self._here.tick()
             self._here.flush()
+            if self._remote.taken != taken:  # files may take longer than machines get to join
+                deadline, taken = self._clock() + self.plan.start_timeout, self._remote.taken
             if self._stops:
                 raise RunFailed("stopped while other machines were awaited", interrupted=True)
             if self._clock() > deadline:

@@ -70,7 +70,8 @@ class Bus:
         try:
             self.session = zenoh.open(self.config.zenoh_config())
         except zenoh.ZError as error:
-            raise BusError(f"cannot listen on {', '.join(self.config.listen) or 'nothing'}: {error}") from error
+            listen, connect = (", ".join(places) for places in (self.config.listen, self.config.connect))
+            raise BusError(f"cannot {f'listen on {listen}' if listen else f'connect to {connect}'}: {error}") from error
         self.id = str(self.session.zid())
         self.counted = Counters()
         self._lock = threading.Lock()

@@ -7,11 +7,18 @@ an operator of a nested graph. What concerns one stream lies below its own key.
 from __future__ import annotations
 
 RUNTIME = "@"
+HERE = "@here"
+"""The chunk of keys that tools of other machines are not let to."""
 
 
 def runtime_key(namespace: str, *chunks: str) -> str:
     """`<namespace>/@/<chunks>`."""
     return "/".join((namespace, RUNTIME, *chunks))
+
+
+def local_key(namespace: str, *chunks: str) -> str:
+    """`<namespace>/@here/<chunks>`: a runtime key for tools of this machine alone."""
+    return "/".join((namespace, HERE, *chunks))
 
 
 def static_key(stream: str) -> str:

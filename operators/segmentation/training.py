@@ -45,7 +45,7 @@ class SegmenterTask(ImageTask[SegmentationData]):
         self.width, self.architecture = width, architecture
         network = SegmentationNetwork(len(data.classes), backbone=BACKBONES[architecture](width))
         self.network: nn.Module = network
-        self.backbone = network.backbone
+        self.backbone, self.decoder = network.backbone, network.decoder
         self.class_weights = class_weights(data)
         if backbone is not None:
             load_backbone(self.backbone, backbone)

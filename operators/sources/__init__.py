@@ -7,6 +7,8 @@ from dataflow.lazy import lazily
 if TYPE_CHECKING:
     from operators.sources.broad_imu import BroadImu
     from operators.sources.euroc_imu import EurocImu
+    from operators.sources.gnss import NmeaFile, NmeaGnss
+    from operators.sources.image_folder import GrowingImageFolder, ImageFolder
     from operators.sources.kitti_odometry import KittiOdometry
     from operators.sources.kitti_raw import KittiRaw
     from operators.sources.recorded import (
@@ -28,6 +30,8 @@ else:  # most need a separate library, which a graph without them need not load
         {
             "broad_imu": ("BroadImu",),
             "euroc_imu": ("EurocImu",),
+            "gnss": ("NmeaFile", "NmeaGnss"),
+            "image_folder": ("GrowingImageFolder", "ImageFolder"),
             "kitti_odometry": ("KittiOdometry",),
             "kitti_raw": ("KittiRaw",),
             "recorded": (
@@ -49,8 +53,12 @@ else:  # most need a separate library, which a graph without them need not load
 __all__ = [
     "BroadImu",
     "EurocImu",
+    "GrowingImageFolder",
+    "ImageFolder",
     "KittiOdometry",
     "KittiRaw",
+    "NmeaFile",
+    "NmeaGnss",
     "RecordedCamera",
     "RecordedImu",
     "RecordedLidar",

@@ -23,7 +23,7 @@ SILENT = 3
 """Reads in a row that give nothing, after which a camera counts as unplugged."""
 
 
-class _Video(Source):
+class CalibratedImages(Source):
     """Holds what a file and a camera have in common: images, and a calibration by the field of view."""
 
     image: Out[Image] = Out(doc="RGB images")
@@ -60,7 +60,7 @@ class _Video(Source):
         return {"image": Image(stamp=stamp, frame=self.frame, data=np.ascontiguousarray(bgr[:, :, ::-1]))}
 
 
-class VideoFile(_Video):
+class VideoFile(CalibratedImages):
     """Reads a video file (whatever the installed OpenCV decodes: AVI, MP4, MKV, ...), frame by frame, all of them.
 
     A frame is stamped `first_stamp` plus its time in the file, at least 1 ns after the one before, or with `rate`, plus
@@ -114,7 +114,7 @@ class VideoFile(_Video):
         return self.first_stamp
 
 
-class Webcam(_Video):
+class Webcam(CalibratedImages):
     """Reads a camera: of this machine by its number or device file, of the network by its address (RTSP, HTTP).
 
     An image is stamped when it has arrived. A camera that is unplugged, or gives nothing any more, is looked for again

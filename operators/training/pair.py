@@ -77,7 +77,7 @@ class PairTask:
         self.mask_of: list[MaskedImage] = [mask_of[image.file.name] for image in boxes.training]
         self.size, self.samples, self.variation = size, self.boxes.samples, self.boxes.variation
         self.backbone = self.boxes.backbone
-        self.network = PairNetwork(self.backbone, self.boxes.network.head, self.masks.network.decoder)
+        self.network = PairNetwork(self.backbone, self.boxes.network.head, self.masks.decoder)
 
     def begin_with(self, file: Path) -> None:
         """Begins with `detector.onnx` and the `segmenter.onnx` beside it, whose backbones were one; the detector's

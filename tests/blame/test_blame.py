@@ -79,7 +79,7 @@ def test_the_inputs_of_all_operators_together_are_bounded(two: Path, monkeypatch
     monkeypatch.setattr("dataflow.blame.line.AHEAD", 0)
 
     with Recording(two) as recording:
-        monkeypatch.setattr(chain_module, "MOST_BYTES", 16)
+        monkeypatch.setattr(chain_module, "MOST_BYTES", 8)
         chain = Blame(recording, field).find()
         monkeypatch.setattr(chain_module, "MOST_BYTES", 1)
         with pytest.raises(BlameError, match="the inputs of call 40 of scale take more than 1 bytes"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from inspect import getdoc
 from pathlib import Path
 
 import pytest
@@ -102,7 +103,7 @@ def test_every_help_has_examples_of_its_command_and_explains_options_without_typ
         assert examples, words
         assert all(line.split()[1 : 1 + len(words)] == list(words) for line in examples), words
         if words in [(command,) for command in COMMANDS]:  # each stays on a line
-            documented = Commands()[words[0]].help.splitlines()
+            documented = (getdoc(Commands()[words[0]].callback) or "").splitlines()
             assert examples == [line.strip() for line in documented if "dataflow " in line and line.startswith("  ")]
 
         options = told[told.index("─ Options") :]

@@ -5,11 +5,17 @@ Those of commands of other packages: `tests/operators/training/test_command_opti
 
 from __future__ import annotations
 
+import re
+import signal
+import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
 from cli_commands import commands, untried
+
+from dataflow.client import attach
+from dataflow.machines.keys import TOOLS, issue, new_authority
 
 TRIED: tuple[str, ...] = (
     "demo --to OUT.rrd --seconds 1 --quiet --json",
@@ -17,6 +23,7 @@ TRIED: tuple[str, ...] = (
     " --split-every 1h --split-size 1GB --keep-disk 3GB --set count=4 --path HERE --log-level info --paranoid"
     " --timeout 60 --quiet --json",
     "run GRAPH --set count=4 --place left=a --rate 1000 --verbose --view OUT.rrd --open --overwrite",
+    "run GRAPH --set count=4 --here --quiet",
     "run GRAPH --set count=4 --process-each --live --chaos CHAOS --chaos-seed 3 --quiet",
     "replay RECORDING --one-process --record OUT.mcap --overwrite --compression none --readable all --quiet --json"
     " --record-failure end --split-every 1h --split-size 1GB --keep-disk 3GB --path HERE --paranoid --timeout 60",
@@ -29,6 +36,7 @@ TRIED: tuple[str, ...] = (
     "verify RECORDING --graph GRAPH --set count=30 --process-each --jobs 2",
     "verify RECORDING --baseline OUT.json --accept --repeat 1 --live-effects",
     "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json --live-effects",
+    "debug RECORDING smooth --do next --view OUT.rrd",
     "capture RECORDING --op sum --firing 3 --predicate stamp --graph GRAPH --set count=30 --path HERE --to OUT.py"
     " --overwrite --json",
     "blame RECORDING --field mean@0 --budget 60 --tolerance 0.1 --graph GRAPH --set count=30 --path HERE --json",
@@ -53,9 +61,14 @@ TRIED: tuple[str, ...] = (
     "view RECORDING --to OUT.rrd --overwrite --stream left/* --without fast --start 0 --end 1 --clock auto",
     "logs RECORDING --last 3 --level info --operator sum --json",
     "list --json",
+    "devices --json",
     "new operator Near --kind timer --to OUT --json",
     "new graph near --to OUT --json",
     "new project near --to OUT --json",
+    "new service GRAPH --name near --user robot --keep-disk 3GB --days 3 --to OUT --json",
+    "keys new OUT",
+    "keys add robot --authority AUTHORITY --serves 127.0.0.1 --serves localhost --out OUT",
+    "keys add desk --authority AUTHORITY --tools --out OUT",
 )
 """Commands as they are typed."""
 
@@ -77,8 +90,28 @@ UNANSWERED: tuple[str, ...] = (
     "param list --all --graph none --wait 0 --timeout 1 --json",
     "param dump --all --graph none --wait 0 --timeout 1 --out OUT.yaml --overwrite",
     "param load VALUES --graph none --wait 0 --timeout 1",
+    "health --graph none --wait 0 --rate sum=1 --losses 0.1 --free 1 --folder HERE --over 1 --json",
+    "reload sum --graph none --wait 0 --timeout 1 --json",
 )
 """Commands for a running graph, where none runs: `test_cli_live.py`, `test_param_top.py` and others have one."""
+
+REMOTE: tuple[str, ...] = tuple(
+    f"{line} --connect tls/127.0.0.1:1 --keys AUTHORITY/tools"
+    for line in UNANSWERED
+    if not line.startswith(("logs", "health", "reload"))
+)
+"""Commands for a graph of another machine, where nothing listens: `tests/machines/test_links.py` has one."""
+
+REFUSED: tuple[tuple[str, str], ...] = (
+    (
+        "join robot --connect tls/127.0.0.1:1 --keys HERE --folder OUT --path HERE --timeout 5 --once",
+        "no authority.pem",
+    ),
+    ("run GRAPH --live --listen tls/127.0.0.1:1 --keys HERE", "place one there by `machine: NAME`"),
+    ("debug RECORDING smooth --dap TAKEN", "Address already in use"),
+    ("metrics --port TAKEN --folder HERE", "cannot listen on port"),
+)
+"""Commands that would go on until they are ended, where they cannot begin, and the words that name the reason."""
 
 ELSEWHERE: dict[str, tuple[str, str]] = {
     "convert": ("*", "tests/cli/test_cli_convert.py has a table"),
@@ -106,7 +139,10 @@ def places(small: Path, recorded: tuple[Path, Any], tmp_path_factory: pytest.Tem
     (folder / "contract.yaml").write_text("streams: {}\n")
     (folder / "values.yaml").write_text("sum: {x: 1}\n")
     (folder / "other.mcap").write_bytes(recorded[0].read_bytes())
+    new_authority(folder / "authority")
+    issue(folder / "authority", folder / "authority" / "tools", TOOLS)
     return {
+        "AUTHORITY": str(folder / "authority"),
         "OTHER": str(folder / "other.mcap"),
         "VALUES": str(folder / "values.yaml"),
         "GRAPH": str(small),
@@ -120,8 +156,8 @@ def places(small: Path, recorded: tuple[Path, Any], tmp_path_factory: pytest.Tem
 def typed(line: str, places: dict[str, str], tmp_path: Path) -> list[str]:
     found = []
     for word in line.split():
-        first, given, rest = word.partition("=")
-        found.append((str(tmp_path / word) if word.startswith("OUT") else places.get(first, first)) + given + rest)
+        first, *rest = re.split("([=/])", word, maxsplit=1)
+        found.append(str(tmp_path / word) if word.startswith("OUT") else "".join((places.get(first, first), *rest)))
     return found
 
 
@@ -146,5 +182,26 @@ def test_a_command_for_a_running_graph_says_that_none_runs(
     assert "none" in said or "no graph" in said
 
 
+@pytest.mark.parametrize("line", REMOTE, ids=lambda line: " ".join(line.split()[:2]))
+def test_a_command_for_a_graph_of_another_machine_names_the_endpoint_that_does_not_answer(
+    dataflow, places: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
+    monkeypatch.setattr(attach, "ELSEWHERE_WITHIN", 0.0)
+
+    assert "no graph 'none' runs at tls/127.0.0.1:1" in dataflow(*typed(line, places, tmp_path), code=2).stderr
+
+
+@pytest.mark.parametrize(("line", "reason"), REFUSED, ids=lambda text: text.split()[0])
+def test_a_command_that_cannot_begin_names_the_reason(
+    dataflow, places: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, reason: str
+) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the handlers are those of a process that is the agent
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        places = {**places, "TAKEN": str(taken.getsockname()[1])}
+
+        assert reason in dataflow(*typed(line, places, tmp_path), code=2).stderr
+
+
 def test_every_option_of_every_built_in_command_is_tried() -> None:
-    assert untried(commands(built_in=True), (*TRIED, *UNANSWERED), ELSEWHERE) == {}
+    lines = (*TRIED, *UNANSWERED, *REMOTE, *(line for line, _ in REFUSED))
+    assert untried(commands(built_in=True), lines, ELSEWHERE) == {}

@@ -16,10 +16,11 @@ from rich.console import Console
 from rich.text import Text
 
 from dataflow.cli.support.arguments import chosen_streams, existing, graph_file, output_file, window
-from dataflow.cli.support.output import about_a_file, friendly_errors, jsonable, plural, seconds, size, table
+from dataflow.cli.support.output import about_a_file, friendly_errors, plural, seconds, size, table
 from dataflow.cli.support.progress import RunDisplay, shown, waiting_for
 from dataflow.cli.support.report import print_report, report_json
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, RunReport, Status
+from dataflow.text import jsonable
 
 
 @pytest.mark.parametrize(

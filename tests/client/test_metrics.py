@@ -6,11 +6,12 @@ import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from prometheus_text import prometheus
 
-from dataflow.client.metrics import CONTENT_TYPE, Metrics, MetricsServer
+from dataflow.client.metrics import CONTENT_TYPE, Metrics, MetricsServer, collect
 from dataflow.client.processes import ProcessStatus
 from dataflow.sync import NEVER
 from dataflow.transport.registry import RunningGraph
@@ -33,7 +34,7 @@ def test_every_figure_of_an_operator_is_a_sample() -> None:
     metrics.add_graph(found, ["camera", "idle", "gone"], [status])
 
     read = prometheus(metrics.text())
-    graph = {"graph": STRANGE}
+    graph = {"graph": STRANGE, "run": "1"}
     assert read.pop("dataflow_graph_up") == [(graph, 1)]
     assert read.pop("dataflow_graph_started_seconds") == [(graph, 12.5)]
     up = [(labels["operator"], value) for labels, value in read.pop("dataflow_operator_up")]
@@ -51,6 +52,18 @@ def test_every_figure_of_an_operator_is_a_sample() -> None:
         "dataflow_event_time_seconds": [("camera", 5)],
         "dataflow_behind_clock_seconds": [("camera", 0.5)],
     }
+
+
+def test_no_two_samples_have_the_same_labels(tmp_path: Path) -> None:
+    metrics = Metrics()
+    for pid in (1, 2):
+        found = RunningGraph("robot", "robot", pid, 0.0, (), 12.5, {})
+        status = ProcessStatus("p", {"camera": [7, 6, 2, 3, 5, 4]}, {"camera": 3}, frozenset(), {}, {})
+        metrics.add_graph(found, ["camera"], [status])
+
+    for text in (metrics.text(), collect([], [tmp_path, tmp_path])):
+        series = [line.rpartition(" ")[0] for line in text.splitlines() if not line.startswith("#")]
+        assert len(series) == len(set(series)) > 0
 
 
 @pytest.fixture

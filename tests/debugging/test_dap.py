@@ -343,6 +343,30 @@ def test_values_are_opened_and_expressions_evaluated(recorded: tuple[Recording, 
         assert client.seen() == next(each for each in printed() if each[0] == 11)
 
 
+@pytest.mark.parametrize("text", ["foo bar", "left = nothing_such", "raise SystemExit", "raise OSError(2, 'no')"])
+def test_an_error_typed_in_the_console_leaves_the_call_where_it_is(recorded: tuple[Recording, Path], text: str) -> None:
+    with editing(recorded, first=5) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        assert not client.request("evaluate", expression=text, context="repl", frameId=1)["success"]
+        assert client.line() == LINES["added = 0.0"]
+        assert client.go("next") == ("step", LINES["for value in x.vectors[0].tolist():"])
+
+
+def test_variables_that_are_assigned_by_hand_are_those_of_the_frame(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, first=5, stopOnEntry=False) as client:
+        client.breakpoints(LINES["if value > most:"])
+        client.ask("configurationDone")
+        client.stopped()
+        client.value("value = 40.0", context="repl")
+        client.ask("evaluate", expression="value = 7.0", context="repl", frameId=2)
+        assert client.variables()["value"] == "40.0"
+        assert client.value("value") == "40.0"
+        client.breakpoints()
+        client.go("stepOut")
+        assert client.seen()[2] == {"added": "40.0", "value": "7.0"}
+
+
 def test_a_breakpoint_that_cannot_be_says_why(recorded: tuple[Recording, Path]) -> None:
     with editing(recorded) as client:
         doc = LINES['"""Adds up."""']

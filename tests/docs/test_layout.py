@@ -71,12 +71,15 @@ def test_imports_go_one_way(repository: Path) -> None:
                     assert fits, f"{file.relative_to(repository)} imports {module}; {package} may import {may}"
 
 
-def test_every_package_is_in_the_table(repository: Path) -> None:
+def test_every_package_is_in_the_table_and_the_list_of_folders(repository: Path) -> None:
     named = allowed(repository)
+    listed = (repository / "docs" / "design.md").read_text(encoding="utf-8").partition("\ndataflow/ ")[2]
     for path in (repository / "dataflow").iterdir():
         name = f"dataflow.{path.stem}"
         if path.stem not in ("__init__", "__pycache__") and (path.is_dir() or path.suffix == ".py"):
             assert name in named, f"{name} is not in the table of docs/design.md"
+            here = f"\n  {path.name}{'/' if path.is_dir() else ''} "
+            assert here in listed, f"{path.name} is not in the list of folders of docs/design.md"
 
 
 def test_the_table_has_no_circle(repository: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -220,6 +221,15 @@ def test_another_programs_file_keeps_its_writer_its_latched_topics_and_its_times
     assert (header.profile, header.library) == ("ros2", "another program")
     assert is_foreign(tmp_path / "part.mcap")
     assert (done.attachments, done.notes) == (1, [])
+
+
+def test_a_part_keeps_the_code_of_a_setup_that_it_leaves_out() -> None:
+    setups = [replace(record("op", 0, "setup", detail={"code": {"m": str(k)}}), incarnation=k) for k in range(3)]
+    _, cut = folded([*setups, replace(record("op", 5, "fire", 5), incarnation=2)])
+
+    taken = taken_by(cut)
+    assert taken is not None
+    assert (cut.incarnation, taken.again, taken.code) == (2, True, {"m": "2"})
 
 
 def test_a_state_that_was_too_large_to_be_kept_stands_in_for_no_calls() -> None:

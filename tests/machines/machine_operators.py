@@ -49,6 +49,7 @@ class Scale(Operator):
     y: Out[FeatureVector]
     gain: float = Param(1.0, doc="another factor", tunable=True)
     weights: str = Param("", doc="a file with a number")
+    other: str = Param("", doc="any text, or another file")
 
     def setup(self) -> None:
         self.factor = float(self.use_file(self.weights).read_text()) if self.weights else 2.0

@@ -73,9 +73,11 @@ def link() -> Iterator[tuple[int, Relay]]:
     relay.close()
 
 
+@pytest.mark.parametrize("seconds", [2.0, pytest.param(8.0, marks=pytest.mark.long)])
 def test_a_link_that_stalls_and_resets_loses_nothing_and_nothing_is_started_again(
-    keys: Path, link: tuple[int, Relay], tmp_path: Path
+    keys: Path, link: tuple[int, Relay], tmp_path: Path, seconds: float
 ) -> None:
+    """For more than a link may be silent, and for more than Zenoh keeps it (`hub.LEASE`)."""
     port, relay = link
     robot = join("robot", f"tls/127.0.0.1:{relay.port}", tmp_path / "files", "--keys", str(keys / "robot"))
     stalled = threading.Event()
@@ -89,7 +91,7 @@ def test_a_link_that_stalls_and_resets_loses_nothing_and_nothing_is_started_agai
     def trouble() -> None:
         assert listening(port) == [f"127.0.0.1:{port}"]
         relay.stalled = True
-        time.sleep(2.0)  # more than the link may be silent
+        time.sleep(seconds)
         relay.stalled = False
         time.sleep(0.5)
         relay.reset()
@@ -104,11 +106,65 @@ def test_a_link_that_stalls_and_resets_loses_nothing_and_nothing_is_started_agai
 
     said = end(robot)
     assert stalled.is_set()
-    assert {name: summary["taken"] for name, summary in report.summaries.items()} == {"here": 400, "there": 400}, said
+    took = {name: summary["taken"] for name, summary in report.summaries.items()}
+    dropped = sum(number for _, _, number in report.drops.get("sensor", ()))
+    assert took == dict.fromkeys(("here", "there"), 400 - dropped), said
+    if seconds < 3:  # the sensor's window, in which it does not hear that `here` is out of reach, holds them
+        assert not dropped
     assert not report.restarts
     assert any("the link to machine 'robot' is down" in note for note in report.notes)
     assert any("the link to machine 'robot' is back" in note for note in report.notes)
     assert verify(tmp_path / "link.mcap", jobs=1).identical
+
+
+@pytest.mark.long
+def test_a_slow_link_delays_messages_and_gets_no_process_killed(
+    keys: Path, link: tuple[int, Relay], tmp_path: Path
+) -> None:
+    port, relay = link
+    relay.rate = 4e6  # less than half of what the sensor makes: seconds of it wait
+    robot = join("robot", f"tls/127.0.0.1:{relay.port}", tmp_path / "files", "--keys", str(keys / "robot"))
+
+    report = run(
+        load_text(GRAPH.replace("size: 2000}", "size: 25000}, live: {restart: {max: 1, backoff: 10ms}}")),
+        machines=Meeting(f"tls/127.0.0.1:{port}", keys / "laptop"),
+        live=True,
+    )
+
+    said = end(robot)
+    took = {name: summary["taken"] for name, summary in report.summaries.items()}
+    dropped = sum(number for _, _, number in report.drops.get("sensor", ()))
+    assert took == dict.fromkeys(("here", "there"), 400 - dropped), said
+    assert not report.restarts
+    assert not any("no longer waited for" in note for note in report.notes)
+
+
+@pytest.mark.long
+def test_an_agent_that_gave_the_run_up_ends_it(keys: Path, link: tuple[int, Relay], tmp_path: Path) -> None:
+    port, relay = link
+    at = f"tls/127.0.0.1:{relay.port}"
+    robot = join("robot", at, tmp_path / "files", "--keys", str(keys / "robot"), "--timeout", "2")
+    stalled = threading.Event()
+
+    def stall() -> None:
+        relay.stalled = True
+        time.sleep(4.0)  # more than the agent is patient for
+        relay.stalled = False
+
+    def spoil(status: Status) -> None:
+        if status.phase == "running" and status.operators["sensor"].firings > 50 and not stalled.is_set():
+            stalled.set()
+            threading.Thread(target=stall, daemon=True).start()
+
+    with pytest.raises(RunFailed, match=r"machine 'robot' has left the run: .*; its operators are gone"):
+        run(
+            load_text(GRAPH.replace("steps: 400", "steps: 1000000")),
+            machines=Meeting(f"tls/127.0.0.1:{port}", keys / "laptop"),
+            live=True,
+            watch=spoil,
+        )
+
+    assert "the supervisor was not heard for 2 s" in end(robot)
 
 
 @pytest.mark.parametrize("who", ["stranger", pytest.param("tools", marks=pytest.mark.long)])
@@ -138,6 +194,16 @@ def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:
         new_authority(keys / "authority")
 
 
+def test_keys_that_could_not_be_made_leave_nothing_in_the_way(keys: Path, tmp_path: Path) -> None:
+    with pytest.raises(KeysError, match="openssl x509"):
+        issue(keys / "authority", tmp_path / "arm", "arm", serves=["not,a:host"])
+    assert not list(tmp_path.iterdir())
+
+    issue(keys / "authority", tmp_path / "arm", "arm", serves=["192.168.1.3"])
+
+    assert {path.name for path in (tmp_path / "arm").iterdir()} == {"authority.pem", "certificate.pem", "key.pem"}
+
+
 @pytest.mark.long
 def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(keys: Path, tmp_path: Path) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"
@@ -154,6 +220,7 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
             while supervisor.status.phase == "starting":
                 time.sleep(0.05)
             found["echo"] = tool("echo", "there/y", "-n", "3", "--json")
+            found["echo here"] = tool("echo", "here/y", "-n", "3", "--json")
             found["top"] = tool("top", "--json")
             found["set"] = tool("param", "set", "there.gain", "7")
             found["record"] = tool("record", "there/y", "-o", str(tmp_path / "part.mcap"), "--seconds", "0.5")
@@ -173,11 +240,12 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
 
     end(robot)
     assert len(found["echo"].stdout.splitlines()) == 3, found["echo"]
+    assert len(found["echo here"].stdout.splitlines()) == 3, found["echo here"]
     top = json.loads(found["top"].stdout)
     assert {row["operator"]: row["state"] for row in top["operators"]}["there"] == "running"
     robot_state = top["machines"]["robot"]
     assert robot_state["up"]
-    assert abs(robot_state["offset"]) <= robot_state["delay"]  # it is this machine's clock
+    assert abs(robot_state["offset"]) <= robot_state["delay"] / 2  # it is this machine's clock
     assert found["set"].returncode == 0, found["set"]
     assert found["record"].returncode == 0, found["record"]
     assert found["stranger"].returncode != 0

@@ -119,3 +119,42 @@ def test_the_offset_of_clocks_is_that_of_the_shortest_exchange() -> None:
     clocks.exchanged(asked=2000, taken=3010, answered=3020, heard=2030)  # 10 there, 10 back
     clocks.exchanged(asked=3000, taken=4900, answered=4900, heard=3920)  # 900 there, 20 back
     assert clocks.best == (20, 1000)
+
+
+def test_what_waits_is_looked_at_seldom_however_much_of_it_may_not_be_dropped(
+    link: Link, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipes, "MOST_WAITING", 10_000)
+    looks: list[int] = []
+    drop = Pipe._drop_oldest
+    monkeypatch.setattr(Pipe, "_drop_oldest", lambda pipe: (looks.append(1), drop(pipe)))
+    link.loses = lambda payload: True
+    a, b = ends(link, [], bounded=True)
+
+    for _ in range(1000):
+        a.send(b"x" * 100, droppable=True)
+    assert a.dropped > 800
+    assert len(looks) <= 100  # a tenth of the bound at once
+    looks.clear()
+    for _ in range(1000):
+        a.send(b"x" * 100)
+    assert len(looks) <= 101
+
+    a.close()
+    b.close()
+
+
+def test_a_word_with_a_beat_overtakes_the_frames(link: Link) -> None:
+    taken: list[bytes] = []
+    link.loses = lambda payload: True
+    a, b = ends(link, taken)
+    a.send(b"frame")
+
+    a.send_with_beat(b"word")
+
+    assert taken == [b"word"]
+    link.loses = lambda payload: False
+    assert emptied(a)
+    assert taken == [b"word", b"frame"]
+    a.close()
+    b.close()

@@ -66,18 +66,32 @@ def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
     monkeypatch.chdir(tmp_path)
     Path("models").mkdir()
     Path("models/factor.txt").write_text("3.5")
-    text = GRAPH.replace("  there: {", "  there: {params: {weights: models/factor.txt}, ")
+    with Path("models/large.bin").open("wb") as large:
+        large.truncate(70 << 20)  # more than the link's process is given at once
+    (robot.folder / "models").mkdir(parents=True, exist_ok=True)
+    (robot.folder / "models/factor.txt.part").write_text("of a run that was killed")
+    text = (
+        GRAPH.replace("  there: {", "  there: {params: {weights: models/factor.txt, other: models/large.bin}, ")
+        .replace("  here: {", f"  here: {{params: {{other: '{'no file ' * 40}'}}, ")
+        .replace("  beside: {", f"  beside: {{params: {{other: '{'no file ' * 40}'}}, ")
+    )
 
     report = two(robot, text)
 
     assert report.summaries["there"]["factor"] == 3.5
     assert (robot.folder / "models/factor.txt").read_text() == "3.5"
+    assert (robot.folder / "models/large.bin").stat().st_size == 70 << 20
+    assert not list((robot.folder / "models").glob("*.part"))
     theirs = robot.code / "machine_operators.py"
     before = theirs.read_text()
     theirs.write_text(before + "# changed there\n")
-    with pytest.raises(RunFailed, match=r"machine 'robot' cannot take part: machine_operators\.py differs"):
-        two(robot)
+    descriptors = []
+    for _ in range(2):
+        with pytest.raises(RunFailed, match=r"machine 'robot' cannot take part: machine_operators\.py differs"):
+            two(robot)
+        descriptors.append(settled(psutil.Process(robot.process.pid).num_fds))
     theirs.write_text(before)
+    assert descriptors[0] == descriptors[1]
 
 
 @pytest.mark.long
@@ -133,6 +147,18 @@ def test_a_supervisor_that_is_killed_leaves_no_operators_and_the_machine_takes_t
     short = load_text(GRAPH.replace("SIZE", "1").replace(", MORE", ""))
     assert run(short, machines=Meeting(endpoint)).summaries["there"]["taken"] == 120
     assert "was not heard for 2 s" in end(agent)
+
+
+def settled(count: Callable[[], int]) -> int:
+    """Returns a count once it has not changed in ten looks (bounded)."""
+    seen = [count()]
+
+    def still() -> bool:
+        seen.append(count())
+        return len(seen) > 10 and len(set(seen[-10:])) == 1
+
+    await_(still)
+    return seen[-1]
 
 
 def await_(condition: Callable[[], bool], within: float = 60.0) -> None:

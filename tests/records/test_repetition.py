@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.mcap.chunks import Chunks
-from dataflow.records.cuts import is_known, taken_by
+from dataflow.records.cuts import Taken, cut_record, is_known, taken_by
 from dataflow.records.firing import CALLS, FiringRecord, Kind, encode_batch
 from dataflow.records.order import Outline, Run
 from dataflow.records.reading import FiringLog, whole
@@ -99,6 +99,30 @@ def test_a_message_is_left_until_its_last_use(told: list[tuple[int, int, int]]) 
         assert [uses.take(message) for _ in range(times)] == [False] * (times - 1) + [True]
         assert not uses.left("s", message.incarnation, message.seq)
     assert not uses.left("other", 0, 0)
+
+
+def test_each_incarnation_is_repeated_with_its_own_code() -> None:
+    """The second one was a restart by a new process, which had the edited files; a reload replaced its code alone."""
+    first, second, third = ({"m": letter} for letter in "abc")
+    kinds: list[Kind] = ["setup", "setup", "reset", "setup", "setup"]
+    details = [{"code": first}, {"code": second}, {}, {"code": third}, {"code": third}]
+    records = [FiringRecord("a", k, 0, kind, k, detail=details[k]) for k, kind in enumerate(kinds)]
+    repetition = Repetition(lambda: records, stateless=False)
+    look_at([repetition])
+    assert [repetition.code_of(k) for k in range(5)] == [first, second, second, None, None]
+
+    records[1] = cut_record(records[1], left_out=3, taken=Taken(True, {}, {}, b"s", second), held=(), stamp=1)
+    repetition = Repetition(lambda: [*records[:2], *records[3:]], stateless=False)
+    look_at([repetition])
+    assert [repetition.code_of(k) for k in range(5)] == [first, second, second, None, None]
+
+
+def test_code_that_is_none_is_left_alone() -> None:
+    for code in ("/dev/zero", [], {"m": 3}, {3: "m"}):
+        records = [FiringRecord("a", k, 0, "setup", k, detail={"code": c}) for k, c in enumerate((code, {"m": "a"}))]
+        repetition = Repetition(lambda records=records: records, stateless=False)
+        look_at([repetition])
+        assert repetition.code_of(0) is None
 
 
 def test_records_of_several_operators_are_read_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

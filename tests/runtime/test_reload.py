@@ -32,8 +32,13 @@ graph: reloaded
 namespace: test
 operators:
   ticks: {use: runtime_operators:Counter, params: {count: 1000000}}
-  sum: {use: summing_reloaded:Sum, inputs: {x: ticks/fast}, live: {queue: block}}
+  sum: {use: offering_reloaded:Sum, inputs: {x: ticks/fast}, live: {queue: block}}
   after: {use: runtime_operators:Smooth, inputs: {x: sum/total}, live: {queue: block}}
+"""
+LAZY = """\
+from dataflow.lazy import lazily
+
+__getattr__, __dir__ = lazily(__name__, {"summing": ("Sum",)})
 """
 HELPER = "def weighted(number):\n    return WEIGHT * number\n\n\nWEIGHT = 1\n"
 CODE = """\
@@ -66,7 +71,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Holds the code, which processes import, and what reloads store."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "home"))
     monkeypatch.syspath_prepend(str(tmp_path))
-    (tmp_path / "summing_reloaded.py").write_text(CODE)
+    (tmp_path / "offering_reloaded").mkdir()
+    (tmp_path / "offering_reloaded" / "__init__.py").write_text(LAZY)
+    (tmp_path / "offering_reloaded" / "summing.py").write_text(CODE)
     (tmp_path / "weights_reloaded.py").write_text(HELPER)
     (tmp_path / "graph.yaml").write_text(GRAPH)
     yield tmp_path
@@ -74,7 +81,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def _forget() -> None:
-    for name in ("summing_reloaded", "weights_reloaded"):
+    for name in ("offering_reloaded", "offering_reloaded.summing", "weights_reloaded"):
         sys.modules.pop(name, None)
 
 
@@ -143,8 +150,8 @@ def test_new_code_goes_on_with_the_state_and_the_run_verifies_identical(folder: 
     assert kinds == [(0, "setup"), (1, "setup"), (1, "restore"), (2, "setup"), (2, "restore")]
     codes = [r.detail["code"] for r in records if r.kind == "setup"]
     assert len({code["weights_reloaded"] for code in codes}) == 3
-    assert len({code["summing_reloaded"] for code in codes}) == 1
-    assert [r.detail["replaced"] for r in records if "replaced" in r.detail] == codes[:2]
+    assert len({code["offering_reloaded.summing"] for code in codes}) == 1
+    assert {file.name for file in store().iterdir()} == {digest for code in codes[:2] for digest in code.values()}
     with Recording(recording) as opened:
         totals = [number(item.message) for item in opened.messages(["test/sum/total"])]
     assert all(b - a in (0, 1, 100, 10_000) for a, b in itertools.pairwise(totals))

@@ -137,7 +137,7 @@ def test_a_service_is_a_unit_that_systemd_takes(tmp_path: Path, monkeypatch: pyt
     unit = (folder / "patrol.service").read_text()
     assert ("--keep-disk 20GB" in unit) == (not flight)
     kept = (folder / "patrol.conf").read_text().splitlines()[-1]
-    assert kept == f'd "{str(folder).replace("%", "%%")}/{"kept" if flight else "out"}" - - - 3d'
+    assert kept == f'e "{str(folder).replace("%", "%%")}/{"kept" if flight else "out"}" - - - 3d'
     assert "is there already" in call("new", "service", "patrol.yaml", code=2).stderr
     assert "cannot be the name" in call("new", "service", "patrol.yaml", "--name", "a b", code=2).stderr
     if (analyze := shutil.which("systemd-analyze")) is not None:

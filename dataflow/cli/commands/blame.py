@@ -78,7 +78,7 @@ def blame(
     Examples:
 
       dataflow blame run.mcap --field "tracks.ids[3]@12.4"
-      dataflow blame run.mcap --field "tracks.boxes[ids == 7]@12.4" --budget 300
+      dataflow blame run.mcap --field "tracks.boxes[2]@12.4" --budget 300
       dataflow blame run.mcap --field odometry.position@3 --json
     """
     with friendly_errors():
@@ -92,7 +92,7 @@ def blame(
         loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
         chain = _found(recording, field, loaded, budget, tolerance)
     if json:
-        print_json(_as_json(chain))
+        print_json(chain.as_json())
     else:
         _print(chain, field)
     if not chain.whole:
@@ -125,7 +125,7 @@ def drops(
     Examples:
 
       dataflow drops run.mcap --worse "ate_rmse_m > 0.05"
-      dataflow drops run.mcap --worse "score.recall < 0.8 or score.precision < 0.8" --budget 300
+      dataflow drops run.mcap --worse "score.recall < 0.8" --budget 300
     """
     with friendly_errors():
         recording = existing_recording(recording)
@@ -264,31 +264,3 @@ def _other(value: Any, before: Any) -> str:
 def _text(value: Any) -> str:
     text = f"{value:.4g}" if isinstance(value, float) else "none" if value is None else " ".join(str(value).split())
     return text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + "…"
-
-
-def _as_json(chain: Chain) -> dict[str, Any]:
-    return {
-        "value": chain.value,
-        "call": [*chain.target],
-        "stamp": chain.stamp,
-        "links": [
-            {
-                "call": [*link.call],
-                "stamp": link.stamp,
-                "input": link.input or None,
-                "message": None if link.message is None else [*link.message],
-                "from": None if link.maker is None else [*link.maker],
-                "effects": [
-                    {"way": e.way, "fields": e.fields, "value": e.value, "together": e.together} for e in link.effects
-                ],
-            }
-            for link in chain.links
-        ],
-        "sensed": [[*place] for place in dict.fromkeys(link.message for link in chain.sensed) if place is not None],
-        "whole": chain.whole,
-        "not_looked_into": [[*call] for call in chain.left],
-        "not_taken_apart": [[*each] for each in chain.unsplit],
-        "not_tried_before": chain.ended,
-        "calls_made": chain.made,
-        "seconds": chain.seconds,
-    }

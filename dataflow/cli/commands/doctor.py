@@ -1,4 +1,4 @@
-"""`dataflow doctor`."""
+"""`dataflow doctor` and `dataflow devices`."""
 
 from __future__ import annotations
 
@@ -55,6 +55,32 @@ def doctor(json: Json = False) -> None:
         out.print(Text("nothing stands in the way", style="green"))
     if faults:
         raise typer.Exit(DIFFERENT)
+
+
+def devices(json: Json = False) -> None:
+    """List the cameras and serial devices of this machine, each with the source that reads it.
+
+    Nothing is opened, so that a device may still give nothing.
+
+    Examples:
+
+      dataflow devices
+      dataflow devices --json
+    """
+    from dataflow.doctor.devices import find_devices
+
+    found = find_devices()
+    if json:
+        print_json([device.to_json() for device in found])
+        return
+    if not found:
+        out.print("no cameras (/dev/video*), no serial devices (/dev/serial/by-id, /dev/ttyUSB*, /dev/ttyACM*)")
+    for device in found:
+        out.print(Text.assemble((device.kind, "bold"), f"  {device.path}  {device.name}".rstrip()), soft_wrap=True)
+        for line in device.lines.splitlines():
+            out.print(Text(f"  {line}"), soft_wrap=True)
+        if device.note:
+            out.print(Text(f"  → {device.note}", style="dim"), soft_wrap=True)
 
 
 def _print(findings: Iterable[Finding]) -> None:

@@ -60,12 +60,10 @@ def new(
 
       dataflow keys new authority
     """
-    from dataflow.machines.keys import KeysError, new_authority
+    from dataflow.machines.keys import new_authority
 
-    try:
+    with friendly_errors():
         new_authority(folder)
-    except KeysError as error:
-        raise fail(str(error)) from None
     say(f"{folder} issues keys: dataflow keys add NAME --authority {folder}")
 
 
@@ -87,13 +85,11 @@ def add(
       dataflow keys add robot --authority authority
       dataflow keys add my_tools --authority authority --tools
     """
-    from dataflow.machines.keys import TOOLS, KeysError, issue
+    from dataflow.machines.keys import TOOLS, issue
 
     if tools and serves:
         raise fail("--tools and --serves exclude each other: tools only connect")
     folder = out or Path(name)
-    try:
+    with friendly_errors():
         issue(authority, folder, TOOLS if tools else name, serves=serves or ())
-    except KeysError as error:
-        raise fail(str(error)) from None
     say(f"{folder}: the keys of {'tools' if tools else f'machine {name!r}'}")

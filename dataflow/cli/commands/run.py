@@ -131,8 +131,8 @@ def run(
         storage = storage_of(record, split_every, split_size, keep_disk, record_failure, readable, flight=flight)
         outputs = checked_outputs(record, view, open_view, overwrite, storage)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-        controls = keys(quiet or json, live=live, flight=flight)
-        options |= {"live": live, "paused": step, "controls": controls, **machines_of(listen, keys_folder, here=here)}
+        options |= {"live": live, "paused": step, "controls": keys(quiet or json, live=live, flight=flight)}
+        options |= machines_of(loaded, listen, keys_folder, here=here)
         if compression is not None:
             if record is None and not flight:
                 raise fail("--compression is of a recording: name one with --record")

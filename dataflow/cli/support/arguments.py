@@ -249,16 +249,9 @@ def span(recording: PlayableStreams, streams: Iterable[str]) -> tuple[int, int] 
 
     Of a part of a recording, what lies outside of its span is left out.
     """
-    from dataflow.recording.streams.cutting import cut_of
+    from dataflow.execution.feeds.playable import span_of
 
-    infos = [recording.streams[s] for s in streams if not recording.streams[s].static]
-    firsts = [info.first for info in infos if info.first is not None]
-    lasts = [info.last for info in infos if info.last is not None]
-    if not firsts or not lasts:
-        return None
-    part = cut_of(recording.metadata)
-    start, end = (None, None) if part is None else (part.start, part.end)
-    return min(firsts) if start is None else start, max(lasts) if end is None else min(max(lasts), end)
+    return span_of(recording, streams)
 
 
 def named_once(metavar: str, argument: Path | None, option: Path | None) -> Path | None:

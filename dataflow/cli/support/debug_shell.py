@@ -13,6 +13,7 @@ from rich.text import Text
 
 from dataflow.cli.support.output import out, plural, print_json_line
 from dataflow.cli.support.verdicts import difference_text
+from dataflow.debugging.fired import described
 from dataflow.execution.snapshots import changes
 from dataflow.messages.base import Message
 from dataflow.messages.display.text import field_text
@@ -221,7 +222,7 @@ class Shell(cmd.Cmd):
 
     def _show(self, fired: Fired) -> None:
         if self._json:
-            print_json_line(self.values(fired))
+            print_json_line(fired.as_json(self._debugger.node.name, self._origin))
         else:
             for line in self.lines(fired):  # the state may take a moment longer than the rest
                 out.print(line, soft_wrap=True)
@@ -230,21 +231,6 @@ class Shell(cmd.Cmd):
             made = ((made.stream, made.here) for made in fired.made if made.here is not None)
             for stream, message in chain(((entry.stream, entry.value) for entry in given), made):
                 self._viewer.log(stream, message)
-
-    def values(self, fired: Fired) -> dict[str, Any]:
-        """A call as JSON values."""
-        return {
-            "operator": self._debugger.node.name,
-            "number": fired.number,
-            **fired.call._asdict(),
-            "same": fired.same,
-            "injected": fired.injected,
-            "inputs": {name: self._what(value) for name, value in fired.inputs.items()},
-            "outputs": {m.port: {"same": m.same, "fields": [f.as_json() for f in m.fields]} for m in fired.made},
-            "changed": fired.changed(),
-            "error": fired.error,
-            "recorded_error": fired.recorded_error,
-        }
 
     def lines(self, fired: Fired) -> Iterator[Text]:
         """A call in some lines: when it was, what was given, what came out, what it changed."""
@@ -256,11 +242,11 @@ class Shell(cmd.Cmd):
         if fired.injected:
             yield Text("  the run tried out a fault here: the operator was not called")
         for name, value in fired.inputs.items():
-            yield Text(f"  given    {name:<14} {self._what(value)}")
+            yield Text(f"  given    {name:<14} {described(value, self._origin)}")
         for made in fired.made:
             what = "identical" if made.same else _difference(made.here, made.recorded)
             yield Text.assemble(
-                f"  made     {made.port:<14} {self._what(made.here)}  ", (what, "" if made.same else "red")
+                f"  made     {made.port:<14} {described(made.here, self._origin)}  ", (what, "" if made.same else "red")
             )
             for field in made.fields[:MOST_FIELDS]:
                 yield Text(f"             {difference_text(field)}")
@@ -272,23 +258,12 @@ class Shell(cmd.Cmd):
             yield Text(f"  recorded {fired.recorded_error or 'no error'}")
             yield Text.assemble("  raised   ", (fired.error or "nothing", "red"))
 
-    def _what(self, value: Any) -> str:
-        match value:
-            case None:
-                return "nothing"
-            case Message():
-                return f"{value.SCHEMA} at {(value.stamp - self._origin) * 1e-9:.3f} s"
-            case Mapping():
-                return "; ".join(f"{stream}: {self._what(message)}" for stream, message in value.items()) or "nothing"
-            case _:
-                return f"{plural(len(value), 'message')}" + (f", the last {self._what(value[-1])}" if value else "")
-
     def _messages(self, messages: Mapping[str, Any], name: str) -> None:
         if name and name not in messages:
             raise WrongCommand(f"no {name!r} here; there are: {', '.join(messages)}")
         for key, value in messages.items():
             if not name or key == name:
-                out.print(Text.assemble((key, "bold"), f"  {self._what(value)}"), soft_wrap=True)
+                out.print(Text.assemble((key, "bold"), f"  {described(value, self._origin)}"), soft_wrap=True)
                 for message in _each(value):
                     for field, held in message.items():
                         out.print(Text(f"  {field:<20} {field_text(held)}"), soft_wrap=True)

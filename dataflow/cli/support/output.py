@@ -3,8 +3,6 @@ code."""
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import sys
 import traceback
@@ -19,7 +17,7 @@ from rich.markup import escape
 from rich.segment import Segment
 from rich.text import Text
 
-from dataflow.text import visible, visible_json, visible_lines
+from dataflow.text import json_text, visible, visible_lines
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -82,33 +80,12 @@ def print_json(value: Any) -> None:
     """Prints one JSON document on standard output; an object also holds the notes of the files that were opened."""
     if isinstance(value, dict) and _notes and "notes" not in value:
         value = value | {"notes": list(_notes)}
-    print(_json(value, indent=2))
+    print(json_text(value, indent=2))
 
 
 def print_json_line(value: Any) -> None:
     """Prints one JSON value as one line, and flushes."""
-    print(_json(value), flush=True)
-
-
-def _json(value: Any, indent: int | None = None) -> str:
-    return visible_json(json.dumps(jsonable(value), indent=indent, ensure_ascii=False, allow_nan=False))
-
-
-def jsonable(value: Any) -> Any:
-    """JSON values only: numbers that JSON has no word for become the strings NaN, Infinity and -Infinity."""
-    import numpy as np
-
-    if isinstance(value, dict):
-        return {str(key): jsonable(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return jsonable(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [jsonable(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-    return value if value is None or isinstance(value, (str, bool, int, float)) else str(value)
+    print(json_text(value), flush=True)
 
 
 def say(text: str) -> None:
@@ -186,17 +163,20 @@ def interrupted_by_user(error: BaseException | None) -> bool:
 def _explained(error: Exception) -> tuple[str, str, int] | None:
     """(message, details, exit code) of an error that users can do something about; None for a bug."""
     from dataflow.chaos.plan import ChaosError
-    from dataflow.client.attach import NotRunning
+    from dataflow.client.attach import Lost, NotRunning
     from dataflow.graph import GraphError, OperatorImportError
     from dataflow.interop.mapping import MappingError
+    from dataflow.machines.keys import KeysError
     from dataflow.messages import MessageError
     from dataflow.operator import ParameterError
     from dataflow.recording import RecordingError
     from dataflow.reexecution.recorded_run import ReplayError
     from dataflow.supervision.core.report import RunFailed
+    from dataflow.transport import BusError, NetworkError
     from dataflow.transport.registry import RegistryError
 
     known = (
+        BusError,
         RecordingError,
         ReplayError,
         ParameterError,
@@ -204,6 +184,8 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         OperatorImportError,
         NotRunning,
         RegistryError,
+        KeysError,
+        NetworkError,
         ChaosError,
         MappingError,
     )
@@ -217,6 +199,8 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
                 details = ""  # the message names the file; where in the operator it was opened does not help
             message = "\n".join((str(error), *getattr(error, "__notes__", ())))
             return message, details, INTERRUPTED if error.interrupted else DIFFERENT
+        case Lost():
+            return str(error), "", DIFFERENT
         case BrokenPipeError():
             return None
         case OSError() if error.strerror and error.filename:

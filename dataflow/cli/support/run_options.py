@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from dataflow.cli.support.arguments import FLAG, number
 from dataflow.cli.support.output import fail
+
+if TYPE_CHECKING:
+    from dataflow.graph import Graph
 
 PLACEMENT, OUTPUT = "Placement", "Results"
 
@@ -149,7 +152,7 @@ Verbose = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]
 
 
-def machines_of(listen: str | None, keys: Path | None, *, here: bool) -> dict[str, Any]:
+def machines_of(graph: Graph, listen: str | None, keys: Path | None, *, here: bool) -> dict[str, Any]:
     """Returns the field of a `RunPlan` for other machines, if an option is about them."""
     from dataflow.supervision.plan import Meeting
 
@@ -157,4 +160,6 @@ def machines_of(listen: str | None, keys: Path | None, *, here: bool) -> dict[st
         raise fail("--here runs everything on this machine; --listen is for others")
     if keys is not None and listen is None:
         raise fail("--keys is for --listen: where do other machines join?")
+    if listen is not None and all(node.machine is None for node in graph.nodes.values()):
+        raise fail("--listen: no operator is to run on another machine; place one there by `machine: NAME`")
     return {"machines": Meeting(listen, keys)} if listen is not None else {"machines": None} if here else {}

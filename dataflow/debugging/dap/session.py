@@ -6,8 +6,10 @@ the call and makes it again, to a line event before; so does going to another ca
 
 from __future__ import annotations
 
+import ctypes
 import os
 import socket
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
@@ -280,7 +282,9 @@ class Session:
             if name in ("launch", "attach"):
                 self._wire.event("initialized")
             return self._over or (self._away is not None and not moved)
-        except (LookupError, TypeError, ValueError) as error:
+        except Gone:
+            raise
+        except Exception as error:
             self._wire.answer(request, error=f"{name}: {readable(error)}")
             return False
 
@@ -377,13 +381,8 @@ class Session:
             self._away = partial(self._to, text.removeprefix("goto ").strip())
             return {"result": "", "variablesReference": 0}
         try:
-            value = eval(text, frame.f_globals, frame.f_locals)
-        except SyntaxError as error:
-            if not typed:
-                raise ValueError(readable(error)) from error
-            value = None
-            exec(compile(text, "<console>", "exec"), frame.f_globals, frame.f_locals)
-        except Exception as error:
+            value = _evaluated(text, frame, statements=typed)
+        except (Exception, SystemExit) as error:
             raise ValueError(readable(error)) from error
         shown = self._variables.shown(text, value)
         return {"result": shown["value"], "type": shown["type"], "variablesReference": shown["variablesReference"]}
@@ -420,6 +419,23 @@ class Session:
 
 
 _real = cache(os.path.realpath)
+
+
+def _evaluated(text: str, frame: FrameType, *, statements: bool) -> Any:
+    """Returns the value of an expression in a frame; None for `statements`, which may assign to its variables. Raises
+    what the text raises."""
+    names = frame.f_locals
+    try:
+        code = compile(text, "<console>", "eval")
+    except SyntaxError:
+        if not statements:
+            raise
+        code = compile(text, "<console>", "exec")
+    try:
+        return eval(code, frame.f_globals, names)
+    finally:
+        if sys.version_info < (3, 13):  # `f_locals` is a copy there
+            ctypes.pythonapi.PyFrame_LocalsToFast(ctypes.py_object(frame), ctypes.c_int(0))
 
 
 def _at(wanted: int, why: str) -> Stops:

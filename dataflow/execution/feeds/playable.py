@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from dataflow.recording.streams.cutting import cut_of
 from dataflow.recording.streams.entries import Recorded
 from dataflow.recording.streams.streams import StreamInfo
 
@@ -37,3 +38,18 @@ class PlayableStreams(Protocol):
 
     def close(self) -> None:
         """Closes the file. Idempotent."""
+
+
+def span_of(recording: PlayableStreams, streams: Iterable[str]) -> tuple[int, int] | None:
+    """The first and the last stamp (ns) of those streams that are not static; None when they hold no message.
+
+    Of a part of a recording, what lies outside of its span is left out.
+    """
+    infos = [recording.streams[s] for s in streams if not recording.streams[s].static]
+    firsts = [info.first for info in infos if info.first is not None]
+    lasts = [info.last for info in infos if info.last is not None]
+    if not firsts or not lasts:
+        return None
+    part = cut_of(recording.metadata)
+    start, end = (None, None) if part is None else (part.start, part.end)
+    return min(firsts) if start is None else start, max(lasts) if end is None else min(max(lasts), end)

@@ -98,6 +98,10 @@ class Inbox:
                     items.append(("envelope", key, payload))
         return not items
 
+    def close(self) -> None:
+        """Gives up what it waits by; the eventfd stays."""
+        self._poll.close()
+
     def counters(self) -> dict[str, int]:
         """Returns what has arrived through the rings."""
         return {

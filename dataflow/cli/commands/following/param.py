@@ -16,13 +16,13 @@ from dataflow.cli.support.output import (
     DIFFERENT,
     fail,
     friendly_errors,
-    jsonable,
     out,
     print_json,
     print_json_line,
     say,
     table,
 )
+from dataflow.text import jsonable
 
 if TYPE_CHECKING:
     from dataflow.client.processes import Parameter

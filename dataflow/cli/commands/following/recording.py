@@ -64,6 +64,7 @@ def record(
     Exit codes:
 
       0    written
+      1    another machine's graph was not heard for 30 s: written as far as it came
       2    could not record: no graph runs, a wrong option
 
     Examples:

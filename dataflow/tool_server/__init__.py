@@ -1,0 +1,1 @@
+"""The commands that find the cause of a failure, as tools of coding agents over the Model Context Protocol."""

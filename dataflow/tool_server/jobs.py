@@ -1,0 +1,205 @@
+"""Calls of tools, each in its own process: so many at once, answered within seconds or by a job that goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dataflow.execution.threads import environment
+from dataflow.text import json_text
+
+AT_ONCE = 2
+"""Processes that answer calls."""
+MOST_WAITING = 16
+"""Calls that are not answered yet."""
+KEPT = 64
+"""Jobs whose answers can be asked for again."""
+SOON = 4.5
+"""Seconds after which a call is answered by its job."""
+LONGEST = 1800.0
+"""Seconds that a call may take."""
+MOST_BYTES = 8000
+"""Of an answer, in UTF-8."""
+NOTE = 200
+"""Bytes of it for the note that there is more."""
+PRINTED = 2000
+"""Characters that are shown of what operators printed."""
+
+
+class Refused(ValueError):
+    """Raised for a call that failed; the message has what would be right."""
+
+
+@dataclass(slots=True)
+class Job:
+    """One call: `progress` as its process gave it, `text` the whole answer. `began`: when it was asked for (s)."""
+
+    name: str
+    tool: str
+    began: float
+    future: Future[None] = field(default_factory=Future)
+    process: subprocess.Popen[str] | None = None
+    progress: str = "waits for a process"
+    text: str = ""
+    failed: bool = False
+    cancelled: bool = False
+    seconds: float = 0.0
+
+
+class Jobs:
+    """Makes calls. `threads`: by a recording the number of threads of its operators. `soon`: see `SOON`."""
+
+    def __init__(self, threads: Callable[[Mapping[str, Any]], int] | None = None, *, soon: float = SOON) -> None:
+        self._threads, self._soon = threads or threads_of, soon
+        self._pool = ThreadPoolExecutor(AT_ONCE, "job")
+        self._jobs: dict[str, Job] = {}
+        self._lock = threading.Lock()
+        self._number = 0
+        self._closed = False
+
+    def call(self, tool: str, arguments: Mapping[str, Any]) -> str:
+        """Calls a tool: its answer, or that of its job if it takes longer. Raises `Refused`."""
+        with self._lock:
+            if sum(not job.future.done() for job in self._jobs.values()) >= MOST_WAITING:
+                raise Refused(f"{MOST_WAITING} jobs are not done: wait for one, or end one by job(id, cancel=true)")
+            self._number += 1
+            job = Job(str(self._number), tool, time.monotonic())
+            self._jobs[job.name] = job
+            for name in [n for n, each in self._jobs.items() if each.future.done()][: max(0, len(self._jobs) - KEPT)]:
+                del self._jobs[name]
+        job.future = self._pool.submit(self._work, job, dict(arguments))
+        return self._answer(job, 0)
+
+    def job(self, name: str, offset: int = 0, *, cancel: bool = False) -> str:
+        """Returns the answer of a job from a byte on, or how far it is. Raises `Refused`."""
+        with self._lock:
+            job = self._jobs.get(name)
+            if job is None:
+                raise Refused(f"no job {name!r}; there are: {', '.join(self._jobs) or 'none'}")
+            if cancel and not job.future.done():
+                job.cancelled = True
+                _end(job.process)
+        return self._answer(job, offset)
+
+    def close(self) -> None:
+        """Ends all processes."""
+        with self._lock:
+            self._closed = True
+            for job in self._jobs.values():
+                job.cancelled = True
+                _end(job.process)
+        self._pool.shutdown(cancel_futures=True)
+
+    def _answer(self, job: Job, offset: int) -> str:
+        wait([job.future], self._soon)
+        if not job.future.done():
+            state = {"job": job.name, "tool": job.tool, "seconds": round(time.monotonic() - job.began, 1)}
+            return json_text(state | {"progress": job.progress, "next": f'job(id="{job.name}") gives the answer'})
+        error = job.future.exception()
+        text = cut(job.text if error is None else str(error), offset, job.name)
+        if job.failed or error is not None:
+            raise Refused(text)
+        return text
+
+    def _work(self, job: Job, arguments: Mapping[str, Any]) -> None:
+        with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as printed:
+            with self._lock:
+                if job.cancelled or self._closed:
+                    raise Refused(f"job {job.name} was cancelled")
+                job.progress = "runs"
+                job.process = process = subprocess.Popen(
+                    [sys.executable, "-P", "-m", "dataflow.tool_server.work"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=printed,
+                    text=True,
+                    env=environment(self._threads(arguments)),
+                    start_new_session=True,
+                )
+            timer = threading.Timer(LONGEST, _end, [process])
+            timer.start()
+            try:
+                found = _converse(process, job, arguments)
+            finally:
+                timer.cancel()
+                _end(process)
+                process.wait()
+                job.seconds = time.monotonic() - job.began
+            printed.seek(max(0, printed.seek(0, os.SEEK_END) - PRINTED))
+            text = printed.read().strip()
+        if job.cancelled:
+            raise Refused(f"job {job.name} was cancelled after {job.seconds:.1f} s")
+        if found is None:
+            late = f" after {LONGEST:g} s, the longest that a call may take" if job.seconds >= LONGEST else ""
+            raise Refused(f"the process of {job.tool} ended without an answer{late} ({process.returncode}): {text}")
+        job.failed = "error" in found
+        job.text = found["error"] if job.failed else json_text(found["answer"])
+        if text and not job.failed:
+            job.text += f"\nprinted: {text}"
+
+
+def cut(text: str, offset: int, job: str) -> str:
+    """Returns the part of an answer from a byte on that fits, with how to ask for the rest."""
+    data = text.encode()
+    if not 0 <= offset <= len(data):
+        raise Refused(f"offset={offset}: the answer of job {job} has {len(data)} bytes")
+    if len(data) - offset <= MOST_BYTES:
+        return data[offset:].decode(errors="ignore")
+    end = offset + MOST_BYTES - NOTE
+    while data[end] & 0xC0 == 0x80:  # inside a character
+        end -= 1
+    rest = f'\n(bytes {offset} to {end} of {len(data)}: job(id="{job}", offset={end}) gives the rest)'
+    return data[offset:end].decode(errors="ignore") + rest
+
+
+def threads_of(arguments: Mapping[str, Any]) -> int:
+    """Returns the number of threads that the operators of a recording have; 1 where there is none."""
+    from dataflow.recording import Recording, RecordingError
+    from dataflow.reexecution.recorded_run import resolved_graph
+
+    file = Path(arguments.get("recording", ""))
+    if not file.is_file():
+        return 1
+    try:
+        with Recording(file) as opened:
+            graph = resolved_graph(opened)
+    except RecordingError:  # the process of the call reports it
+        return 1
+    return 1 if graph is None else graph.threads
+
+
+def _converse(process: subprocess.Popen[str], job: Job, arguments: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Returns the last line of a process; None where it ended without one."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        process.stdin.write(json.dumps({"tool": job.tool, "arguments": arguments}) + "\n")
+        process.stdin.close()
+    except BrokenPipeError:  # it has ended
+        return None
+    for line in process.stdout:
+        found: dict[str, Any] = json.loads(line)
+        if "progress" not in found:
+            return found
+        job.progress = found["progress"]
+    return None
+
+
+def _end(process: subprocess.Popen[str] | None) -> None:
+    """Ends a process with all that it started."""
+    if process is not None and process.poll() is None:
+        try:
+            os.killpg(process.pid, signal.SIGKILL)
+        except ProcessLookupError:  # it ended meanwhile
+            return

@@ -1,0 +1,61 @@
+"""The server, over standard input and output, by the package `mcp`."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import inspect
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from mcp.server.mcpserver import MCPServer
+from mcp.server.mcpserver.exceptions import ToolError
+
+from dataflow.tool_server.jobs import MOST_BYTES, Jobs, Refused
+from dataflow.tool_server.tools import TOOLS
+
+INSTRUCTIONS = f"""\
+Tools to find the cause of a failure in a recorded run of a robot's operators, which re-executes bit for bit.
+Begin with verify: it names the operators that do not make what was recorded. Then why, diff, goto, state, history and
+blame lead to the call and the line; what_if tries a change, capture writes the test, prove checks the fix.
+Recordings are files (.mcap) on this machine; graph is a graph file, path are folders in which operators' modules lie.
+An answer has at most {MOST_BYTES} bytes and names how to ask for the rest. A call of more than five seconds is
+answered by a job: ask for it with job(id)."""
+
+
+def serve() -> None:
+    """Serves one agent, until it closes standard input."""
+    jobs = Jobs()
+    server = MCPServer("dataflow", instructions=INSTRUCTIONS)
+    for tool in (*TOOLS.values(), _job):
+        server.add_tool(_served(tool, jobs), structured_output=False)
+    try:
+        server.run("stdio")
+    finally:
+        jobs.close()
+
+
+def _job(id: str, offset: int = 0, cancel: bool = False) -> Any:
+    """Give the answer of a job from a byte on, or how far it is; `cancel` ends it."""
+
+
+def _served(tool: Callable[..., Any], jobs: Jobs) -> Callable[..., Awaitable[str]]:
+    """Returns a tool as the server calls it: by a job, with the arguments that agents give."""
+
+    @functools.wraps(tool)
+    async def call(**arguments: Any) -> str:
+        try:
+            if tool is _job:
+                asked = functools.partial(jobs.job, arguments.pop("id"), **arguments)
+                return await asyncio.to_thread(asked)
+            return await asyncio.to_thread(jobs.call, tool.__name__, arguments)
+        except Refused as error:
+            raise ToolError(str(error)) from None
+
+    del call.__wrapped__
+    call.__name__ = tool.__name__.lstrip("_")
+    call.__doc__ = inspect.cleandoc(tool.__doc__ or "")
+    signature = inspect.signature(tool, eval_str=True)
+    given = [each for each in signature.parameters.values() if each.name != "say"]
+    call.__signature__ = signature.replace(parameters=given)  # type: ignore[attr-defined]
+    return call

@@ -1,0 +1,448 @@
+"""The tools: what each takes, and how the library answers it. They run in a process for each call (`work`)."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dataflow.debugging.debugger import Debugger
+    from dataflow.debugging.fired import Fired
+    from dataflow.graph import Graph
+    from dataflow.recording import Recording
+    from dataflow.verification.report import VerifyReport
+
+MOST_CALLS = 200
+"""Calls that `history` shows."""
+MOST_CHANGED = 50
+"""Changed calls that `prove` names."""
+
+Say = Callable[[str], None]
+"""Takes a line about how far the work is."""
+
+
+class ToolError(ValueError):
+    """Raised for arguments that do not fit; the message has what would be right."""
+
+
+def verify(
+    recording: str, only: list[str] | None = None, graph: str | None = None, path: list[str] | None = None
+) -> Any:
+    """Re-execute a recorded run with the code as it is now and compare every output, bit for bit.
+
+    A culprit was given the recorded inputs and made another output; `first` is its first differing call, with the
+    field. `only`: these operators; `graph`: a graph file in place of the recorded graph; `path`: folders of modules.
+    """
+    return _verified(_verify(_file(recording), only, _loaded(graph))[1])
+
+
+def why(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None) -> Any:
+    """Find why a culprit of `verify` does not repeat: at most 8 re-runs of it with clocks, random numbers, threads,
+    hashes, memory and files fixed in turn. Gives causes with the lines that led to them."""
+    from dataflow.causes.why import why as find
+
+    file, loaded = _file(recording), _loaded(graph)
+    return find(file, _verify(file, [operator], loaded)[1], operator, graph=loaded).as_json()
+
+
+def goto(recording: str, operator: str, call: str, graph: str | None = None, path: list[str] | None = None) -> Any:
+    """Make one recorded call of an operator again: what it was given, made, and changed, against the recording.
+
+    `call`: its number ("0" is the first, "-1" the last), "@12.3" (the last one by 12.3 s), or "diff" (the first that
+    does not give what was recorded).
+    """
+    with _debugger(recording, operator, graph) as (debugger, origin, _):
+        return _shown(_at(debugger, origin, call), debugger, origin)
+
+
+def diff(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None) -> Any:
+    """Go to the first call of an operator that does not give what was recorded, and show it as `goto` does."""
+    return goto(recording, operator, "diff", graph, path)
+
+
+def state(
+    recording: str, operator: str, call: str, part: str = "", graph: str | None = None, path: list[str] | None = None
+) -> Any:
+    """Show the state of an operator before and after a call (as in `goto`): the parts it changed, or the one named."""
+    from dataflow.execution.snapshots import changes
+
+    with _debugger(recording, operator, graph) as (debugger, origin, _):
+        fired = _at(debugger, origin, call)
+        before, after = fired.states()
+        if before is None or after is None:
+            raise ToolError(f"{debugger.node.name} has no state")
+        if part and part not in {*before, *after}:
+            raise ToolError(f"no part {part!r} in the state; there are: {', '.join(sorted({*before, *after}))}")
+        pairs = [(part, before.get(part), after.get(part))] if part else list(changes(before, after))
+        shown = {name: {"before": _text(was), "after": _text(now)} for name, was, now in pairs}
+        return {"call": fired.number, "parts": sorted({*before, *after}), "part" if part else "changed": shown}
+
+
+def history(
+    recording: str,
+    operator: str,
+    field: str,
+    first: int = 0,
+    last: int = -1,
+    graph: str | None = None,
+    path: list[str] | None = None,
+) -> Any:
+    """Give the value of a Python expression over the calls of an operator, from number `first` to `last`.
+
+    It sees inp, out (by input and port: "len(out.tracks.ids)"), stamp, number, same, error. Calls that give the same
+    value as the one before are left out; at most 200 are given. Where it fails, the error is the value.
+    """
+    with _debugger(recording, operator, graph) as (debugger, *_):
+        code = _compiled("field", field)
+        begin, end = (_number(debugger, number) for number in (first, last))
+        values: list[dict[str, Any]] = []
+
+        def visit(fired: Fired) -> bool:
+            try:
+                value = _text(_evaluated(code, field, fired.names()))
+            except ToolError as error:  # such as of an output that this call did not make
+                value = {"error": str(error)}
+            if not values or value != values[-1]["value"]:
+                values.append({"call": fired.number, "stamp": fired.call.stamp, "value": value})
+            return len(values) == MOST_CALLS
+
+        reached = _each(debugger, begin, end, visit)
+    rest = {} if reached == end else {"next": f"history with first={reached + 1} goes on"}
+    return {"field": field, "calls": [begin, reached], "changes": values} | rest
+
+
+def what_if(
+    recording: str,
+    operator: str,
+    call: str,
+    params: dict[str, Any] | None = None,
+    show: str = "",
+    graph: str | None = None,
+    path: list[str] | None = None,
+) -> Any:
+    """Make one call of an operator again with other parameters, or with its source as it was edited, from the recorded
+    inputs and state; compare with the recording.
+
+    `params`: values by name, such as {"threshold": 0.3}; `show`: a Python expression over the call, which also sees
+    before and after, the states.
+    """
+    with _debugger(recording, operator, graph, params) as (debugger, origin, _):
+        fired = _at(debugger, origin, call)
+        found = _shown(fired, debugger, origin)
+        if show:
+            found["show"] = _text(_evaluated(_compiled("show", show), show, _names(fired)))
+        return found
+
+
+def capture(
+    recording: str,
+    operator: str,
+    to: str,
+    call: int | None = None,
+    predicate: str = "",
+    graph: str | None = None,
+    path: list[str] | None = None,
+) -> Any:
+    """Write a wrong call of an operator as a pytest file with the smallest inputs that still show it.
+
+    `to`: the file, which must not exist (test_NAME.py; its data lie beside it). `call`: its number, by default the
+    first wrong one. `predicate`: a Python expression, true of a wrong call; by default: not as recorded, or an error.
+    """
+    from dataflow.capture.capture import capture as find
+    from dataflow.capture.capture import write_test
+
+    file = Path(to)
+    if file.suffix != ".py" or file.exists() or not file.parent.is_dir():
+        raise ToolError(f"to={to!r}: expected a new file that ends in .py, in a folder that exists")
+    if predicate:
+        _compiled("predicate", predicate)
+    with _debugger(recording, operator, graph) as (debugger, _, opened):
+        found = find(opened, debugger, call, predicate)
+    words = ["dataflow", "capture", Path(recording).name, "--op", operator, "--firing", str(found.number)]
+    words += ["--predicate", predicate] * bool(predicate) + ["--graph", graph or ""] * bool(graph)
+    words += [word for folder in path or () for word in ("--path", folder)]
+    nbytes = write_test(found, file, Path(recording).name, shlex.join(words))
+    kept = {"call": found.number, "calls": found.calls, "kept": found.left, "begins": found.begins}
+    return {"test": to, "wrong": found.wrong, "bytes": nbytes} | kept
+
+
+def blame(
+    recording: str,
+    field: str,
+    budget: float = 60.0,
+    graph: str | None = None,
+    path: list[str] | None = None,
+    *,
+    say: Say,
+) -> Any:
+    """Find what decided a value: the chain of calls back to the sensors' messages, each shown by re-execution.
+
+    `field`: STREAM.FIELD@SECONDS, such as "tracks.ids[3]@12.4"; `budget`: seconds to look for it.
+    """
+    from dataflow.blame.chain import Blame
+    from dataflow.blame.field import Field
+    from dataflow.recording import Recording
+
+    def watch(made: int, links: int) -> None:
+        say(f"{made} calls made again, {links} links found")
+
+    with Recording(_file(recording)) as opened:
+        found = Blame(opened, Field.parse(field), _loaded(graph), budget=budget, watch=watch)
+        return found.find().as_json()
+
+
+def drops(
+    recording: str,
+    worse: str,
+    budget: float = 60.0,
+    graph: str | None = None,
+    path: list[str] | None = None,
+    *,
+    say: Say,
+) -> Any:
+    """Find a smallest set of drops, late messages and timeouts of a live run without which its figures are not bad.
+
+    `worse`: a Python expression over the figures, true where they are bad: "ate_rmse_m > 0.05"; `budget`: seconds.
+    """
+    from dataflow.drops.search import Drops
+    from dataflow.recording import Recording
+
+    def watch(replays: int, left: int) -> None:
+        say(f"{replays} replays; losses undone in the next one: {left}")
+
+    _compiled("worse", worse)
+    with Recording(_file(recording)) as opened:
+        return asdict(Drops(opened, worse, _loaded(graph), budget=budget, watch=watch).find())
+
+
+def prove(
+    recording: str,
+    operator: str,
+    call: str,
+    expect: str,
+    may_change: str = "True",
+    params: dict[str, Any] | None = None,
+    graph: str | None = None,
+    path: list[str] | None = None,
+    *,
+    say: Say,
+) -> Any:
+    """Check a fix (edited source, or `params`): it changes what it should, and nothing else.
+
+    Proven is a fix by which the call gives another result than the recorded one, for which `expect` is true, all other
+    calls of the operator that change are such that `may_change` is true, and every other operator that is given the
+    recorded inputs makes what was recorded. Both are Python expressions over a call: inp, out, stamp, number, same,
+    error; `expect` also sees before and after, the states. `call`: as in `goto`.
+    """
+    expected, allowed = _compiled("expect", expect), _compiled("may_change", may_change)
+    with _debugger(recording, operator, graph, params) as (debugger, origin, _):
+        fired = _at(debugger, origin, call)
+        number, name, changed_graph = fired.number, debugger.node.name, debugger.graph
+        meets = bool(_evaluated(expected, expect, _names(fired)))
+        differs = not fired.same
+        shown = _shown(fired, debugger, origin)
+        say(f"call {number} of {name} made again; all its calls follow")
+        changed: list[int] = []
+        refused: list[int] = []
+
+        def visit(each: Fired) -> bool:
+            if not each.same:
+                changed.append(each.number)
+                if each.number != number and not _evaluated(allowed, may_change, each.names()):
+                    refused.append(each.number)
+            return False
+
+        _each(debugger, 0, len(debugger.calls) - 1, visit)
+    say("all operators are verified")
+    with_graph = changed_graph if graph or params else None
+    others, report = _verify(_file(recording), None, with_graph)
+    verdicts = {v.operator: report.verdict(v) for v in report.operators if v.operator != name}
+    after = _downstream(changed_graph, name)
+    bad = {
+        n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)
+    } | dict.fromkeys(others, "not re-executed")
+    reasons = [
+        *(() if differs else [f"call {number} still gives what was recorded"]),
+        *(() if meets else [f"call {number}: expect is false: {expect}"]),
+        *([f"calls that may not change do: {refused[:MOST_CHANGED]}"] if refused else ()),
+        *([f"other operators: {bad}"] if bad else ()),
+    ]
+    return {
+        "proven": not reasons,
+        "reasons": reasons,
+        "changed_calls": {"count": len(changed), "of": len(debugger.calls), "first": changed[:MOST_CHANGED]},
+        "other_operators": {v: sorted(n for n, of in verdicts.items() if of == v) for v in set(verdicts.values())},
+        "call": shown,
+    }
+
+
+TOOLS: Mapping[str, Callable[..., Any]] = {
+    each.__name__: each for each in (verify, why, goto, diff, state, history, what_if, capture, blame, drops, prove)
+}
+
+
+def answer(name: str, arguments: Mapping[str, Any], say: Say) -> Any:
+    """Answers one call of a tool by values that JSON can hold. Raises what the library raises."""
+    import inspect
+
+    from dataflow.graph.search import add_current_folder, add_folder
+
+    for folder in arguments.get("path") or ():
+        if not Path(folder).is_dir():
+            raise ToolError(f"path: no such folder: {folder}")
+        add_folder(folder)
+    add_current_folder()
+    tool = TOOLS[name]
+    more = {"say": say} if "say" in inspect.signature(tool).parameters else {}
+    return tool(**arguments, **more)
+
+
+# ------------------------------------------------------------------------------------------------- inside
+
+
+def _file(recording: str) -> Path:
+    file = Path(recording)
+    if not file.is_file():
+        near = sorted(str(each) for each in file.parent.glob("*.mcap"))[:5] if file.parent.is_dir() else []
+        raise ToolError(f"no recording {recording}; beside it: {', '.join(near) or 'none'}")
+    return file
+
+
+def _loaded(graph: str | None) -> Graph | None:
+    from dataflow.graph import load_graph
+
+    return None if graph is None else load_graph(graph)
+
+
+def _verify(file: Path, only: Sequence[str] | None, graph: Graph | None) -> tuple[list[str], VerifyReport]:
+    """Returns the recorded operators that were left out, and the report."""
+    from dataflow.verification.verify import verify as verify_recording
+
+    report = verify_recording(file, graph=graph, only=only or None)
+    return sorted(report.absent), report
+
+
+def _verified(report: VerifyReport) -> dict[str, Any]:
+    """Returns the report, of identical operators the names alone."""
+    values = report.as_json()
+    by: dict[str, list[str]] = {}
+    for each in values["operators"]:
+        by.setdefault(each["verdict"], []).append(each["operator"])
+    values["verdicts"] = by
+    values["operators"] = [each for each in values["operators"] if each["verdict"] != "identical"]
+    return {name: value for name, value in values.items() if value not in ([], {}, None)}
+
+
+@contextmanager
+def _debugger(
+    recording: str, operator: str, graph: str | None, params: Mapping[str, Any] | None = None
+) -> Iterator[tuple[Debugger, int, Recording]]:
+    """Opens a debugger, with the stamp of 0 s and the recording."""
+    from dataflow.debugging.debugger import Debugger
+    from dataflow.execution.feeds.playable import span_of
+    from dataflow.recording import Recording
+
+    with Recording(_file(recording)) as opened:
+        loaded = _loaded(graph)
+        if params:
+            loaded = _with(loaded, opened, operator, params)
+        debugger = Debugger(opened, operator, loaded)
+        try:
+            yield debugger, (span_of(opened, opened.streams) or (0, 0))[0], opened
+        finally:
+            debugger.close()
+
+
+def _with(graph: Graph | None, recording: Recording, operator: str, params: Mapping[str, Any]) -> Graph:
+    """Returns the graph with other parameters of one operator."""
+    from dataflow.operator import validate_parameters
+    from dataflow.reexecution.recorded_run import graph_that_is_here
+
+    graph = graph_that_is_here(recording)[0] if graph is None else graph
+    node = graph.nodes.get(operator)
+    if node is None:
+        raise ToolError(f"no operator {operator!r} in the graph; there are: {', '.join(sorted(graph.nodes))}")
+    changed = {**node.params, **params}
+    validate_parameters(node.operator, changed)
+    return replace(graph, nodes={**graph.nodes, operator: replace(node, params=changed)})
+
+
+def _at(debugger: Debugger, origin: int, call: str) -> Fired:
+    if call == "diff":
+        if (found := debugger.first_difference()) is None:
+            raise ToolError(f"{debugger.node.name}: all {len(debugger.calls)} calls give what was recorded")
+        return found
+    try:
+        if call.startswith("@"):
+            return debugger.goto(debugger.number_at(origin + round(float(call[1:]) * 1e9)))
+        number = int(call)
+    except ValueError:
+        raise ToolError(f'call={call!r}: expected a number such as "7" or "-1", "@SECONDS" or "diff"') from None
+    return debugger.goto(number)
+
+
+def _number(debugger: Debugger, number: int) -> int:
+    count = len(debugger.calls)
+    if not -count <= number < count:
+        raise ToolError(f"{debugger.node.name} has calls 0 to {count - 1}, there is no {number}")
+    return range(count)[number]
+
+
+def _each(debugger: Debugger, begin: int, end: int, visit: Callable[[Fired], bool]) -> int:
+    """Visits the calls from one number to another, until a visit returns true; returns the number of the last one."""
+    debugger.at = debugger.goto(begin - 1) if begin else None
+    found = debugger.until(lambda fired: visit(fired) or fired.number == end)
+    return end if found is None else found.number
+
+
+def _shown(fired: Fired, debugger: Debugger, origin: int) -> dict[str, Any]:
+    given = {m.port: _fields(m.here) for m in fired.made}
+    return fired.as_json(debugger.node.name, origin) | {"of": len(debugger.calls), "made": given}
+
+
+def _fields(message: Any) -> Any:
+    return None if message is None else {name: _text(value) for name, value in message.items()}
+
+
+def _names(fired: Fired) -> dict[str, Any]:
+    before, after = fired.states()
+    return fired.names() | {"before": before, "after": after}
+
+
+def _text(value: Any) -> Any:
+    from dataflow.messages.display.text import field_text
+
+    return value if value is None or isinstance(value, bool | int | float) else field_text(value)
+
+
+def _compiled(argument: str, text: str) -> Any:
+    try:
+        return compile(text, f"<{argument}>", "eval")
+    except SyntaxError as error:
+        raise ToolError(f"{argument}={text!r}: no Python expression: {error.msg}") from None
+
+
+def _evaluated(code: Any, text: str, names: dict[str, Any]) -> Any:
+    try:
+        return eval(code, names)
+    except Exception as error:
+        parts = [f"{n}.{m}" for n in ("inp", "out") for m in vars(names[n])]
+        there = ", ".join(parts + [f"{n}[{m!r}]" for n in ("before", "after") for m in names.get(n) or ()])
+        raise ToolError(
+            f"{text} at call {names['number']}: {type(error).__name__}: {error}; there are: {there}"
+        ) from None
+
+
+def _downstream(graph: Graph, operator: str) -> set[str]:
+    """Returns the operators that take, directly or not, what one makes."""
+    found, waiting = set[str](), [operator]
+    while waiting:
+        name = waiting.pop()
+        more = {node.name for stream in graph.nodes[name].outputs.values() for node, _ in graph.consumers(stream)}
+        waiting += more - found
+        found |= more
+    return found

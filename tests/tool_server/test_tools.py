@@ -1,0 +1,168 @@
+"""Each tool answers as the command of its name does, in JSON values; what does not fit is refused with what would."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.text import json_text
+from dataflow.tool_server.tools import ToolError, answer
+
+SKIPPED, DEGREES = 613, 640
+"""The first calls of `sum` and `sine` that the bugs change."""
+
+
+def ask(tool: str, recording: str, **arguments: Any) -> Any:
+    """Returns the answer as an agent gets it."""
+    return json.loads(json_text(answer(tool, {"recording": recording, **arguments}, lambda text: None)))
+
+
+def test_verify_names_culprits_with_their_first_call(bugs: dict[str, str]) -> None:
+    told = ask("verify", bugs["right"])
+
+    assert not told["identical"]
+    assert sorted(told["culprits"]) == ["sine", "sum"]
+    assert {each["operator"] for each in told["operators"]} == {"sine", "sum"}
+    assert all(each["first"]["stamp"] for each in told["operators"])
+
+
+def test_a_call_is_shown_with_its_difference(bugs: dict[str, str]) -> None:
+    found = ask("diff", bugs["right"], operator="sine")
+
+    assert (found["number"], found["same"], found["of"]) == (DEGREES, False, 701)
+    assert [each["field"] for each in found["outputs"]["out"]["fields"]] == ["vectors"]
+    assert found == ask("goto", bugs["right"], operator="sine", call=str(DEGREES))
+    assert ask("goto", bugs["right"], operator="sine", call="@6.4")["number"] == DEGREES
+    assert ask("goto", bugs["right"], operator="sine", call="-1")["number"] == 700
+
+
+def test_the_state_before_and_after_a_call(bugs: dict[str, str]) -> None:
+    told = ask("state", bugs["wrong"], operator="sum", call="5")
+
+    assert told["changed"] == {"total": {"before": 10.0, "after": 15.0}}
+    assert ask("state", bugs["wrong"], operator="sum", call=str(SKIPPED))["changed"] == {}
+    with pytest.raises(ToolError, match="no part 'nothing' in the state; there are: "):
+        ask("state", bugs["wrong"], operator="sum", call="5", part="nothing")
+    with pytest.raises(ToolError, match="sine has no state"):
+        ask("state", bugs["wrong"], operator="sine", call="5")
+
+
+def test_the_history_of_a_field_leaves_out_what_stays(bugs: dict[str, str]) -> None:
+    told = ask("history", bugs["wrong"], operator="sum", field="out.out.vectors[0, 0]", first=SKIPPED - 2, last=-1)
+
+    assert told["calls"] == [SKIPPED - 2, 700]
+    assert [each["call"] for each in told["changes"][:3]] == [SKIPPED - 2, SKIPPED - 1, SKIPPED + 1]
+    part = ask("history", bugs["wrong"], operator="sum", field="number")
+    assert (part["calls"], part["next"]) == ([0, 199], "history with first=200 goes on")
+    wrong = ask("history", bugs["wrong"], operator="sum", field="out.none", last=3)
+    assert len(wrong["changes"]) == 4
+    assert "there are: inp.x, out.out" in wrong["changes"][0]["value"]["error"]
+
+
+def test_what_if_the_code_or_a_parameter_were_another(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ZOO_FIXED", "1")
+    told = ask("what_if", bugs["wrong"], operator="sum", call=str(SKIPPED), show="after['total']")
+
+    assert not told["same"]
+    assert told["show"] == sum(range(SKIPPED + 1))
+    with pytest.raises(ValueError, match="Skips has no parameter 'step'"):
+        ask("what_if", bugs["wrong"], operator="sum", call="3", params={"step": 2})
+    with pytest.raises(ToolError, match="no operator 'summ' in the graph; there are: sine, src, sum"):
+        ask("what_if", bugs["wrong"], operator="summ", call="3", params={"step": 2})
+
+
+@pytest.mark.long
+def test_a_fix_is_proven_when_it_changes_what_it_should_and_nothing_else(
+    bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = "out.out.vectors[0, 0] == before['total'] + 613"
+    common = {"operator": "sum", "call": str(SKIPPED)}
+    told = ask("prove", bugs["wrong"], expect=right, **common)
+    assert not told["proven"]
+    assert told["reasons"] == ["call 613 still gives what was recorded", f"call 613: expect is false: {right}"]
+
+    monkeypatch.setenv("ZOO_FIXED", "1")  # which mends sine, too: something else
+    told = ask("prove", bugs["wrong"], expect=right, may_change="number < 620", **common)
+    assert not told["proven"]
+    assert told["changed_calls"]["count"] == 700 - SKIPPED
+    assert told["reasons"][0].startswith("calls that may not change do: [620, 621")
+    assert told["reasons"][1:] == ["other operators: {'sine': 'culprit'}"]
+
+
+def test_a_proven_fix(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zoo.bugs.Skips.work", lambda self, k, kind: _added(self.state, k))
+    expect = {"expect": "out.out.vectors[0, 0] == 188_191", "may_change": f"number > {SKIPPED}"}
+
+    only = ask("prove", bugs["wrong"], operator="sum", call=str(SKIPPED), **expect)
+
+    assert only["reasons"] == []
+    assert only["proven"]
+    assert only["other_operators"] == {"identical": ["sine"]}
+
+
+def _added(state: Any, k: float) -> list[float]:
+    state.total += k
+    return [state.total]
+
+
+def test_a_wrong_call_becomes_a_test(bugs: dict[str, str], tmp_path: Path) -> None:
+    file = tmp_path / "test_sine.py"
+    told = ask("capture", bugs["right"], operator="sine", to=str(file))
+
+    assert (told["call"], told["kept"]) == (DEGREES, 1)
+    assert "dataflow capture right.mcap --op sine --firing 640" in file.read_text()
+    done = subprocess.run([sys.executable, "-m", "py_compile", str(file)], check=False, timeout=60)
+    assert done.returncode == 0
+    with pytest.raises(ToolError, match=r"expected a new file that ends in \.py"):
+        ask("capture", bugs["right"], operator="sine", to=str(file))
+
+
+def test_blame_leads_to_the_source_and_tells_how_far_it_is(bugs: dict[str, str]) -> None:
+    said: list[str] = []
+    arguments = {"recording": bugs["wrong"], "field": "sine/out.vectors[0,0]@1"}
+    told = json.loads(json_text(answer("blame", arguments, said.append)))
+
+    assert told["whole"]
+    assert [place[0] for place in told["sensed"]] == ["bugs/src/x"]
+    assert "links found" in said[-1]
+
+
+def test_drops_refuses_with_the_figures_that_there_are(bugs: dict[str, str]) -> None:
+    with pytest.raises(ReplayError):
+        ask("drops", bugs["wrong"], worse="ate > 1")
+    with pytest.raises(ToolError, match="worse='ate >': no Python expression"):
+        ask("drops", bugs["wrong"], worse="ate >")
+
+
+@pytest.mark.long
+def test_why_finds_that_code_repeats_and_differs_from_the_recorded(bugs: dict[str, str]) -> None:
+    told = ask("why", bugs["right"], operator="sine")
+
+    assert told["repeats"]
+    assert told["operator"] == "sine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"call": "first"}, 'expected a number such as "7" or "-1", "@SECONDS" or "diff"'),
+        ({"call": "701"}, "sine has calls 0 to 700, there is no 701"),
+        ({"call": "0", "operator": "cosine"}, "there are: sine, sum"),
+        ({"call": "0", "path": ["nowhere"]}, "path: no such folder: nowhere"),
+    ],
+)
+def test_wrong_arguments_are_refused(bugs: dict[str, str], arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        ask("goto", bugs["right"], **{"operator": "sine", **arguments})
+
+
+def test_a_missing_recording_is_named_with_those_beside_it(bugs: dict[str, str]) -> None:
+    with pytest.raises(ToolError, match=r"no recording .*rigth\.mcap; beside it: .*right\.mcap, .*wrong\.mcap"):
+        ask("verify", bugs["right"].replace("right", "rigth"))
