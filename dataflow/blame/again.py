@@ -55,6 +55,8 @@ class Effects:
                 made: Mapping[str, Message] | None = {}
             else:
                 made = line.fire(call.number, replace(shot.firing, inputs=inputs), other=True)
+            if made is None and line.records[call.number].outcome == "error":
+                made = {}  # as in the run
             if made is None:
                 line.leave()
                 return AS_IT_WAS

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -33,8 +33,8 @@ SECONDS = 60.0
 ANOTHER = 8
 """Other messages of a stream, from its whole length, that are put in place of one of which nothing else shows an
 effect: a number on the same side of a threshold, nudged, shows none."""
-MOST_BYTES = 2**30
-"""Of the inputs of one operator's calls: beyond it earlier calls are not looked for."""
+MOST_BYTES = 2**31
+"""Of the inputs of all calls that are held: beyond it no others are read."""
 HISTORY = 0.5
 """Of the time that is left, what the earlier calls of one operator may take."""
 
@@ -50,7 +50,7 @@ class Effect:
     `together`: how many inputs, or calls, were others at once, none of which changes the value alone (a tie).
     """
 
-    way: Way | Literal["call left out"]
+    way: Way | Literal["call left out", "a new operator"]
     fields: tuple[str, ...]
     value: Any
     together: int = 1
@@ -62,7 +62,8 @@ class Link:
 
     - `call`: the one that took it; `stamp`: its, in ns.
     - `message`: of an input. `maker`: the call that made the message, or that left its mark in the state; None where it
-      comes from a source, or from an operator that is not made again.
+      comes from a source, or from an operator that is not made again, and for a state that the operator was given
+      before `call` (a reload, a beginning in the middle).
     - `effects`: the changes of it that changed the value.
     """
 
@@ -81,9 +82,10 @@ class Chain:
 
     - `value`, of the message `place` that `target` made. `links`: why each is on the chain.
     - `sensed`: the links at the chain's ends.
-    - `left`: calls on the chain that were not looked into, as the time was up. `unsplit`: operator, first and last of
-      calls of which some left their mark in the state, which the time, or the memory for
-      their inputs (`MOST_BYTES`), did not suffice to find.
+    - `left`: calls on the chain that were not looked into, as the time or the memory for inputs (`MOST_BYTES`) was up.
+      `unsplit`: operator, first and last of calls of which some left their mark in the state, which were not found for
+      the same reason, or as the operator was given its state behind them.
+    - `ended`: by operator, the call before which a new operator gives the same value, so that none before was tried.
     """
 
     target: Call
@@ -93,6 +95,7 @@ class Chain:
     links: list[Link] = field(default_factory=list)
     left: list[Call] = field(default_factory=list)
     unsplit: list[tuple[str, int, int]] = field(default_factory=list)
+    ended: dict[str, int] = field(default_factory=dict)
     made: int = 0
     seconds: float = 0.0
 
@@ -130,6 +133,7 @@ class Chain:
             "whole": self.whole,
             "not_looked_into": [[*call] for call in self.left],
             "not_taken_apart": [[*each] for each in self.unsplit],
+            "not_tried_before": dict(self.ended),
             "calls_made": self.made,
             "seconds": self.seconds,
         }
@@ -160,7 +164,10 @@ class Blame:
         self.graph = graph_that_is_here(recording)[0] if graph is None else graph
         self._budget, self._deadline = budget, float("inf")
         self._lines: dict[str, Line] = {}
-        self._order = {name: number for number, name in enumerate(self.graph.nodes)}
+        above = {name: _above(self.graph, name) for name in self.graph.nodes}
+        self._rank = {name: len(found) for name, found in above.items()}
+        """More than that of each operator that is upstream; equal in a cycle."""
+        self._in_cycle = {n for n, found in above.items() if any(n in above[m] for m in found if m != n)}
         self._takers: dict[Place, list[Call]] = {}
         """The calls whose inputs are held that take a message."""
         self._last: dict[str, int] = {}
@@ -184,7 +191,7 @@ class Blame:
             finally:
                 for line in self._lines.values():
                     line.close()
-        chain.links.sort(key=lambda link: self._age(link.call))
+        chain.links.sort(key=lambda link: (-link.stamp, self._age(link.call)))
         chain.seconds = time.monotonic() - began
         return chain
 
@@ -208,17 +215,16 @@ class Blame:
         else:
             raise BlameError(f"{stream} has no message at or before {self._field.seconds:g} s")
         target, record = Call(maker, number), line.records[number]
-        self._reach(target, number)
+        try:
+            self._reach(target, number)
+        except _OutOfTime:
+            raise BlameError(f"the inputs of call {number} of {maker} take more than {MOST_BYTES:,} bytes") from None
         self._port = list(node.outputs)[port]
         shot = line.shots.get(number)
         if shot is None or shot.here.get(self._port) != emission.digest:
             raise BlameError(f"call {number} of {maker} does not give what was recorded: see dataflow verify")
         self._last[maker] = number
-        line.begin(number)
-        made = line.fire(number, shot.firing)
-        message = None if made is None else made.get(self._port)
-        if message is None or message.digest() != emission.digest:
-            raise BlameError(f"call {number} of {maker} does not repeat: dataflow verify --why {self._recording.path}")
+        message = self._repeated(target)[self._port]
         value = self._field.value(message)
         if value is None:
             raise BlameError(f"{stream} at {emission.stamp} ns has no {self._field.path.lstrip('.')}: {message!r}")
@@ -234,7 +240,7 @@ class Blame:
 
     def _line(self, operator: str) -> Line:
         if operator not in self._lines:
-            self._lines[operator] = Line(self._recording, self.graph, operator, self._count)
+            self._lines[operator] = Line(self._recording, self.graph, operator, self._count, self._was_read)
         return self._lines[operator]
 
     def _count(self) -> None:
@@ -242,17 +248,37 @@ class Blame:
         if time.monotonic() > self._deadline:
             raise _OutOfTime
 
+    def _was_read(self, nbytes: int) -> None:
+        if time.monotonic() > self._deadline or sum(line.nbytes for line in self._lines.values()) + nbytes > MOST_BYTES:
+            raise _OutOfTime
+
+    def _repeated(self, call: Call) -> Mapping[str, Message]:
+        """Makes a call as it was; returns its messages by port. Raises `BlameError` where they are others."""
+        line = self._lines[call.operator]
+        line.begin(call.number)
+        made = line.fire(call.number, line.shots[call.number].firing) or {}
+        if {port: message.digest() for port, message in made.items()} != line.shots[call.number].here:
+            where = f"call {call.number} of {call.operator}"
+            raise BlameError(f"{where} does not repeat: dataflow verify --why {self._recording.path}")
+        return made
+
     def _reach(self, call: Call, last: int) -> None:
         line = self._line(call.operator)
         for number in line.reach(call.number, last):
             for given in line.shots[number].firing.inputs.values():
                 for entry in entries_of(given):
                     self._takers.setdefault(place_of(entry), []).append(Call(call.operator, number))
+        if line.other is not None:
+            raise BlameError(
+                f"call {line.other} of {call.operator} does not give what was recorded: see dataflow verify"
+            )
 
     def _age(self, call: Call) -> tuple[int, int, int]:
-        """Orders calls, the latest first: messages only come from calls that began before."""
-        record = self._lines[call.operator].records[call.number]
-        return -record.wall_start, -record.stamp, -self._order[call.operator]
+        """Orders calls, those that others depend on last: by operator, downstream first; in a cycle of operators by
+        when they began."""
+        operator, number = call
+        began = self._lines[operator].records[number].wall_start if operator in self._in_cycle else 0
+        return -self._rank[operator], -began, -number
 
     # ------------------------------------------------------------------------------------------------- the search
 
@@ -279,19 +305,41 @@ class Blame:
         self._reach(call, max(call.number, self._last[call.operator]))
         if (shot := line.shots.get(call.number)) is None:
             return
+        if call != self._chain.target:
+            self._repeated(call)
+        without: list[list[Slot]] = []
         for name, given in shot.firing.inputs.items():
             slots = [(name, k) for k in range(len(entries_of(given)))]
-            for (_, k), effects in self._deciding(call, shot.firing, slots):
-                entry = entries_of(given)[k]
-                self._link(call, name, entry, effects)
+            found = list(self._deciding(call, shot.firing, slots))
+            self._link_all(call, shot.firing, found)
+            if slots and not found:
+                without.append(slots)
+        if len(without) > 1:
+            self._link_all(call, shot.firing, self._tied(call, shot.firing, without))
         if not line.stateless:
             self._look_back(call)
+
+    def _link_all(self, call: Call, firing: Firing, found: Iterable[tuple[Slot, tuple[Effect, ...]]]) -> None:
+        for (name, k), effects in found:
+            self._link(call, name, entries_of(firing.inputs[name])[k], effects)
+
+    def _tied(
+        self, call: Call, firing: Firing, inputs: Sequence[Sequence[Slot]]
+    ) -> Iterator[tuple[Slot, tuple[Effect, ...]]]:
+        """Yields the messages of several inputs that decide together, though none alone."""
+        effects = self._together(call, firing, [slot for slots in inputs for slot in slots])
+        left = list(inputs) if effects else []
+        for slots in inputs:
+            rest = [each for each in left if each is not slots]
+            if len(rest) > 1 and (fewer := self._together(call, firing, [slot for each in rest for slot in each])):
+                left, effects = rest, fewer
+        yield from ((slot, effects) for slots in left for slot in slots)
 
     def _link(self, call: Call, name: str, entry: Entry, effects: tuple[Effect, ...]) -> None:
         maker = self._maker(entry)
         stamp = self._lines[call.operator].records[call.number].stamp
         self._chain.links.append(Link(call, stamp, name, place_of(entry), entry.stamp, maker, effects))
-        if maker is not None:
+        if maker is not None and any(effect.together == 1 for effect in effects):
             self._queue(maker)
 
     def _maker(self, entry: Entry) -> Call | None:
@@ -428,22 +476,38 @@ class Blame:
         self._deadline = min(deadline, time.monotonic() + HISTORY * (deadline - time.monotonic()))
         try:
             while end > first:
-                if line.nbytes > MOST_BYTES:
-                    raise _OutOfTime
                 begin = max(first, end - size)
                 self._reach(Call(operator, begin), self._last[operator])
                 for number, effects in self._marks(call, begin, end):
                     earlier = Call(operator, number)
                     self._chain.links.append(Link(call, line.records[call.number].stamp, "", None, 0, earlier, effects))
-                    self._queue(earlier)
+                    if any(effect.together == 1 for effect in effects):
+                        self._queue(earlier)
                 self._searched[operator] = begin
                 if begin > first and self._changed({}, anew=Call(operator, begin)) is None:
+                    self._chain.ended[operator] = min(begin, self._chain.ended.get(operator, begin))
                     break
                 size, end = max(size, call.number - begin), begin
+            else:
+                self._look_at_beginning(Call(operator, first))
         except _OutOfTime:
             self._chain.unsplit.append((operator, first, end - 1))
         finally:
             self._deadline = deadline
+
+    def _look_at_beginning(self, first: Call) -> None:
+        """Names the state that an operator was given before its first call, where that decides."""
+        line = self._lines[first.operator]
+        if not line.begins_with_state(first.number) or any(
+            link.call == first and not link.input and link.maker is None for link in self._chain.links
+        ):
+            return
+        if (found := self._changed({}, anew=first)) is None:
+            return
+        effects = (Effect("a new operator", (), found[0]),)
+        self._chain.links.append(Link(first, line.records[first.number].stamp, "", None, 0, None, effects))
+        if first.number:
+            self._chain.unsplit.append((first.operator, 0, first.number - 1))
 
     def _marks(self, call: Call, begin: int, end: int) -> Iterator[tuple[int, tuple[Effect, ...]]]:
         """Yields those calls from `begin` to before `end` that decide by what they leave in the state."""
@@ -487,3 +551,13 @@ class Blame:
             return None
         value = self._field.value(message)
         return (value,) if differ(self._value, value, self._tolerance) else None
+
+
+def _above(graph: Graph, operator: str) -> set[str]:
+    """The operator, and all that it depends on."""
+    found, left = {operator}, [operator]
+    while left:
+        makers = {graph.streams[stream].node for stream in graph.nodes[left.pop()].taken} - found
+        found |= makers
+        left += makers
+    return found

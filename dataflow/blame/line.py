@@ -17,7 +17,7 @@ from dataflow.execution.restarts import close_quietly
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
-from dataflow.records.cuts import parameters_at
+from dataflow.records.cuts import is_known, parameters_at
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import seeding_of
@@ -45,8 +45,16 @@ class Line:
     Raises as `Debugger`.
     """
 
-    def __init__(self, recording: Recording, graph: Graph, operator: str, made: Callable[[], None]) -> None:
-        """`made` is called before each call that is made again."""
+    def __init__(
+        self,
+        recording: Recording,
+        graph: Graph,
+        operator: str,
+        made: Callable[[], None],
+        read: Callable[[int], None],
+    ) -> None:
+        """`made` is called before each call that is made again, `read` with the bytes of the inputs of each that is
+        read."""
         self._debugger = Debugger(recording, operator, graph)
         self.node = node = self._debugger.node
         records = list(FiringLog.read(recording).ordered(node))
@@ -57,6 +65,10 @@ class Line:
         places = [(r.incarnation, r.index) for r in self.records]
         before = [bisect.bisect_left(setups, place) for place in places]
         self._begins = [bisect.bisect_left(places, setups[k - 1]) if k else 0 for k in before]
+        given = [r for r in self._changes if r.kind in ("restore", "cut") and is_known(r)]
+        self._with_states = {bisect.bisect_left(places, (r.incarnation, r.index)) for r in given}
+        self.other: int | None = None
+        """The first call that was read and is not what was recorded."""
         self.shots: dict[int, Shot] = {}
         self.first = len(self.records)
         self.nbytes = 0
@@ -64,7 +76,7 @@ class Line:
         self._read: set[int] = set()
         self._states: dict[int, bytes] = {}
         """States before calls."""
-        self._graph, self._seeding, self._made = graph, seeding_of(recording), made
+        self._graph, self._seeding, self._made, self._was_read = graph, seeding_of(recording), made, read
         self._journal = RecordedJournal()
         self._calls: Calls | None = None
         self._at = -1
@@ -84,6 +96,10 @@ class Line:
         """The number of the first call behind the operator's last `setup()` before a call."""
         return self._begins[number]
 
+    def begins_with_state(self, number: int) -> bool:
+        """Returns whether the operator was given a state before a call: it was reloaded, or began in the middle."""
+        return number in self._with_states
+
     def emitted(self, stream: str, place: tuple[int, int]) -> int | None:
         """The number of the call that emitted a message (incarnation, number); None where it was no call."""
         port = list(self.node.outputs.values()).index(stream)
@@ -97,32 +113,42 @@ class Line:
         """Reads the inputs of the calls from `first` to `last`; returns the numbers of those that were not held."""
         if self._read.issuperset(range(first, last + 1)):
             return []
+        if not self.stateless and first < (begin := self.begin_of(last)):
+            return self.reach(begin, last) + self.reach(first, begin - 1)
         first, until = self._ahead(first), last
         while until in self._read:
             until -= 1
         fired = self._debugger.goto(first)
-        if fired.before is not None:
-            self._states[first] = fired.before
-        elif not self.stateless and first > (begin := self.begin_of(first)):
+        if fired.before is None and not self.stateless and first > (begin := self.begin_of(first)):
             return self.reach(begin, last)
         place = self.records[first].incarnation, self.records[first].index
         changes = changes_between(self._changes, self._debugger, place, until)
-        added: list[int] = []
+        read: set[int] = set()
+        added: dict[int, Shot] = {}
+        nbytes = 0
 
         def take(each: Fired) -> bool:
+            nonlocal nbytes
             if each.number <= until:
-                self._read.add(each.number)
-            if each.number <= until and each.firing is not None:
-                self.shots[each.number] = shot_of(self._debugger, each, tuple(changes.get(each.number, ())))
-                added.append(each.number)
+                read.add(each.number)
+                if not each.same:
+                    self.other = each.number if self.other is None else min(self.other, each.number)
+            if each.number <= until and each.firing is not None and each.number not in self.shots:
+                added[each.number] = shot_of(self._debugger, each, tuple(changes.get(each.number, ())))
                 inputs = each.firing.inputs.values()
-                self.nbytes += sum(entry.value.nbytes() for given in inputs for entry in entries_of(given))
+                nbytes += sum(entry.value.nbytes() for given in inputs for entry in entries_of(given))
+                self._was_read(nbytes)
             return each.number >= until
 
         if not take(fired):
             self._debugger.until(take)
+        self._read |= read
+        self.shots |= added
+        self.nbytes += nbytes
+        if fired.before is not None:
+            self._states[first] = fired.before
         self.first = first if self.stateless else min(first, self.first)
-        return added
+        return list(added)
 
     def _ahead(self, first: int) -> int:
         """The number of a call before one, from which on they are read, too: going back begins anew each time."""
@@ -140,7 +166,8 @@ class Line:
         if self._calls is not None and not anew and is_there:
             return
         alone = anew or self.stateless
-        near = number if alone else max((n for n in self._states if n <= number), default=self.first)
+        begin = max(self.first, self.begin_of(number))
+        near = number if alone else max((n for n in self._states if begin <= n <= number), default=begin)
         self._set_up(near)
         if not anew and near in self._states:
             assert self._calls is not None

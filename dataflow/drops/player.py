@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import xxhash
@@ -14,6 +15,7 @@ from dataflow.execution.restarts import close_quietly
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.sync import NEVER, Firing
 from dataflow.sync.entries import entries_of
 
@@ -21,7 +23,31 @@ SPACING = 0.1
 """Seconds of work between two states that are kept."""
 MOST_BYTES = 2**28
 """Of states, and of messages, that are kept of one operator."""
+MOST_GIVEN = 2**32
+"""Of the inputs of one operator since the last state that is kept."""
 _NEW = b""
+
+
+class Given:
+    """Firings that an operator with a state was given in one replay. `pasts` are those behind each, before them `_NEW`.
+
+    Of firings before a state that is kept only the stamps are left; `nbytes`: of the inputs of the others.
+    """
+
+    def __init__(self) -> None:
+        self.pasts, self.firings = [_NEW], list[Firing]()
+        self.nbytes = 0
+        self._left = 0
+
+    def add(self, past: bytes, firing: Firing, *, known_state: bool) -> None:
+        """Adds a firing; `known_state`: the state behind it is kept."""
+        self.pasts.append(past)
+        self.firings.append(firing)
+        self.nbytes += sum(entry.value.nbytes() for given in firing.inputs.values() for entry in entries_of(given))
+        if known_state:
+            for k in range(self._left, len(self.firings)):
+                self.firings[k] = replace(self.firings[k], inputs={})
+            self._left, self.nbytes = len(self.firings), 0
 
 
 class Player:
@@ -41,6 +67,8 @@ class Player:
         self._held = self._state_bytes = 0
         self._at: bytes | None = None
         """The past of the operator as it is; None before its setup."""
+        self._changed = 0
+        """How many of the parameters' changes an operator without a state has seen."""
         self._worked = 0.0
         self.made = 0
 
@@ -50,17 +78,16 @@ class Player:
             self.statics, self._at = self.calls.setup(), _NEW
         return self.statics
 
-    def bring(self, pasts: Sequence[bytes], firings: Sequence[Firing]) -> None:
-        """Brings the operator to behind the last of some firings; `pasts` are those behind each, before them `_NEW`."""
+    def bring(self, given: Given) -> None:
+        """Brings the operator to behind what it was given."""
+        pasts, firings = given.pasts, given.firings
         if self.stateless or self._at == pasts[-1]:
             return
         near = next(
             k for k in range(len(pasts) - 1, -1, -1) if not k or pasts[k] in self._states or pasts[k] == self._at
         )
         if pasts[near] != self._at:
-            close_quietly(self.calls.operator)
-            self.calls.operator = self.node.make()
-            self.calls.setup()
+            self._make_anew()
             for _, name, value in self._due(NEVER, firings[near - 1].stamp if near else NEVER):
                 self.calls.parameter(name, value, (0, NEVER))
             if near:
@@ -69,25 +96,35 @@ class Player:
         for k in range(near, len(pasts) - 1):
             self._call(firings[k], firings[k - 1].stamp if k else NEVER, pasts[k + 1])
 
-    def process(self, pasts: list[bytes], firings: list[Firing], firing: Firing) -> Mapping[str, Message]:
-        """Makes the firing behind those, or gives what it gave in another replay; both lists are carried on.
+    def process(self, given: Given, firing: Firing) -> Mapping[str, Message]:
+        """Makes the firing behind those, or gives what it gave in another replay; `given` is carried on.
 
-        Raises what the operator raises.
+        Raises what the operator raises, and `ReplayError` where too much would have to be kept.
         """
-        past = _past(b"" if self.stateless else pasts[-1], firing)
+        past = _past(b"" if self.stateless else given.pasts[-1], firing)
         if (known := self.known.get(past)) is None:
-            self.bring(pasts, firings)
-            known = self._call(firing, firings[-1].stamp if firings else NEVER, past)
+            self.bring(given)
+            known = self._call(firing, given.firings[-1].stamp if given.firings else NEVER, past)
             self._held += sum(message.nbytes() for message in known.values())
             if self._held <= MOST_BYTES:
                 self.known[past] = known
         if not self.stateless:
-            pasts.append(past)
-            firings.append(firing)
+            given.add(past, firing, known_state=past in self._states)
+            if given.nbytes > MOST_GIVEN:
+                raise ReplayError(
+                    f"{self.node.name} would have to be brought back over more than {MOST_GIVEN >> 30} GiB of inputs: "
+                    "it gives no state, or one too large to be kept more often; take a part of the recording"
+                )
         return known
 
     def _call(self, firing: Firing, before: int, past: bytes) -> Mapping[str, Message]:
-        for _, name, value in self._due(before, firing.stamp):
+        due = self._due(NEVER if self.stateless else before, firing.stamp)
+        if self.stateless:
+            if len(due) < self._changed:
+                self._make_anew()
+                self._changed = 0
+            due, self._changed = due[self._changed :], len(due)
+        for _, name, value in due:
             self.calls.parameter(name, value, (0, firing.stamp - 1))
         began = time.perf_counter()
         self._at = None
@@ -104,6 +141,11 @@ class Player:
                 self._state_bytes += len(state)
         return made
 
+    def _make_anew(self) -> None:
+        close_quietly(self.calls.operator)
+        self.calls.operator = self.node.make()
+        self.calls.setup()
+
     def _due(self, after: int, until: int) -> Sequence[tuple[int, str, Any]]:
         return [change for change in self._parameters if after < change[0] <= until]
 
@@ -119,18 +161,18 @@ class PlayedCalls(Calls):
         calls = player.calls
         super().__init__(calls.node, calls.operator, calls.seed, version=calls.version, effects=calls.effects)
         self._player = player
-        self._pasts, self._firings = [_NEW], list[Firing]()
+        self._given = Given()
 
     def setup(self) -> dict[str, Message]:
         return dict(self._player.set_up())
 
     def process(self, firing: Firing) -> dict[str, Message]:
-        return dict(self._player.process(self._pasts, self._firings, firing))
+        return dict(self._player.process(self._given, firing))
 
     def summary(self, place: Place) -> dict[str, float | int | str]:
-        past = self._pasts[-1]
+        past = self._given.pasts[-1]
         if past not in self._player.summaries:
-            self._player.bring(self._pasts, self._firings)
+            self._player.bring(self._given)
             self._player.summaries[past] = self._player.calls.summary(place)
         return dict(self._player.summaries[past])
 

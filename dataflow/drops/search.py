@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +54,8 @@ class Worse:
         return list(dict.fromkeys(meant[0] for meant in self._named.values() if meant is not None))
 
     def is_true(self, figures: Figures) -> bool:
-        """Returns whether it is true of figures. Raises `DropsError` where one is missing, or no number."""
+        """Returns whether it is true of figures. Raises `DropsError` where one is missing, or no number, or where it
+        is not true and one is NaN."""
         names: dict[str, Any] = {}
         for name, meant in self._named.items():
             if meant is None:
@@ -61,11 +63,15 @@ class Worse:
             found = {_word(n): value for n, value in figures.get(meant[0], {}).items()}
             names[name] = found.get(meant[1]) if meant[1] else SimpleNamespace(**found)
         try:
-            return bool(eval(self._code, names))
+            is_worse = bool(eval(self._code, names))
         except Exception as error:
             raise DropsError(
                 f"--worse {self.text}: {type(error).__name__}: {error}; figures: {dict(figures)}"
             ) from error
+        seen = self.values(figures)
+        if not is_worse and (unknown := [n for n, v in seen.items() if isinstance(v, float) and math.isnan(v)]):
+            raise DropsError(f"--worse {self.text}: {', '.join(unknown)} is NaN, so it is not known whether it is true")
+        return is_worse
 
     def values(self, figures: Figures) -> dict[str, Any]:
         """Returns the figures that it sees, by name."""
@@ -206,7 +212,7 @@ class Drops:
             self._watch(self.replays, len(part))
             try:
                 return not self.worse.is_true(self._replay(branch, part))
-            except OperatorFailure:  # an operator cannot cope with what comes then: that heals nothing
+            except (OperatorFailure, ReplayError):  # what comes then cannot be coped with, or gives no figure
                 return False
 
         named = needed(losses, heals)

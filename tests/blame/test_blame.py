@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import blamed_graphs
+import held_runs
 import numpy as np
 import pytest
 
+import dataflow
+from dataflow.blame import chain as chain_module
 from dataflow.blame.chain import Blame, BlameError, Chain
 from dataflow.blame.field import Field, differ
+from dataflow.blame.line import Line
 from dataflow.blame.nudge import nudged
 from dataflow.graph import load_text
+from dataflow.graph.model import Node
 from dataflow.messages import FeatureVector, Pose
 from dataflow.recording import Recording
+from dataflow.records.firing import FiringRecord
+from dataflow.records.reading import FiringLog
 
+HOUR = 3600 * 10**9
+TWO = ("keep | Keep | x: src/a, flag: src/b", "scale | Scale | x: keep/out")
 KEEPS = 85
 """The seed of a graph without selections before a state, of which the value is two calls old."""
 
@@ -63,6 +74,20 @@ def test_what_the_time_does_not_suffice_for_is_named(kept: tuple[blamed_graphs.C
     assert chain.left == [chain.target]
 
 
+def test_the_inputs_of_all_operators_together_are_bounded(two: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = Field.parse(blamed_graphs.at(40, "scale/out"))
+    monkeypatch.setattr("dataflow.blame.line.AHEAD", 0)
+
+    with Recording(two) as recording:
+        monkeypatch.setattr(chain_module, "MOST_BYTES", 8)
+        chain = Blame(recording, field).find()
+        monkeypatch.setattr(chain_module, "MOST_BYTES", 1)
+        with pytest.raises(BlameError, match="the inputs of call 40 of scale take more than 1 bytes"):
+            Blame(recording, field).find()
+
+    assert chain.left == [("keep", 40)]
+
+
 @pytest.mark.parametrize(
     ("field", "problem"),
     [
@@ -91,6 +116,120 @@ def test_code_that_gives_something_else_now_is_not_blamed(kept: tuple[blamed_gra
         Blame(recording, Field.parse(case.field), other).find()
 
 
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("two") / "run.mcap"
+    dataflow.run(blamed_graphs.graph_of(*TWO), record=path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("other", "problem"), [("KeepHalf", "does not give what was"), ("Unsteady", "does not repeat")]
+)
+def test_code_in_front_of_the_value_that_gives_something_else_is_not_blamed(
+    two: Path, other: str, problem: str
+) -> None:
+    graph = blamed_graphs.graph_of(TWO[0].replace("Keep", other), TWO[1])
+    blamed_graphs.Unsteady.given.clear()
+
+    with Recording(two) as recording, pytest.raises(BlameError, match=f"of keep {problem}"):
+        Blame(recording, Field.parse(blamed_graphs.at(40, "scale/out")), graph).find()
+
+
+def test_the_state_that_an_operator_was_given_in_the_middle_is_on_the_chain(two: Path, tmp_path: Path) -> None:
+    flags = [blamed_graphs.reading(0, "b", k) >= blamed_graphs.HALF for k in range(blamed_graphs.STEPS)]
+    k = next(k for k in range(20, blamed_graphs.STEPS) if not any(flags[k - 3 : k + 1]))
+    begin, path = (k - 1) * blamed_graphs.STEP * 1e-9, tmp_path / "part.mcap"
+    dataflow.replay(two, start=begin, record=path)
+
+    with Recording(path) as recording:
+        chain = Blame(recording, Field.parse(blamed_graphs.at(1, "scale/out"))).find()
+
+    (given,) = [link for link in chain.links if not link.input]
+    assert given.call == ("keep", 0)
+    assert given.maker is None
+    assert [effect.way for effect in given.effects] == ["a new operator"]
+
+
+def test_where_the_search_among_earlier_calls_ended_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    dataflow.run(blamed_graphs.graph_of("mean | Mean | x: src/a"), record=path)
+
+    with Recording(path) as recording:
+        chain = Blame(recording, Field.parse(blamed_graphs.at(40, "mean/out"))).find()
+
+    assert chain.ended == {"mean": 37}
+    assert sensed(chain) == {("a", 38), ("a", 39), ("a", 40)}
+
+
+def test_two_inputs_that_each_suffice_are_named_together_and_not_followed(tmp_path: Path) -> None:
+    a, b, c = ([blamed_graphs.reading(0, s, k) for k in range(blamed_graphs.STEPS)] for s in "abc")
+    large = [(x >= blamed_graphs.HALF, y / 2 + z / 2 >= blamed_graphs.HALF) for x, y, z in zip(a, b, c, strict=True)]
+    k = next(k for k in range(2, len(large)) if all(large[k]) and not any(large[k - 1]))
+    path = tmp_path / "run.mcap"
+    graph = blamed_graphs.graph_of("sum | Add | x: src/b, y: src/c", "either | Either | x: src/a, y: sum/out")
+    dataflow.run(graph, record=path)
+
+    with Recording(path) as recording:
+        chain = Blame(recording, Field.parse(blamed_graphs.at(k, "either/out"))).find()
+
+    assert [(link.call, link.input) for link in chain.links] == [(("either", k), "x"), (("either", k), "y")]
+    assert {effect.together for link in chain.links for effect in link.effects} == {2}
+
+
+@pytest.mark.parametrize("offset", [-HOUR, HOUR])
+def test_clocks_of_machines_that_are_off_do_not_hide_a_cause(
+    offset: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    graph = blamed_graphs.graph_of(
+        "sum | Add | x: src/a, y: src/b",
+        "scale | Scale | x: sum/out",
+        "pick | Pick | x: scale/out, y: src/c, by: sum/out",
+    )
+    dataflow.run(graph, record=path)
+    ordered = FiringLog.ordered
+
+    def shifted(log: FiringLog, node: Node) -> Iterator[FiringRecord]:
+        for record in ordered(log, node):
+            yield replace(record, wall_start=record.wall_start + offset) if node.name == "scale" else record
+
+    monkeypatch.setattr(FiringLog, "ordered", shifted)
+    picked = [
+        blamed_graphs.reading(0, "a", k) + blamed_graphs.reading(0, "b", k) > 2 * blamed_graphs.HALF + 5
+        for k in range(blamed_graphs.STEPS)
+    ]
+    k = next(k for k in range(20, blamed_graphs.STEPS) if picked[k])
+
+    with Recording(path) as recording:
+        chain = Blame(recording, Field.parse(blamed_graphs.at(k, "pick/out"))).find()
+
+    nudges = {link.message[0] for link in chain.sensed if link.message for e in link.effects if e.way == "nudged"}
+    assert nudges == {"blamed/src/a", "blamed/src/b"}
+
+
+def test_a_call_that_raised_in_the_run_too_hides_nothing_behind_it(tmp_path: Path) -> None:
+    live = "live: {restart: {max: 3, backoff: 0s}}"
+    graph = blamed_graphs.graph_of(
+        "mean | Mean | x: src/a",
+        f"fussy | Fussy | x: mean/out | params: {{at: 40}} | {live}",
+        "largest | Mean | x: fussy/out",
+    )
+    path = held_runs.recorded(graph, held_runs.Faults(), tmp_path / "run.mcap")
+
+    with Recording(path) as recording:
+        chain = Blame(recording, Field.parse(blamed_graphs.at(42, "largest/out"))).find()
+
+        line = Line(recording, graph, "fussy", lambda: None, lambda nbytes: None)
+        line.reach(39, 42)
+        line.begin(41)
+        made = line.fire(41, line.shots[41].firing)
+
+    assert sensed(chain) == {("a", k) for k in range(36, 42)}
+    assert made is not None
+    assert blamed_graphs.number(made["out"]) == 0.0, "the first call behind a restart begins anew"
+
+
 def test_a_row_stands_before_or_behind_its_field_and_brackets_see_other_fields() -> None:
     message = FeatureVector(stamp=5, vectors=np.arange(6, dtype=np.float32).reshape(3, 2), model="m")
 
@@ -98,6 +237,7 @@ def test_a_row_stands_before_or_behind_its_field_and_brackets_see_other_fields()
         assert Field.parse(f"a/b{path}@0").value(message) == 2.0
     assert Field.parse("a/b@1.5") == Field("a/b", "", 1.5)
     assert Field.parse("b@1").value(message) is message
+    assert Field.parse("b.vectors[vectors[:, 1] > 9][:, 0].max()@1").value(message) is None
 
 
 def test_numbers_differ_by_more_than_a_part_of_the_largest_and_others_at_all() -> None:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import held_runs
 import pytest
 from held_runs import MS, STAMP
 
+from dataflow.drops import player as player_module
 from dataflow.drops.losses import Loss
+from dataflow.drops.player import Given, PlayedCalls, Player
 from dataflow.drops.search import Cost, Drops, DropsError, Worse
 from dataflow.graph import load_text
+from dataflow.graph.model import Node
+from dataflow.messages import FeatureVector, Message
 from dataflow.recording import Recording
-from dataflow.sync import FOREVER, TICK
+from dataflow.records.firing import FiringRecord
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.sync import FOREVER, TICK, Entry, Firing
 
 STEPS = 200
 FAULTS = held_runs.Faults(
@@ -108,6 +115,59 @@ def test_a_figure_that_changes_by_itself_is_refused(run: Path) -> None:
 
     with Recording(run) as recording, pytest.raises(DropsError, match="the figures change by themselves"):
         Drops(recording, "end_error_m > 5", chancy).find()
+
+
+@pytest.mark.parametrize("score", ["Undecided", "Silent"])
+def test_a_figure_that_is_missing_or_nan_heals_nothing(run: Path, score: str) -> None:
+    with Recording(run) as recording:
+        found = Drops(recording, "end_error_m > 5", held_runs.graph(STEPS, score)).find()
+
+    assert [loss.stamp for loss in found.named] == [STAMP + 1000 * MS, STAMP + 3000 * MS]
+
+
+def _firing(stamp: int, value: float, port: str) -> Firing:
+    message = held_runs.vector(stamp, value)
+    return Firing(stamp, "fire", inputs={port: Entry(stamp, message, 0, 0, message.digest(), "held/drive/step")})
+
+
+def test_a_parameter_of_an_operator_without_a_state_is_as_it_was_at_each_call_of_each_replay() -> None:
+    node = _node("Scaled", "at: drive/step")
+    change = FiringRecord("it", 0, 2, "param", 10, detail={"name": "gain", "value": 2.0})
+    player = Player(node, 0, 1, [FiringRecord("it", 0, 1, "fire", 10), change])
+
+    replays = [
+        [_value(PlayedCalls(player).process(_firing(stamp, value, "at"))) for stamp in (10, 20)] for value in (1.0, 3.0)
+    ]
+
+    assert replays == [[1.0, 2.0], [3.0, 6.0]]
+
+
+def test_inputs_before_a_kept_state_are_let_go_and_more_than_can_be_held_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(player_module, "SPACING", 0.0)
+    given = Given()
+    player = Player(_node("Count", "step: drive/step"), 0, 1, ())
+    for stamp in (10, 20, 30):
+        player.process(given, _firing(stamp, 1.0, "step"))
+    assert [firing.inputs for firing in given.firings] == [{}, {}, {}]
+    assert given.nbytes == 0
+
+    monkeypatch.setattr(player_module, "SPACING", 1e9)
+    monkeypatch.setattr(player_module, "MOST_GIVEN", 1)
+    with pytest.raises(ReplayError, match="it would have to be brought back over more than"):
+        player.process(given, _firing(40, 1.0, "step"))
+
+
+def _node(operator: str, inputs: str) -> Node:
+    text = "graph: held\noperators:\n  drive: {use: 'held_runs:Drive'}\n"
+    return load_text(f"{text}  it: {{use: 'held_runs:{operator}', inputs: {{{inputs}}}}}\n").nodes["it"]
+
+
+def _value(made: Mapping[str, Message]) -> float:
+    (message,) = made.values()
+    assert isinstance(message, FeatureVector)
+    return float(message.vectors[0, 0])
 
 
 def test_a_set_that_the_time_did_not_suffice_to_reduce_is_not_called_a_smallest(run: Path) -> None:

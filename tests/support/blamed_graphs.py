@@ -8,11 +8,12 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
 import dataflow
-from dataflow.graph import load_text
+from dataflow.graph import Graph, load_text
 from dataflow.messages import FeatureVector, Message
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 
@@ -107,6 +108,46 @@ class KeepHalf(Keep):
 
     def process(self, x: FeatureVector, flag: FeatureVector) -> FeatureVector:
         return vector(x.stamp, number(super().process(x, flag)) / 2.0)
+
+
+class Unsteady(Keep):
+    """Gives something else from the second time on that it is given a message."""
+
+    given: ClassVar[set[int]] = set()
+
+    def process(self, x: FeatureVector, flag: FeatureVector) -> FeatureVector:
+        made = super().process(x, flag)
+        again = x.stamp in self.given
+        self.given.add(x.stamp)
+        return vector(x.stamp, number(made) + again)
+
+
+class Fussy(Operator):
+    """The input before. Raises at one stamp, and then has forgotten it; what it remembers is no declared state."""
+
+    x: In[FeatureVector]
+    out: Out[FeatureVector]
+    at: int = Param(0, doc="the number of the step")
+
+    def setup(self) -> None:
+        self._latest = 0.0
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        if x.stamp == STAMP + self.at * STEP:
+            raise ValueError("not this one")
+        before, self._latest = self._latest, number(x)
+        return vector(x.stamp, before)
+
+
+class Either(Operator):
+    """Whether one of two is large."""
+
+    x: In[FeatureVector]
+    y: In[FeatureVector]
+    out: Out[FeatureVector]
+
+    def process(self, x: FeatureVector, y: FeatureVector) -> FeatureVector:
+        return vector(x.stamp, float(number(x) >= HALF or number(y) >= HALF))
 
 
 class Mean(Operator):
@@ -248,7 +289,23 @@ def case(seed: int) -> Case:
         if batch[-1] == batch[-2]:  # a tie: neither decides alone
             return case(seed + 1000)
         truth = Decided(truth.value, truth.must, truth.may | {("slow", k)})
-    return Case(text, f"{last}.vectors[0, 0]@{k * STEP * 1e-9 + 0.01:.2f}", truth, kinds)
+    return Case(text, at(k, last), truth, kinds)
+
+
+def graph_of(*operators: str, seed: int = 0) -> Graph:
+    """The sensors and operators, each "name | Class | input: stream, ...", of which all streams are recorded."""
+    lines = [f"  src: {{use: 'blamed_graphs:Sensors', params: {{seed: {seed}}}}}"]
+    for operator in operators:
+        name, made, inputs, *more = operator.split(" | ")
+        lines.append(
+            f"  {name}: {{use: 'blamed_graphs:{made}', inputs: {{{inputs}}}{''.join(', ' + m for m in more)}}}"
+        )
+    return load_text("graph: blamed\nrecord: {snapshots: 1s}\noperators:\n" + "\n".join(lines) + "\n")
+
+
+def at(k: int, stream: str) -> str:
+    """The field of the value of a stream at a step."""
+    return f"{stream}.vectors[0, 0]@{k * STEP * 1e-9 + 0.01:.2f}"
 
 
 def recorded(one: Case, path: Path) -> Path:

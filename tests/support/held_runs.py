@@ -21,7 +21,7 @@ from dataflow.graph.model import Node
 from dataflow.messages import FeatureVector, Message
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 from dataflow.recording import Recording
-from dataflow.records.firing import Emission
+from dataflow.records.firing import Emission, FiringRecord
 from dataflow.sync import NEVER, Entry
 
 STAMP, MS = 10**18, 1_000_000
@@ -126,6 +126,18 @@ class Beat(Operator, every="100ms"):
         return {"beats": self._beats}
 
 
+class Count(Operator):
+    """Adds up; its state is declared."""
+
+    step: In[FeatureVector]
+    out: Out[FeatureVector]
+    state: Sum
+
+    def process(self, step: FeatureVector) -> FeatureVector:
+        self.state.value += float(step.vectors[0, 0])
+        return vector(step.stamp, self.state.value)
+
+
 class HalfSmooth(Smooth):
     """Another version, which gives something else."""
 
@@ -138,6 +150,34 @@ class Chancy(Score):
 
     def summary(self) -> Mapping[str, float]:
         return {**super().summary(), "end_error_m": 10.0 + time.perf_counter()}
+
+
+class Undecided(Score):
+    """An error of middle size is not a number."""
+
+    def summary(self) -> Mapping[str, float]:
+        figures = super().summary()
+        return figures | ({"end_error_m": float("nan")} if 1 < figures["end_error_m"] < 25 else {})
+
+
+class Silent(Score):
+    """An error of middle size is left out."""
+
+    def summary(self) -> Mapping[str, float]:
+        figures = super().summary()
+        return {} if 1 < figures["end_error_m"] < 25 else figures
+
+
+class Scaled(Operator):
+    """A value times a parameter that may change; stateless."""
+
+    at: In[FeatureVector]
+    out: Out[FeatureVector]
+    gain: float = Param(1.0, doc="factor", tunable=True)
+    stateless = True
+
+    def process(self, at: FeatureVector) -> FeatureVector:
+        return vector(at.stamp, float(at.vectors[0, 0]) * self.gain)
 
 
 TEXT = """
@@ -171,6 +211,16 @@ class Faults:
     still: Sequence[tuple[str, int, int]] = ()
 
 
+class RestartRecorder(Recorder):
+    """Records operators that are started again, too: a batch is of one incarnation."""
+
+    def record(self, record: FiringRecord) -> None:
+        held = self._records.get(record.operator)
+        if held and held[-1].incarnation != record.incarnation:
+            self._flush(record.operator)
+        super().record(record)
+
+
 def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None = None) -> Path:
     """Makes and records the run: time goes on by 5 ms, messages arrive, operators that do not stand still work.
 
@@ -179,7 +229,7 @@ def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None 
     clock = [0.0]
     driver = Driver()
     emitter = Emitting(driver)
-    emitter.recorder = Recorder(
+    emitter.recorder = RestartRecorder(
         path, graph, set(graph.streams), {"metadata": metadata_of(graph, "run"), "overwrite": False}
     )
     for node in graph.nodes.values():

@@ -218,14 +218,20 @@ def _print(chain: Chain, field: str) -> None:
         out.print(f"and {count(len(chain.links) - MOST_ROWS)} more: --json has all")
     sensed = list(dict.fromkeys(_origin(link) for link in chain.sensed))
     more = f" and {count(len(sensed) - MOST_ROWS)} more" if len(sensed) > MOST_ROWS else ""
-    told = ", ".join(sensed[:MOST_ROWS]) + more or "nothing that was sensed: no input changes it"
+    given = [f"the state given to {_call(link.call)}" for link in chain.links if not link.input and link.maker is None]
+    told = ", ".join(sensed[:MOST_ROWS] + given) + more or "nothing that was sensed: no input changes it"
     out.print(Text(f"decided by {told}"), soft_wrap=True)
+    for operator, first in chain.ended.items():
+        text = f"calls of {operator} before #{first} were not tried: a new operator in front of it gives the same value"
+        out.print(Text(text), soft_wrap=True)
     for operator, first, last in chain.unsplit:
-        text = f"not known which of calls {first} to {last} of {operator} left a mark: the time, or the memory, was up"
+        text = f"not known which of calls {first} to {last} of {operator} left a mark: the time, or the memory, was up,"
+        text += " or it was given its state behind them"
         out.print(Text(text, style="yellow"), soft_wrap=True)
     if chain.left:
         names = ", ".join(map(_call, chain.left[:5]))
-        text = f"the time was up: {plural(len(chain.left), 'call')} on the chain not looked into ({names}): --budget"
+        left = f"{plural(len(chain.left), 'call')} on the chain not looked into ({names})"
+        text = f"the time (--budget), or the memory, was up: {left}"
         out.print(Text(text, style="yellow"), soft_wrap=True)
     out.print(f"{plural(chain.made, 'call')} made again in {seconds(chain.seconds)}")
 
@@ -236,7 +242,7 @@ def _call(call: tuple[str, int]) -> str:
 
 def _origin(link: Link) -> str:
     if link.message is None:
-        return "" if link.maker is None else _call(link.maker)
+        return "given" if link.maker is None else _call(link.maker)
     stream, _, place = link.message
     return f"{stream} #{place}" if link.maker is None else f"{_call(link.maker)}: {stream} #{place}"
 
