@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 from cli_commands import commands, untried
 
-from dataflow.client import attach
-from dataflow.machines.keys import TOOLS, issue, new_authority
+from dataflow.machines import keys
 
 TRIED: tuple[str, ...] = (
     "demo --to OUT.rrd --seconds 1 --quiet --json",
@@ -139,8 +138,8 @@ def places(small: Path, recorded: tuple[Path, Any], tmp_path_factory: pytest.Tem
     (folder / "contract.yaml").write_text("streams: {}\n")
     (folder / "values.yaml").write_text("sum: {x: 1}\n")
     (folder / "other.mcap").write_bytes(recorded[0].read_bytes())
-    new_authority(folder / "authority")
-    issue(folder / "authority", folder / "authority" / "tools", TOOLS)
+    keys.new_authority(folder / "authority")
+    keys.issue(folder / "authority", folder / "authority" / "tools", keys.TOOLS)
     return {
         "AUTHORITY": str(folder / "authority"),
         "OTHER": str(folder / "other.mcap"),
@@ -186,7 +185,7 @@ def test_a_command_for_a_running_graph_says_that_none_runs(
 def test_a_command_for_a_graph_of_another_machine_names_the_endpoint_that_does_not_answer(
     dataflow, places: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
-    monkeypatch.setattr(attach, "ELSEWHERE_WITHIN", 0.0)
+    monkeypatch.setattr(keys, "CONNECT_WITHIN", 50)
 
     assert "no graph 'none' runs at tls/127.0.0.1:1" in dataflow(*typed(line, places, tmp_path), code=2).stderr
 
