@@ -68,7 +68,7 @@ class Player:
         self._at: bytes | None = None
         """The past of the operator as it is; None before its setup."""
         self._changed = 0
-        """How many of the parameters' changes an operator without a state has seen."""
+        """The number of the parameters' changes that an operator without a state has seen."""
         self._worked = 0.0
         self.made = 0
 
