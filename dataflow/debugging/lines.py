@@ -29,7 +29,7 @@ class Spot(NamedTuple):
 
 
 Homes = tuple[Path, ...]
-"""Where the operator's source lies: the folders of its top package, or its file."""
+"""The folders of the operator's top package, or its file."""
 
 
 class Lines:

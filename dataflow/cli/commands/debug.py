@@ -286,7 +286,7 @@ def _serve(debugger: Debugger, port: int, first: int, shell: Shell) -> None:
         listening.settimeout(EDITOR_COMES)
         host, port = listening.getsockname()
         out.print(f'waits for an editor on {host}:{port} (launch.json: "debugServer": {port})', soft_wrap=True)
-        out.print("any user of this machine can connect there, and run code as you", soft_wrap=True)
+        out.print("every account of this machine can connect there, and run code as you", soft_wrap=True)
         try:
             connection, _ = listening.accept()
         except TimeoutError:

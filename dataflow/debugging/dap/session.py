@@ -211,7 +211,7 @@ class Session:
     def _last(self, first: int, last: int, wanted: Stops, spot: Spot | None = None) -> tuple[int, int] | None:
         """Makes calls, up to a spot if there is one. Returns the last line event at which `wanted` would stop: its call
         and its number in that."""
-        found = None
+        found: tuple[int, int] | None = None
         call = first
 
         def at_line(frame: FrameType, count: int) -> None:
