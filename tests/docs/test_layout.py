@@ -21,7 +21,7 @@ LONG = {
     "dataflow.cli.commands.demo:demo": 65,
     "dataflow.cli.commands.following.live:hz": 63,
     "dataflow.cli.commands.following.logs:logs": 69,
-    "dataflow.cli.commands.following.recording:record": 71,
+    "dataflow.cli.commands.following.recording:record": 70,
     "dataflow.cli.commands.replay:replay": 181,
     "dataflow.cli.commands.run:run": 106,
     "dataflow.cli.commands.verification:verify": 135,
