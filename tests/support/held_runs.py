@@ -156,7 +156,7 @@ class Undecided(Score):
     """An error of middle size is not a number."""
 
     def summary(self) -> Mapping[str, float]:
-        figures = super().summary()
+        figures = dict(super().summary())
         return figures | ({"end_error_m": float("nan")} if 1 < figures["end_error_m"] < 25 else {})
 
 
