@@ -227,6 +227,7 @@ def test_a_call_that_raised_in_the_run_too_hides_nothing_behind_it(tmp_path: Pat
 
     assert sensed(chain) == {("a", k) for k in range(36, 42)}
     assert made is not None
+    assert isinstance(made["out"], FeatureVector)
     assert blamed_graphs.number(made["out"]) == 0.0, "the first call behind a restart begins anew"
 
 
