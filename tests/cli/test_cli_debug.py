@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -19,7 +19,9 @@ from dataflow.debugging.debugger import Debugger
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
 from dataflow.sync.entries import entries_of
-from dataflow.view import ViewerSink
+
+if TYPE_CHECKING:
+    from dataflow.view import ViewerSink
 
 KEPT = Path(__file__).resolve().parent.parent / "recordings_of"
 LIVE = KEPT / "live.mcap"
@@ -131,7 +133,7 @@ def prompt(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Shell, Drawing]]:
     monkeypatch.syspath_prepend(str(KEPT))
     with Recording(LIVE) as recording:
         debugger, viewer = Debugger(recording, "smooth"), Drawing()
-        yield Shell(debugger, 0, viewer=cast(ViewerSink, viewer)), viewer
+        yield Shell(debugger, 0, viewer=cast("ViewerSink", viewer)), viewer
         debugger.close()
 
 

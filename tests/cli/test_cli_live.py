@@ -84,7 +84,7 @@ def test_commands_say_which_graph_they_follow(dataflow, tmp_path: Path, words: l
 @pytest.mark.usefixtures("running")
 def test_the_graph_that_is_meant_may_stand_in_the_environment(dataflow, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATAFLOW_GRAPH", "kitchen")
-    assert "no graph 'kitchen' runs here" in dataflow("echo", code=2).stderr
+    assert "no graph 'kitchen' runs on this machine" in dataflow("echo", code=2).stderr
     assert "left/fast" in dataflow("echo", "left/fast", "--graph", "small", "-n", 1).stdout
     assert "total" in dataflow("hz", "--graph", "small", "--seconds", 0.2).stdout
 
@@ -171,7 +171,7 @@ def test_hz_takes_a_window(dataflow) -> None:
 
 def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, running: Background) -> None:
     told = dataflow("echo", "--graph", "kitchen", code=2).stderr
-    assert "no graph 'kitchen' runs here (running: small)" in told
+    assert "no graph 'kitchen' runs on this machine (running: small)" in told
     assert "0 or more" in dataflow("hz", "--wait", "-1", code=2).stderr
     assert running.thread.is_alive()
 

@@ -247,7 +247,7 @@ def test_health_names_what_is_wrong_and_has_an_exit_code_for_it(dataflow, tmp_pa
     assert slow.startswith("slow: drops ")
     assert disk.endswith("left, less than 1e+09 GB")
     assert "did you mean 'left'?" in dataflow(*words, "--rate", "lef=3", code=2).stderr
-    assert "no graph 'other' runs here" in dataflow(*words, "--graph", "other", code=2).stderr
+    assert "no graph 'other' runs on this machine" in dataflow(*words, "--graph", "other", code=2).stderr
 
 
 @pytest.mark.usefixtures("running")

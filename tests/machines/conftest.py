@@ -12,7 +12,7 @@ from joined_agents import HERE, Robot, end, join
 sys.path.append(str(HERE))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # other tests end every process that was left
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     """A machine called robot, which takes part in one run after the other; joined over a socket of this user."""
     folder = tmp_path_factory.mktemp("robot")

@@ -57,7 +57,8 @@ def call(operator: Program, stamp: int, **given: Message | tuple[Message, ...] |
 
 
 def test_messages_of_every_type_come_back_bit_for_bit_from_cpp(relay: Relay) -> None:
-    for turn, cls in enumerate(message_types().values()):
+    shipped = [cls for cls in message_types().values() if cls.__module__.startswith("dataflow.")]
+    for turn, cls in enumerate(shipped):
         message = example(cls, seed=turn)
         relay.on_reset("message")
         outputs = call(relay, message.stamp, message=message)

@@ -49,7 +49,7 @@ def test_a_tap_sees_the_statics_first_and_then_the_messages_of_a_running_graph()
 
 
 def test_looking_for_a_graph_that_does_not_run_says_what_does() -> None:
-    with pytest.raises(NotRunning, match="no graph 'nothing' runs here"):
+    with pytest.raises(NotRunning, match="no graph 'nothing' runs on this machine"):
         find_running("nothing")
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from dataflow.messages import Message, Odometry, PointCloud
 from dataflow.view.layout import layout
-from dataflow.view.visualizers.clouds import KeptPoints, Points
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     import rerun as rr
     from rrd_rows import at, rows
 
     from dataflow.view import SceneState, ViewOptions, visualize
+    from dataflow.view.visualizers.clouds import KeptPoints, Points
 
 
 def still(frame: str, stamp: int) -> Points:

@@ -137,7 +137,7 @@ def service(
     with friendly_errors():
         loaded = load_graph(file, live=True)
     flight, folder = loaded.record.flight, Path.cwd()
-    command = [str(Path(sys.prefix, "bin", "dataflow")), "run", str(file.resolve()), "--live", "--quiet"]
+    command = [str(Path(sys.executable).with_name("dataflow")), "run", str(file.resolve()), "--live", "--quiet"]
     if flight is None:
         command += ["--record", "out/{time}.mcap", "--split-every", "10min", "--keep-disk", keep_disk]
     kept = folder / (flight.folder if flight is not None else "out")

@@ -23,7 +23,6 @@ from operators.detection.custom.dataset import DataError, labelled
 from operators.detection.custom.decode import decode_grid, find_boxes
 from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.custom.folder import read_detection_data
-from operators.detection.custom.training import fit_anchors, mean_best_iou, size_iou
 from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
@@ -35,6 +34,7 @@ if TYPE_CHECKING:  # imported before the first of these tests runs (tests/confte
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     from operators.detection.custom.loss import Truth, assign, complete_iou, decode_maps, detection_loss
     from operators.detection.custom.network import STRIDES, GridDetector
+    from operators.detection.custom.training import fit_anchors, mean_best_iou, size_iou
 
 COLORS = {"crate": (200, 60, 40), "ball": (40, 90, 210)}
 
