@@ -23,7 +23,7 @@ SILENT = 3
 """Reads in a row that give nothing, after which a camera counts as unplugged."""
 
 
-class CalibratedImages(Source):
+class CalibratedImages(Source, abstract=True):
     """Holds what a file and a camera have in common: images, and a calibration by the field of view."""
 
     image: Out[Image] = Out(doc="RGB images")
