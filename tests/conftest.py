@@ -33,7 +33,7 @@ ROOMS = {
     "process": (
         "analysis", "api", "blame", "capture", "causes", "cli", "debugging", "doctor", "drops", "editing", "graphs",
         "operators/perception", "operators/training", "process", "program", "recordings_of", "runtime", "shipped",
-        "simulation", "supervision", "verification",
+        "simulation", "supervision", "tool_server", "verification",
     ),
 }  # fmt: skip
 """Folders of tests by marker; a test anywhere else is a `unit` test."""
