@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from cli_commands import commands, untried
+from needed_programs import need
 
 from dataflow.machines import keys
 
@@ -138,6 +139,7 @@ def places(small: Path, recorded: tuple[Path, Any], tmp_path_factory: pytest.Tem
     (folder / "contract.yaml").write_text("streams: {}\n")
     (folder / "values.yaml").write_text("sum: {x: 1}\n")
     (folder / "other.mcap").write_bytes(recorded[0].read_bytes())
+    need("openssl")
     keys.new_authority(folder / "authority")
     keys.issue(folder / "authority", folder / "authority" / "tools", keys.TOOLS)
     return {

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from needed_programs import need
 
 from dataflow.machines.hub import machine_key, router
 from dataflow.machines.keys import GRAPH_KEY, TOOLS, access, issue, new_authority, settings, tool_settings
@@ -25,6 +26,7 @@ HOLDERS = ("tools", "robot", "elsewhere")
 @pytest.fixture(scope="module")
 def buses(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Bus]]:
     """By who holds it, a connection to one supervisor's machine; "here" is one of its own processes."""
+    need("openssl")
     folder = tmp_path_factory.mktemp("access")
     new_authority(folder / "authority")
     issue(folder / "authority", folder / "laptop", "laptop", serves=["127.0.0.1"])

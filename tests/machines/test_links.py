@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from joined_agents import HERE, end, join
 from link_relay import Relay
+from needed_programs import need
 
 from dataflow.graph import load_text
 from dataflow.machines.keys import TOOLS, KeysError, issue, new_authority, settings
@@ -42,6 +43,7 @@ operators:
 @pytest.fixture(scope="session")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Keys of two machines and of another authority's robot."""
+    need("openssl")
     folder = tmp_path_factory.mktemp("keys")
     for authority in ("authority", "other"):
         new_authority(folder / authority)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from joined_agents import HERE, end
+from needed_programs import need
 
 from dataflow.graph import load_text
 from dataflow.machines.keys import issue, new_authority
@@ -60,6 +61,7 @@ def cable() -> Iterator[None]:
 
 
 def test_a_cable_that_is_pulled_loses_nothing_and_only_the_asked_port_listens(cable: None, tmp_path: Path) -> None:
+    need("openssl")
     new_authority(tmp_path / "authority")
     issue(tmp_path / "authority", tmp_path / "laptop", "laptop", serves=[ADDRESS])
     issue(tmp_path / "authority", tmp_path / "robot", "robot")
