@@ -259,6 +259,8 @@ class Nursery:
         if not self._children and not self._unborn:
             self._process.kill()  # it may be importing still
         self._socket.close()
+        for child in self._unborn:  # no signal reaches them yet: they leave by themselves
+            child.channel.close()
         try:
             self._process.wait(timeout=LEAVE_WITHIN)
         except subprocess.TimeoutExpired:

@@ -119,7 +119,7 @@ def test_a_process_of_another_machine_that_dies_is_started_again_there_or_ends_t
 def test_a_machine_that_does_not_join_is_named_with_the_command_that_joins_it(tmp_path: Path) -> None:
     meeting = Meeting(f"unixsock-stream/{tmp_path / 'meet'}")
     with pytest.raises(RunFailed, match=r"machine 'robot' did not join\. On each: dataflow join NAME --connect unix"):
-        run(load_text(GRAPH.replace("SIZE", "1").replace(", MORE", "")), machines=meeting, start_timeout=2.0)
+        run(load_text(GRAPH.replace("SIZE", "1").replace(", MORE", "")), machines=meeting, start_timeout=0.2)
 
 
 def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:

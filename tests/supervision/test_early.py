@@ -12,6 +12,7 @@ from dataflow.execution.threads import environment
 from dataflow.graph import load_text
 from dataflow.supervision import supervisor
 from dataflow.supervision.early_nursery import EarlyNursery, early_nursery
+from dataflow.supervision.nursery import Nursery
 from dataflow.supervision.run import run
 
 GRAPH = """\
@@ -92,3 +93,12 @@ def test_threads_are_those_of_the_graph_unless_it_says_nothing() -> None:
     assert taken.environment == environment(1)
     taken.close()
     assert os.environ.get("DATAFLOW_THREADS") is None
+
+
+def test_a_process_that_is_only_asked_for_leaves_when_its_nursery_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dataflow.supervision.nursery.LEAVE_WITHIN", 9.0)  # before a nursery kills what stays: then -9
+    nursery = Nursery(environment(1))
+    child = nursery.spawn()
+    nursery.close()
+    child.close()
+    assert nursery._process.returncode == 0
