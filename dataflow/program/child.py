@@ -113,7 +113,7 @@ class Child:
             return self._process.wait(seconds)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            return self._process.wait()
+            return self._process.wait(_LEAVING)
 
     def _write(self, parts: list[Bytes], what: str, deadline: float) -> None:
         left = [memoryview(part).cast("B") for part in parts if len(part)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import math
 import os
@@ -22,6 +21,7 @@ from typing import Any, Literal
 import xxhash
 
 from dataflow.graph.search import import_path
+from dataflow.parent import end_with_parent
 from dataflow.sweep.plan import Task
 
 Outcome = Literal["done", "failed", "killed", "timed out", "not fetched"]
@@ -36,7 +36,6 @@ WORKER_KILLED = f"was killed by {signal.SIGKILL.name}"
 """Of a worker of `dataflow verify`, as that reports it: for want of memory, as a rule."""
 STEP = 0.2
 """Seconds between two looks at whether to stop."""
-_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +127,7 @@ def _run(command: list[str], folder: Path, timeout: float, stop: Event | None) -
             stderr=err,
             env=environment,
             start_new_session=True,
-            preexec_fn=_end_with_parent,
+            preexec_fn=end_with_parent,
         )
     handle, ended, deadline = os.pidfd_open(process.pid), False, time.monotonic() + timeout
     try:
@@ -140,10 +139,6 @@ def _run(command: list[str], folder: Path, timeout: float, stop: Event | None) -
             os.killpg(process.pid, signal.SIGKILL)
         code = process.wait()  # only now: until then no other process has its number
     return code if ended else None
-
-
-def _end_with_parent() -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _read(printed: Path) -> dict[str, Any] | None:

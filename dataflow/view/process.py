@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib.util
 import os
 import signal
@@ -10,8 +9,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+
+from dataflow.parent import end_with_parent
 
 LOOPBACK = "127.0.0.1"
 _START_TIMEOUT = 15.0  # seconds
@@ -62,7 +64,7 @@ def start(arguments: Sequence[str], ports: Sequence[int], *, outlive: bool) -> s
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
-        preexec_fn=None if outlive else _die_with_parent(),
+        preexec_fn=None if outlive else partial(end_with_parent, signal.SIGTERM),
     )
     deadline = time.monotonic() + _START_TIMEOUT
     while not all(listening(port) for port in ports):
@@ -92,11 +94,3 @@ def listening(port: int, host: str = LOOPBACK, timeout: float = 1.0) -> bool:
             return True
     except OSError:
         return False
-
-
-def _die_with_parent() -> Callable[[], None] | None:
-    if not sys.platform.startswith("linux"):
-        return None
-    libc = ctypes.CDLL(None)
-    set_death_signal, terminate = 1, int(signal.SIGTERM)
-    return lambda: libc.prctl(set_death_signal, terminate)

@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.debug import take_environment
+from dataflow.cli.support.again import begin_again
 from dataflow.cli.support.arguments import (
     Json,
     ModuleFolders,
+    OtherGraph,
     RecordingFile,
     Settings,
     existing_recording,
-    find_modules_in,
-    graph_file,
     number,
     span,
 )
@@ -59,10 +58,7 @@ def blame(
             help="What a floating-point value must change by to count, as a part of it.",
         ),
     ] = 1e-4,
-    graph: Annotated[
-        Path | None,
-        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
-    ] = None,
+    graph: OtherGraph = None,
     settings: Settings = None,
     path: ModuleFolders = None,
     json: Json = False,
@@ -83,13 +79,7 @@ def blame(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        if graph is None and settings:
-            raise fail("--set changes a graph file: name it with --graph")
-        find_modules_in(path)
-        take_environment(recording)
-        from dataflow.graph import load_graph
-
-        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+        loaded = begin_again(recording, graph, settings, path)
         chain = _found(recording, field, loaded, budget, tolerance)
     if json:
         print_json(chain.as_json())
@@ -106,10 +96,7 @@ def drops(
         typer.Option("--worse", metavar="EXPRESSION", help='True of figures that are bad: "ate_rmse_m > 0.05".'),
     ],
     budget: Budget = 60.0,
-    graph: Annotated[
-        Path | None,
-        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
-    ] = None,
+    graph: OtherGraph = None,
     settings: Settings = None,
     path: ModuleFolders = None,
     json: Json = False,
@@ -129,15 +116,10 @@ def drops(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        if graph is None and settings:
-            raise fail("--set changes a graph file: name it with --graph")
-        find_modules_in(path)
-        take_environment(recording)
+        loaded = begin_again(recording, graph, settings, path)
         from dataflow.drops.search import Drops
-        from dataflow.graph import load_graph
         from dataflow.recording import Recording
 
-        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
         with Recording(recording) as opened, progress() as show:
 
             def watch(replays: int, left: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import sys
@@ -13,15 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
+from dataflow.cli.support.again import begin_again
 from dataflow.cli.support.arguments import (
     FLAG,
     Json,
     ModuleFolders,
+    OtherGraph,
     RecordingFile,
     Settings,
     existing_recording,
-    find_modules_in,
-    graph_file,
     number,
     output_file,
     span,
@@ -69,10 +68,7 @@ def debug(
         list[str] | None,
         typer.Option("--do", metavar="COMMAND", help="Do this and end, without a prompt. May be given several times."),
     ] = None,
-    graph: Annotated[
-        Path | None,
-        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
-    ] = None,
+    graph: OtherGraph = None,
     settings: Settings = None,
     path: ModuleFolders = None,
     live_effects: LiveEffects = False,
@@ -104,15 +100,9 @@ def debug(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        if graph is None and settings:
-            raise fail("--set changes a graph file: name it with --graph")
         if dap is not None and (do or json or view):
             raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
-        find_modules_in(path)
-        take_environment(recording)
-        from dataflow.graph import load_graph
-
-        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+        loaded = begin_again(recording, graph, settings, path)
         _debug(recording, operator, loaded, do, live_effects=live_effects, view=view, dap=dap, json=json)
 
 
@@ -140,10 +130,7 @@ def capture(
         typer.Option("--to", metavar="TEST.py", help="The file to write. Default: test_OPERATOR_N.py here."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace a file that exists.")] = False,
-    graph: Annotated[
-        Path | None,
-        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
-    ] = None,
+    graph: OtherGraph = None,
     settings: Settings = None,
     path: ModuleFolders = None,
     json: Json = False,
@@ -164,13 +151,7 @@ def capture(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        if graph is None and settings:
-            raise fail("--set changes a graph file: name it with --graph")
-        find_modules_in(path)
-        take_environment(recording)
-        from dataflow.graph import load_graph
-
-        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+        loaded = begin_again(recording, graph, settings, path)
         words = [] if graph is None else ["--graph", str(graph)]
         words += [word for setting in settings or () for word in ("--set", setting)]
         words += [word for folder in path or () for word in ("--path", str(folder))]
@@ -310,21 +291,3 @@ def _converse(shell: Shell, lines: list[str], *, interactive: bool) -> None:
         failed = failed or shell.failed
     if failed:
         raise typer.Exit(DIFFERENT)
-
-
-def take_environment(recording: Path) -> None:
-    """Begins anew with the environment of operators where this process has another one: libraries read the number of
-    their threads, and Python the salt of hashes, when they begin."""
-    from dataflow.cli import start
-    from dataflow.execution.threads import environment
-    from dataflow.recording import Recording
-    from dataflow.reexecution.recorded_run import resolved_graph
-
-    with Recording(recording) as opened:
-        graph = resolved_graph(opened)
-    wanted = environment(1 if graph is None else graph.threads)
-    if start.words is not None and any(
-        os.environ.get(name) != value for name, value in wanted.items() if name != "PYTHONPATH"
-    ):
-        out.file.flush()
-        os.execve(sys.executable, [sys.executable, "-P", "-m", "dataflow.cli.main", *start.words], wanted)

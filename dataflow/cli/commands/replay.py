@@ -18,6 +18,7 @@ from dataflow.cli.support.arguments import (
     Map,
     ModuleFolders,
     Network,
+    OtherGraph,
     Settings,
     Start,
     Strict,
@@ -57,10 +58,7 @@ if TYPE_CHECKING:
 
 def replay(
     recording: AnyRecording,
-    graph: Annotated[
-        Path | None,
-        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
-    ] = None,
+    graph: OtherGraph = None,
     maps: Map = None,
     clock: Clock = "auto",
     strict: Strict = False,

@@ -15,6 +15,7 @@ from dataflow.cli.support.arguments import (
     FLAG,
     Json,
     ModuleFolders,
+    OtherGraph,
     Settings,
     check_offset,
     existing,
@@ -76,10 +77,7 @@ def verify(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="RECORDING", help="Recordings (.mcap), or folders of them.")
     ],
-    graph: Annotated[
-        Path | None,
-        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
-    ] = None,
+    graph: OtherGraph = None,
     settings: Settings = None,
     path: ModuleFolders = None,
     first: Annotated[

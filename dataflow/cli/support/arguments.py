@@ -39,6 +39,10 @@ GraphFile = Annotated[
         help="A graph file (.yaml), or a name that `dataflow graphs` lists.",
     ),
 ]
+OtherGraph = Annotated[
+    Path | None,
+    typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
+]
 AnyRecording = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder.")
 ]

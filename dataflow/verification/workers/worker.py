@@ -7,7 +7,6 @@ returns plain values. The process ends when its parent does, however that ends.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
 import gc
 import importlib
@@ -21,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dataflow.execution.threads import take_over
+from dataflow.parent import end_with_parent
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.verification.errors import WRONG_INPUT
 from dataflow.verification.workers.board import Board
@@ -28,7 +28,6 @@ from dataflow.verification.workers.mail import read_letter, write_letter
 
 FAILED = 1
 PRELOAD = "dataflow.verification.workers.job"
-_PR_SET_PDEATHSIG = 1
 
 Slot = tuple[int, ...]
 """Descriptors that a parent hands down for one worker: its channel, the letter, the board, its output."""
@@ -37,7 +36,7 @@ Slot = tuple[int, ...]
 def main(slots: Sequence[Slot]) -> int:
     """Imports what verification needs, and serves one parent's slot; of several, each in a separate process, which
     becomes a child of that parent. Returns the exit code."""
-    _end_with_parent()
+    end_with_parent()  # it may be killed while we hold the GIL
     faulthandler.enable()
     importlib.import_module(PRELOAD)
     gc.freeze()  # modules live as long as the process: collections need not look at them
@@ -48,11 +47,6 @@ def main(slots: Sequence[Slot]) -> int:
         if not os.fork():
             return _serve_apart(slot, slots, parent)
     return 0
-
-
-def _end_with_parent() -> None:
-    """Has the kernel kill this process with its parent: that may be killed while we hold the GIL."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _serve_apart(slot: Slot, slots: Sequence[Slot], parent: int) -> int:
@@ -67,7 +61,7 @@ def _serve_apart(slot: Slot, slots: Sequence[Slot], parent: int) -> int:
     forked_by = os.getppid()
     while os.getppid() == forked_by != parent:
         time.sleep(0.0005)  # it forks the others and ends
-    _end_with_parent()
+    end_with_parent()
     return serve(slot) if os.getppid() == parent else FAILED
 
 
