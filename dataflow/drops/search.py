@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.capture.reduce import needed, smallest
+from dataflow.capture.reduce import needed, shortest_end, smallest
 from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, Sent, bursts_of, losses_of, sent_by
 from dataflow.drops.player import Player
@@ -216,7 +216,10 @@ class Drops:
             except (OperatorFailure, ReplayError):  # what comes then cannot be coped with, or gives no figure
                 return False
 
-        named = _flat(needed(bursts, lambda part: heals(_flat(part))))
+        def heal(part: Sequence[Sequence[Loss]]) -> bool:
+            return heals(_flat(part))
+
+        named = _flat(needed(shortest_end(sorted(bursts, key=len), heal), heal))  # the longest of them at first
         if in_time and len(named) > 1:
             named = smallest(needed(named, heals), heals)
         undone = self._replay(branch, named)
