@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ ACTIVITIES = (
 )
 _WINDOW = 1.0  # seconds of the past that tell how an agent moves
 _WALKING, _ROLLING, _DRIVING = 0.25, 0.12, 0.07  # m/s
+_KNOWN = 0.6  # probability from which an agent is said to move, or not
 _RISING = 0.15  # m/s, of the head
 
 
@@ -72,6 +74,9 @@ def activity_of(body: Body, motion: Motion, relations: Mapping[Relation, float])
     `body` has the velocity of its motion.
     """
     speed = float(np.hypot(*body.velocity[:2]))
+    if not math.isnan(body.moving) and not body.person:
+        sure = max(body.moving, 1 - body.moving)
+        return (UNKNOWN, 0.3, -1) if sure < _KNOWN else ("driving" if body.moving > 0.5 else "resting", sure, -1)
     if len(motion.past) < 3:
         return UNKNOWN, 0.3, -1
     if "rolls" in body.roles:

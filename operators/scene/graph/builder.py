@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -132,9 +132,13 @@ class SceneGraphBuilder(Operator):
         names, class_ids = nodes.class_names, nodes.class_ids[rows].tolist()
         labels = [names[c] if names else str(c) for c in class_ids]
         yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
-        return self._bodies.update(
+        bodies = self._bodies.update(
             nodes.ids[rows].tolist(), labels, nodes.positions[rows], nodes.sizes[rows], yaws[rows]
         )
+        if nodes.moving is None:
+            return bodies
+        moving = nodes.moving[rows].tolist()
+        return [replace(b, moving=p) if p == p else b for b, p in zip(bodies, moving, strict=True)]
 
     def _message(self, nodes: SceneGraph, now: Snapshot) -> SceneGraph:
         classes = (*nodes.class_names, *(n for n in EXTRA.values() if n not in nodes.class_names))
@@ -164,6 +168,7 @@ class SceneGraphBuilder(Operator):
             subjects=np.array([at[s] for (s, _, _), _ in held], np.int32),
             objects=np.array([at[o] for (_, _, o), _ in held], np.int32),
             relation_scores=np.array([min(score, 1.0) for _, score in held], np.float32),
+            moving=None if nodes.moving is None else np.array(given(nodes.moving, np.nan), np.float32),
             tracks=None if nodes.tracks is None else np.array([track for track, _ in tracks], np.int64),
             track_nodes=None if nodes.tracks is None else np.array([node for _, node in tracks], np.int32),
         )

@@ -346,3 +346,18 @@ def test_orientation_turns_a_footprint() -> None:
     assert isinstance(graph, SceneGraph)
     floor = graph.ids.tolist().index(0)
     np.testing.assert_allclose(graph.sizes[floor, :2], [0.8, 1.5], atol=1e-9)
+
+
+def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves() -> None:
+    seen = [room(k, [(2, "car", (8 + 0.3 * k, 3, 0.7), (4, 1.8, 1.5)), TABLE]) for k in range(8)]
+    acts = {}
+    for sure in (0.05, 0.5, 0.95):
+        nodes = [each.replace(moving=np.array([sure, np.nan], np.float32)) for each in seen]
+        played = play(SceneGraphBuilder(), {"nodes": nodes})
+        graph, act = played["graph"][-1], played["activities"][-1]
+        assert isinstance(graph, SceneGraph)
+        assert isinstance(act, Activity)
+        assert graph.moving is not None
+        assert graph.moving[graph.names().index("car 2")] == np.float32(sure)
+        acts[sure] = act.class_names[act.class_ids[0]]
+    assert acts == {0.05: "resting", 0.5: "unknown", 0.95: "driving"}
