@@ -156,7 +156,7 @@ class ViewerSink:
         return True
 
     def scores(self, summaries: Summaries) -> None:
-        """Shows what operators have summed up at the end of a run: those without outputs, with a graph."""
+        """Shows what operators have summed up at the end of a run: those without outputs, with a graph; and findings."""
         self._backlog.put_scores(scores_of(summaries, self._graph))
 
     def statistics(self) -> SinkStatistics:
