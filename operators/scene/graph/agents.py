@@ -68,10 +68,13 @@ class Motion:
         return np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), np.array([r[2] for r in rows])
 
 
-def activity_of(body: Body, motion: Motion, relations: Mapping[Relation, float]) -> tuple[str, float, int]:
+def activity_of(
+    body: Body, motion: Motion, relations: Mapping[Relation, float], posture: tuple[str, float] | None = None
+) -> tuple[str, float, int]:
     """Returns what an agent does, how sure that is, and the id of what it does it to, -1 for nothing.
 
-    `body` has the velocity of its motion.
+    `body` has the velocity of its motion. `posture` is what a person's joints show, `unknown` where they were looked
+    for in vain, with its probability.
     """
     speed = float(np.hypot(*body.velocity[:2]))
     if not math.isnan(body.moving) and not body.person:
@@ -97,8 +100,12 @@ def activity_of(body: Body, motion: Motion, relations: Mapping[Relation, float])
         return "reaching", of["reaching_for"][0], of["reaching_for"][1]
     if speed > _WALKING:
         return "walking", _sure(speed, _WALKING), -1
-    if "sitting_on" in of:
+    if posture is not None and posture[0] == "sitting":
+        return "sitting", posture[1], of.get("sitting_on", (0, -1))[1]
+    if "sitting_on" in of and (posture is None or posture[0] == UNKNOWN):
         return "sitting", of["sitting_on"][0], of["sitting_on"][1]
+    if posture is not None:
+        return *posture, -1
     return "standing", _sure(_WALKING, speed), -1
 
 
