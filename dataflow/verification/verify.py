@@ -188,8 +188,7 @@ def _prepare(
         sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
         stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, books, n)]
         checks, unchecked = stored_checks(recording, played, books, [*operators, *stand_ins])
-        plan = partial(partition.planned, played, log, books, held=held, jobs=jobs, divide=start is None)
-        parts = _parts(played, operators, held, plan)
+        parts = _parts(played, log, books, operators, held=held, jobs=jobs, divide=start is None)
         begin, last = _span(recording, start)
         return _Task(
             path=path,
@@ -217,11 +216,12 @@ def _prepare(
 
 
 def _parts(
-    graph: Graph, operators: Sequence[str], held: Collection[str], plan: Callable[..., list[partition.Job]]
+    graph: Graph, log: FiringLog, books: Books, operators: Sequence[str], *, held: Collection[str], **options: Any
 ) -> list[partition.Job]:
     """Returns the parts of the operators of each environment by itself."""
-    envs, cores = dict.fromkeys(graph.nodes[name].env for name in operators), len(os.sched_getaffinity(0))
-    return [part for env in envs for part in plan(_in(env, graph, operators, held), cores=cores)]
+    plan = partial(partition.planned, graph, log, books, held=held, cores=len(os.sched_getaffinity(0)), **options)
+    envs = dict.fromkeys(graph.nodes[name].env for name in operators)
+    return [part for env in envs for part in plan(_in(env, graph, operators, held))]
 
 
 def _in(env: str | None, graph: Graph, operators: Iterable[str], held: Collection[str]) -> tuple[str, ...]:
