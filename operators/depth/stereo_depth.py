@@ -123,5 +123,7 @@ def _status(left: Image, right: Image, counts: Mapping[str, int], blind: bool, r
         plain = [name for name, image in (("left", left), ("right", right)) if np.ptp(image.data) < 8]
         text += f"; no structure in the {' and the '.join(plain)} image" if plain else "; the pair hardly matches"
     elif crooked:
-        text += f"; the right image lies {abs(rows):.1f} px {'lower' if rows > 0 else 'higher'}: the pair is not rectified"
+        text += (
+            f"; the right image lies {abs(rows):.1f} px {'lower' if rows > 0 else 'higher'}: the pair is not rectified"
+        )
     return counted_status("stereo_depth", left.stamp, text, Level.WARN if blind or crooked else Level.OK, counts)
