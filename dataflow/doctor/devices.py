@@ -31,6 +31,13 @@ class Device:
         return f"use: {self.use}\nparams: {{{params}}}"
 
 
+SERIAL = (
+    "if it is a satellite receiver (NMEA 0183), at the rate that it has; an IMU with VectorNav's messages: "
+    "use: operators.sources:VectorNavImu, baud: 115200"
+)
+"""A device file does not name what is connected to it."""
+
+
 def find_devices(root: Path = Path("/")) -> list[Device]:
     """Returns the cameras, then the serial devices. `root` is the folder that holds `dev` and `sys`."""
     return [*_cameras(root), *_serial_devices(root)]
@@ -64,7 +71,7 @@ def _serial_devices(root: Path) -> Iterator[Device]:
             _text((root / "sys/class/tty" / file.name / "device").resolve().parent / "product"),
             "operators.sources:NmeaGnss",
             {"input": str(path), "baud": 9600},
-            _refused(file, "dialout") or "if it is a satellite receiver (NMEA 0183), at the rate that it has",
+            _refused(file, "dialout") or SERIAL,
         )
 
 

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
         RecordedTransforms,
     )
     from operators.sources.rgbd_folder import RgbdFolder
+    from operators.sources.static_transforms import StaticTransforms
     from operators.sources.synthetic_rgbd import SyntheticRgbd
+    from operators.sources.vectornav import VectorNavImu
     from operators.sources.victoria_park import VictoriaPark
     from operators.sources.video import VideoFile, Webcam
 else:  # most need a separate library, which a graph without them need not load
@@ -44,7 +46,9 @@ else:  # most need a separate library, which a graph without them need not load
                 "RecordedTransforms",
             ),
             "rgbd_folder": ("RgbdFolder",),
+            "static_transforms": ("StaticTransforms",),
             "synthetic_rgbd": ("SyntheticRgbd",),
+            "vectornav": ("VectorNavImu",),
             "victoria_park": ("VictoriaPark",),
             "video": ("VideoFile", "Webcam"),
         },
@@ -67,7 +71,9 @@ __all__ = [
     "RecordedStereoCamera",
     "RecordedTransforms",
     "RgbdFolder",
+    "StaticTransforms",
     "SyntheticRgbd",
+    "VectorNavImu",
     "VictoriaPark",
     "VideoFile",
     "Webcam",

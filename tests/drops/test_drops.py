@@ -70,6 +70,7 @@ def test_losses_without_a_message_between_them_are_one_burst_and_tried_together(
     assert held.replays == 4
 
 
+@pytest.mark.long
 def test_only_the_operators_between_the_losses_and_the_figure_are_replayed(run: Path) -> None:
     assert cost(run, "end_error_m > 5").operators == ("odometry", "smooth", "score")
     assert cost(run, "beats < 38").operators == ("beat",)
@@ -134,6 +135,7 @@ def test_a_figure_that_changes_by_itself_is_refused(run: Path) -> None:
         Drops(recording, "end_error_m > 5", chancy).find()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("score", ["Undecided", "Silent"])
 def test_a_figure_that_is_missing_or_nan_heals_nothing(run: Path, score: str) -> None:
     with Recording(run) as recording:
