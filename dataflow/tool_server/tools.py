@@ -35,9 +35,15 @@ def verify(
     """Re-execute a recorded run with the code as it is now and compare every output, bit for bit.
 
     A culprit was given the recorded inputs and made another output; `first` is its first differing call, with the
-    field. `only`: these operators; `graph`: a graph file in place of the recorded graph; `path`: folders of modules.
+    field; `call` is the number of that for the other tools. `only`: these operators; `graph`: a graph file in place of
+    the recorded graph; `path`: folders of modules.
     """
-    return _verified(_verify(_file(recording), only, _loaded(graph))[1])
+    file = _file(recording)
+    values = _verified(_verify(file, only, _loaded(graph))[1])
+    for each in values.get("operators", ()):
+        if each.get("first"):
+            each["call"] = _call_of(file, each["operator"], each["first"])
+    return values
 
 
 def why(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None) -> Any:
@@ -324,6 +330,20 @@ def _verify(file: Path, only: Sequence[str] | None, graph: Graph | None) -> tupl
 
     report = verify_recording(file, graph=graph, only=only or None)
     return sorted(report.absent), report
+
+
+def _call_of(file: Path, operator: str, first: Mapping[str, Any]) -> int:
+    """Returns the number among an operator's calls of the firing record at which it first differs."""
+    from dataflow.recording import Recording
+    from dataflow.records.firing import CALLS
+    from dataflow.records.reading import FiringLog
+    from dataflow.reexecution.recorded_run import graph_that_is_here
+
+    with Recording(file) as opened:
+        node = graph_that_is_here(opened)[0].nodes[operator]
+        headings = FiringLog.read(opened).headings(node)
+    place = first["incarnation"], first["index"]
+    return sum(h.kind in CALLS and (h.incarnation, h.record) < place for h in headings)
 
 
 def _verified(report: VerifyReport) -> dict[str, Any]:

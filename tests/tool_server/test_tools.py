@@ -31,6 +31,7 @@ def test_verify_names_culprits_with_their_first_call(bugs: dict[str, str]) -> No
     assert sorted(told["culprits"]) == ["sine", "sum"]
     assert {each["operator"] for each in told["operators"]} == {"sine", "sum"}
     assert all(each["first"]["stamp"] for each in told["operators"])
+    assert {each["operator"]: each["call"] for each in told["operators"]} == {"sum": SKIPPED, "sine": DEGREES}
 
 
 def test_a_call_is_shown_with_its_difference(bugs: dict[str, str]) -> None:
