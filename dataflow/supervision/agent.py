@@ -35,6 +35,7 @@ from dataflow.machines.pipe import AWAY_AFTER, Pipe
 from dataflow.process.awake import AwakeClock
 from dataflow.process.descriptors import take_descriptors
 from dataflow.process.streams.inbox import Inbox
+from dataflow.recording.streams.facts import machine_facts
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.children import Children
 from dataflow.supervision.core import events
@@ -306,7 +307,7 @@ class Stay:
         boxes = Boxes(graph, processes, live=wanted["live"])
         self._children = Children(nursery, apart, self._selector, rings, boxes, self._clock, self._feed, self._printed)
         stack.callback(self._children.bury)
-        self._say("", "ready")
+        self._say("", "ready", facts=machine_facts(common))
 
     # Processes
 

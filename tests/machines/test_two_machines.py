@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ import pytest
 from joined_agents import HERE, Robot, end, join
 
 from dataflow.graph import load_text
+from dataflow.recording import Recording
 from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import Meeting
 from dataflow.supervision.run import run
@@ -58,6 +60,9 @@ def test_a_run_over_two_machines_loses_nothing_and_its_recording_verifies_on_one
     verified = verify(tmp_path / "two.mcap", jobs=1)
     assert verified.identical, verified.as_json()
     assert {v.operator for v in verified.operators} == {"here", "there", "beside", "last"}
+    with Recording(tmp_path / "two.mcap") as recording:
+        assert recording.metadata["dataflow:packages of robot"] == recording.metadata["packages"]
+        assert recording.metadata["dataflow:machine of robot"]["python"] == platform.python_version()
 
 
 def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
