@@ -137,6 +137,11 @@ class VideoFile(CalibratedImages):
         return self.first_stamp
 
 
+SET_BACK = 1_000_000_000
+"""Nanoseconds from which on a clock that is behind the last stamp was set back: stamps go on from there, as live runs
+allow."""
+
+
 class Webcam(CalibratedImages):
     """Reads a camera: of this machine by its number or device file, of the network by its address (RTSP, HTTP).
 
@@ -175,7 +180,7 @@ class Webcam(CalibratedImages):
             stamp = time.time_ns() - self.latency
             if bgr is None:
                 self._look_for_it()
-            elif stamp > last:  # else the clock was set back by less than an image: the next one comes soon
+            elif stamp > last or last - stamp > SET_BACK:  # of less the next image is ahead again: this one is left out
                 last = stamp
                 yield self._image(stamp, np.asarray(bgr, np.uint8))
 
