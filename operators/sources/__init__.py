@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from operators.sources.static_transforms import StaticTransforms
     from operators.sources.synthetic_rgbd import SyntheticRgbd
     from operators.sources.vectornav import VectorNavImu
+    from operators.sources.velodyne import VelodyneFile, VelodyneLidar
     from operators.sources.victoria_park import VictoriaPark
     from operators.sources.video import VideoFile, Webcam
 else:  # most need a separate library, which a graph without them need not load
@@ -49,6 +50,7 @@ else:  # most need a separate library, which a graph without them need not load
             "static_transforms": ("StaticTransforms",),
             "synthetic_rgbd": ("SyntheticRgbd",),
             "vectornav": ("VectorNavImu",),
+            "velodyne": ("VelodyneFile", "VelodyneLidar"),
             "victoria_park": ("VictoriaPark",),
             "video": ("VideoFile", "Webcam"),
         },
@@ -74,6 +76,8 @@ __all__ = [
     "StaticTransforms",
     "SyntheticRgbd",
     "VectorNavImu",
+    "VelodyneFile",
+    "VelodyneLidar",
     "VictoriaPark",
     "VideoFile",
     "Webcam",
