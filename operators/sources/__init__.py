@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from operators.sources.image_folder import GrowingImageFolder, ImageFolder
     from operators.sources.kitti_odometry import KittiOdometry
     from operators.sources.kitti_raw import KittiRaw
+    from operators.sources.realsense import RealSense
     from operators.sources.recorded import (
         RecordedCamera,
         RecordedImu,
@@ -37,6 +38,7 @@ else:  # most need a separate library, which a graph without them need not load
             "image_folder": ("GrowingImageFolder", "ImageFolder"),
             "kitti_odometry": ("KittiOdometry",),
             "kitti_raw": ("KittiRaw",),
+            "realsense": ("RealSense",),
             "recorded": (
                 "RecordedCamera",
                 "RecordedImu",
@@ -65,6 +67,7 @@ __all__ = [
     "KittiRaw",
     "NmeaFile",
     "NmeaGnss",
+    "RealSense",
     "RecordedCamera",
     "RecordedImu",
     "RecordedLidar",
