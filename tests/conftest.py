@@ -31,7 +31,8 @@ ROOMS = {
     "docs": ("docs", "scaffold"),
     "network": ("client", "foxglove", "machines", "transport"),
     "process": (
-        "analysis", "api", "blame", "capture", "causes", "cli", "debugging", "doctor", "drops", "editing", "graphs",
+        "analysis", "api", "blame", "capture", "causes", "cli", "debugging", "doctor", "drops", "editing",
+        "environments", "graphs",
         "operators/perception", "operators/training", "process", "program", "recordings_of", "runtime", "shipped",
         "simulation", "supervision", "tool_server", "verification",
     ),

@@ -115,6 +115,7 @@ class Family:
 BUILT_IN: tuple[Command | Family, ...] = (
     Command("demo:demo", MAKE),
     Command("run:run", MAKE),
+    Command("env:env", MAKE),
     Command("machines:join", MAKE),
     Command("replay:replay", MAKE),
     Command("verification:verify", MAKE),

@@ -271,13 +271,16 @@ class FlightSink:
         return bool(time.monotonic() - wanted.over >= self._options["settle"])
 
     def _trigger(self, reason: dict[str, Any], stamp: int) -> None:
-        """Asks to keep what was before and will be after `stamp`; what is asked for meanwhile becomes one."""
+        """Asks to keep what was before now and will be after; what is asked for meanwhile becomes one.
+
+        Now is the newest stamp that came, not `stamp`: a run that is paused, or slower than the clock, is behind it.
+        """
         reason = {**reason, "stamp": stamp}
         if self._wanted is None and len(self._kept) >= self.flight.files:
             self._refused += 1
             return
         if self._wanted is None:
-            self._wanted = Wanted(max(stamp, self._clock) - self.flight.keep, self._clock + self.flight.after)
+            self._wanted = Wanted(self._clock - self.flight.keep, self._clock + self.flight.after)
         elif self._clock + self.flight.after - self._wanted.start <= 2 * (self.flight.keep + self.flight.after):
             self._wanted.due = max(self._wanted.due, self._clock + self.flight.after)
         if len(self._wanted.reasons) < MOST_REASONS:

@@ -164,6 +164,7 @@ class PartsSink:
 
     def close(self, outcome: str) -> Mapping[str, Any]:
         """Completes the last part."""
+        self._introduce_all()
         self._close_full()
         if (part := self._current) is not None:
             self._current = None
@@ -242,6 +243,7 @@ class PartsSink:
         return next(name for name in names if not name.exists())
 
     def _split(self, start: int) -> None:
+        self._introduce_all()
         self._close_full()
         self._full, self._current = self._current, None
         assert self._full is not None
@@ -323,14 +325,24 @@ class PartsSink:
         if part is None:
             self.lost.firings += calls
         else:
-            if part is self._current and operator not in self._introduced:
-                self._introduced.add(operator)
-                for before in consecutive(holding(self._folded.get(operator, ()), self._held.get(operator, ()))):
-                    told = partial(part.sink.firings, operator, part.start or 0, encode_batch(before))
-                    self._store(part, told)
+            if part is self._current:
+                self._introduce(part, operator)
             self._store(part, lambda: part.sink.firings(operator, records[-1].stamp, payload, calls=calls))
         if self._continues:
             self._folded[operator] = folded([*self._folded.get(operator, ()), *records])
+
+    def _introduce(self, part: Part, operator: str) -> None:
+        """Puts what stands in for the operator's records before a part into it, once."""
+        if operator not in self._introduced:
+            self._introduced.add(operator)
+            for before in consecutive(holding(self._folded.get(operator, ()), self._held.get(operator, ()))):
+                self._store(part, partial(part.sink.firings, operator, part.start or 0, encode_batch(before)))
+
+    def _introduce_all(self) -> None:
+        """Does so for those that have not been called in the current part: their records may still come, or none."""
+        for operator in self._folded:
+            if self._current is not None:
+                self._introduce(self._current, operator)
 
     # Failures
 

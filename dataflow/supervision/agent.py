@@ -38,7 +38,7 @@ from dataflow.process.streams.inbox import Inbox
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.children import Children
 from dataflow.supervision.core import events
-from dataflow.supervision.nursery import Nursery, adopting
+from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
 from dataflow.supervision.plan import ProcessPlan
 from dataflow.supervision.rings import Rings
 from dataflow.transport import Bus, Fanout, reserve_endpoints
@@ -300,9 +300,11 @@ class Stay:
         self._gate = self._gate_of(inbox, fanout, Routes.from_json(wanted["routes"]))
         reserved = stack.enter_context(contextlib.closing(reserve_endpoints(len(processes))))
         self._endpoints = dict(zip(processes, reserved.endpoints, strict=True))
-        nursery = Nursery(environment(graph.threads))
+        common = environment(graph.threads)
+        apart = nurseries_of({label: process.env for label, process in processes.items()}, common)
+        nursery = Nursery(common)
         boxes = Boxes(graph, processes, live=wanted["live"])
-        self._children = Children(nursery, self._selector, rings, boxes, self._clock, self._feed, self._printed)
+        self._children = Children(nursery, apart, self._selector, rings, boxes, self._clock, self._feed, self._printed)
         stack.callback(self._children.bury)
         self._say("", "ready")
 

@@ -40,6 +40,7 @@ TRIED: tuple[str, ...] = (
     "capture RECORDING --op sum --firing 3 --predicate stamp --graph GRAPH --set count=30 --path HERE --to OUT.py"
     " --overwrite --json",
     "blame RECORDING --field mean@0 --budget 60 --tolerance 0.1 --graph GRAPH --set count=30 --path HERE --json",
+    "env GRAPH --anew --path HERE",
     "check GRAPH --path HERE --set count=4 --json",
     "show GRAPH --path HERE --set count=4 --json",
     "show GRAPH --mermaid",

@@ -53,6 +53,7 @@ def test_the_drop_and_the_late_message_that_cost_the_estimate_are_named(run: Pat
     assert found.best["score: end_error_m"] == 0.0
 
 
+@pytest.mark.long
 def test_only_the_operators_between_the_losses_and_the_figure_are_replayed(run: Path) -> None:
     assert cost(run, "end_error_m > 5").operators == ("odometry", "smooth", "score")
     assert cost(run, "beats < 38").operators == ("beat",)
@@ -117,6 +118,7 @@ def test_a_figure_that_changes_by_itself_is_refused(run: Path) -> None:
         Drops(recording, "end_error_m > 5", chancy).find()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("score", ["Undecided", "Silent"])
 def test_a_figure_that_is_missing_or_nan_heals_nothing(run: Path, score: str) -> None:
     with Recording(run) as recording:
