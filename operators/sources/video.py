@@ -153,6 +153,8 @@ class Webcam(CalibratedImages):
 
     real_time = True
 
+    _unplugged = 0
+
     input: str = Param("0", min_length=1, doc="number, device file or address of the camera")
     width: int | None = Param(None, ge=1, unit="px", doc="width to ask for; the camera may give another")
     height: int | None = Param(None, ge=1, unit="px", doc="height to ask for")
@@ -186,6 +188,9 @@ class Webcam(CalibratedImages):
 
     def stop_reading(self) -> None:
         self._stopped.set()
+
+    def summary(self) -> Mapping[str, int | str]:
+        return {"clock": "machine", "unplugged": self._unplugged}
 
     def close(self) -> None:
         camera: cv2.VideoCapture | None = getattr(self, "_camera", None)
@@ -224,6 +229,7 @@ class Webcam(CalibratedImages):
         """Waits until the camera is back, or the run ends. Raises SourceError for images of another size."""
         if self._stopped.is_set():
             return
+        self._unplugged += 1
         self.log.warning("camera %s gives no image any more: looking for it every %g s", self.input, self.retry * 1e-9)
         self.close()
         self._camera = None
