@@ -23,6 +23,8 @@ WRITER = b"robot-dataflow/"
 HEAD_BYTES = 128
 _PART = re.compile(r"(.*?)_?(?:\d{4}(?:-\d\d){5})?_\d+\.bag")
 """The name that `rosbag record --split` gives to a part: prefix, date and number."""
+ARCHIVES = ((b"\x1f\x8b", "gzip"), (b"PK\3\4", "zip"), (b"BZh", "bzip2"), (b"\xfd7zXZ", "xz"))
+DATASETS = "folders of datasets (TUM, EuRoC, KITTI) are read by sources of a graph: `dataflow operators` lists them"
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
@@ -55,6 +57,7 @@ def bag_at(path: Path) -> Bag:
     if head.startswith(ZSTD_MAGIC):
         return _of_files(path, Path(path.stem).suffix, [path])
     begins = f"it begins with {head[:8].hex(' ')}" if head else "it is empty"
+    begins = next((f"it is a {name} file, to be unpacked first" for m, name in ARCHIVES if head.startswith(m)), begins)
     raise BagError(
         f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag), "
         "ROS 2 bags (a folder with metadata.yaml, .db3 or .mcap) and Rerun files (.rrd)"
@@ -124,7 +127,11 @@ def _open_folder(path: Path) -> Bag:
         raise BagError(
             f"{path}: {METADATA} names {', '.join(folder.named)}, and the folder holds no .mcap or .db3 file"
         )
-    raise BagError(f"{path} is a folder without a bag: it holds no metadata.yaml, .mcap, .db3 or .bag file")
+    inside = sorted(p.name for p in path.iterdir() if p.is_dir() and any(any(p.glob(f"*{s}")) for s in BAG_SUFFIXES))
+    raise BagError(
+        f"{path} is a folder without a bag: it holds no metadata.yaml, .mcap, .db3 or .bag file"
+        + (f"; its folders {', '.join(inside)} do: name one" if inside else f"; {DATASETS}")
+    )
 
 
 def _of_files(path: Path, suffix: str, files: list[Path], *, compressed: bool = False) -> Bag:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import shutil
 import sqlite3
 from pathlib import Path
@@ -350,3 +351,16 @@ def test_topics_whose_names_differ_by_a_slash_stay_apart(tmp_path: Path, form: s
     bag = open_bag(out)
     assert not bag.notes
     bag.close()
+
+
+def test_a_folder_of_bags_names_them_and_an_archive_is_to_be_unpacked(tmp_path: Path) -> None:
+    write_ros2(tmp_path / "one", imus(STAMPS[:1]))
+    (tmp_path / "bag.mcap.gz").write_bytes(gzip.compress((tmp_path / "one" / "one.mcap").read_bytes()))
+    (tmp_path / "samples").mkdir()
+
+    with pytest.raises(BagError, match="its folders one do: name one"):
+        open_bag(tmp_path)
+    with pytest.raises(BagError, match="are read by sources of a graph"):
+        open_bag(tmp_path / "samples")
+    with pytest.raises(BagError, match="it is a gzip file, to be unpacked first"):
+        open_bag(tmp_path / "bag.mcap.gz")
