@@ -56,7 +56,7 @@ TRIED: tuple[str, ...] = (
     "split RECORDING --out OUT --size 1MB",
     "merge RECORDING OTHER --prefix OTHER=other/ --out OUT.mcap --overwrite --compression lz4 --quiet --json",
     "recover RECORDING --out OUT.mcap --overwrite --compression lz4 --quiet --json",
-    "latency RECORDING --path HERE --json",
+    "latency RECORDING --path HERE --spans OUT.jsonl --overwrite --json",
     "lint RECORDING --write-contract OUT.yaml --overwrite --quick --json",
     "lint RECORDING --contract CONTRACT",
     "view RECORDING --to OUT.rrd --overwrite --stream left/* --without fast --start 0 --end 1 --clock auto",
