@@ -35,7 +35,7 @@ from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 LANGUAGES = ("python", "yaml", "sh", "json", "toml", "text", "ini", "dockerfile", "cpp")
-OUTPUTS = ("output", "record", "view", "to", "complete", "out", "junit", "svg", "baseline", "write_contract")
+OUTPUTS = ("output", "record", "view", "to", "complete", "out", "junit", "svg", "baseline", "write_contract", "rerun")
 """Parameters of commands that name a file which the command may write."""
 QUICK = ("check", "show", "info", "operators", "graphs", "diff", "latency", "lint", "logs")
 """Commands that run, where their files are there."""
