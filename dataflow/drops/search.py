@@ -221,7 +221,7 @@ class Drops:
 
         named = _flat(needed(shortest_end(sorted(bursts, key=len), heal), heal))  # the longest of them at first
         if in_time and len(named) > 1:
-            named = smallest(needed(named, heals), heals)
+            named = list(smallest(needed(named, heals), heals))
         undone = self._replay(branch, named)
         again = self._branch(feeding, losses)
         if self.worse.values(self._replay(again, named)) != self.worse.values(undone):

@@ -8,6 +8,7 @@ from heapq import merge
 from pathlib import Path
 
 from dataflow.graph import Graph
+from dataflow.graph.model import Node, Stream
 from dataflow.messages import Message
 from dataflow.recording import Recording
 from dataflow.sweep.swap import Both
@@ -25,7 +26,7 @@ def layered(
     names: list[dict[str, str]] = []
     for side, graph in zip("AB", graphs, strict=True):
         names.append({s: _below(side, graph.relative(s)) if s in different else s for s in graph.streams})
-    nodes, streams, hidden = {}, {}, set[str]()
+    nodes, streams, hidden = dict[str, Node](), dict[str, Stream](), set[str]()
     for side, graph, named in zip("AB", graphs, names, strict=True):
         for node in graph.nodes.values():
             doubled = any(s in different for s in node.outputs.values())

@@ -214,15 +214,16 @@ def test_until_looks_at_the_last_calls_too_once_gone_back(added: Recording) -> N
     assert numbers == [*range(4, len(debugger.calls))]
 
 
-def test_the_kept_calls_are_bounded_by_their_bytes(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_kept_calls_are_bounded_by_their_bytes(added: Recording) -> None:
     debugger = Debugger(added, "adder")
     debugger.goto(0)
     held = debugger._ring.get(0)
     assert held is not None
     nbytes = sum(message.nbytes() for message in held.messages())
-    monkeypatch.setattr("dataflow.debugging.ring.MOST_BYTES", 5 * nbytes)
-    debugger.goto(25)
-    assert [n for n in range(26) if debugger._ring.get(n)] == [21, 22, 23, 24, 25]
+    for most, kept in ((5, [21, 22, 23, 24, 25]), (0, [25])):
+        debugger = Debugger(added, "adder", most_bytes=most * nbytes)
+        debugger.goto(25)
+        assert [n for n in range(26) if debugger._ring.get(n)] == kept
 
 
 def test_states_are_recorded_by_cpu_time_where_a_graph_asks_for_it(
