@@ -1,6 +1,6 @@
 """The engine on a simulated machine: one scenario for each of the requested seeds.
 
-usage: python benchmarks/simulation.py [--seeds 1000] [--from 0] [--jobs 2] [--json]
+usage: python benchmarks/simulation.py [--seeds 1000] [--from 0] [--jobs 2] [--links] [--json]
        python benchmarks/simulation.py --mutants [--seeds 2000]
 
 Every seed: a small graph, recorded, in one process or one each, live or not, on a machine that is slow or quick, under
@@ -8,6 +8,9 @@ kills, freezes, faults, stops and a disk that is slow or full; then its recordin
 replayed. All of it runs in one thread on simulated time: supervisor, processes, aligners, flow control, recorder and
 verification are those that ship. What must hold: tests/support/simulation/check.py. A seed that breaks a promise is
 shrunk, and its plan is printed; exit code 1.
+
+With --links, a seed is instead what two machines say to each other over a link that is delayed, throttled, stalled and
+reset (tests/support/simulation/pipes.py).
 
 With --mutants, faults are planted in the engine, one at a time, and it is counted how many seeds find each.
 
@@ -40,6 +43,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=1000, help="how many (with --mutants: at most, for each)")
     parser.add_argument("--from", type=int, default=0, dest="first", help="the first one")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="processes that share them")
+    parser.add_argument("--links", action="store_true", help="two machines and their link, instead of runs")
     parser.add_argument("--mutants", action="store_true", help="plant faults, and count the seeds that find each")
     parser.add_argument("--only", help="with --mutants: this one")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead")
@@ -86,11 +90,27 @@ def _seeds(options: argparse.Namespace) -> int:
 
 def _results(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     seeds = range(options.first, options.first + options.seeds)
+    one = _link if options.links else _one
     if options.jobs == 1:
-        yield from map(_one, seeds)
+        yield from map(one, seeds)
         return
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        yield from pool.imap_unordered(_one, seeds, chunksize=10)
+        yield from pool.imap_unordered(one, seeds, chunksize=10)
+
+
+def _link(seed: int) -> dict[str, Any]:
+    """Runs one link; the result as plain values."""
+    from simulation.pipes import journey_of, shrunk, travel
+    from simulation.world import Violation
+
+    journey = journey_of(seed)
+    counts = {"frames": sum(map(len, journey.sent)), "resets": sum(e.kind == "reset" for e in journey.events)}
+    try:
+        travel(journey)
+    except Violation as violation:
+        small, said = shrunk(journey, violation)
+        return {"seed": seed, "verdict": "broken", "violation": said, "plan": str(small), "counts": {}}
+    return {"seed": seed, "verdict": "everything was taken", "violation": "", "plan": "", "counts": counts}
 
 
 def _one(seed: int) -> dict[str, Any]:
@@ -146,11 +166,11 @@ def _show_summary(summary: dict[str, Any], failures: int) -> None:
         f"\n{summary['seeds']} seeds from {summary['from']}, {summary['wall_s']} s with {summary['jobs']} jobs "
         f"({summary['seeds_per_minute']} a minute): {failures} break a promise"
     )
-    print("\n| the recording | seeds |\n| --- | --- |")
+    print("\n| outcome | seeds |\n| --- | --- |")
     for verdict, number in summary["verdicts"].items():
         print(f"| {verdict} | {number} |")
-    names = ("live", "killed", "restarts", "drops", "replayed", "simulated_s")
-    print("\n" + ", ".join(f"{name} {summary.get(name, 0):g}" for name in names))
+    names = ("live", "killed", "restarts", "drops", "replayed", "simulated_s", "frames", "resets")
+    print("\n" + ", ".join(f"{name} {summary[name]:g}" for name in names if name in summary))
 
 
 # Mutants
@@ -183,6 +203,8 @@ def _find(task: tuple[str, int, int]) -> dict[str, Any]:
     from simulation.world import Violation
 
     name, first, most = task
+    if name == "link":
+        return _find_link(first, most)
     begun = time.monotonic()
     with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder, MUTANTS[name].planted():
         for seed in range(first, first + most):
@@ -202,6 +224,25 @@ def _find(task: tuple[str, int, int]) -> dict[str, Any]:
                 }
     wall = round(time.monotonic() - begun, 1)
     return {"name": name, "said": MUTANTS[name].said, "seeds": 0, "wall_s": wall, "violation": "", "plan": ""}
+
+
+def _find_link(first: int, most: int) -> dict[str, Any]:
+    from simulation.mutants import MUTANTS
+
+    begun = time.monotonic()
+    mutant = MUTANTS["link"]
+    with mutant.planted():
+        results = map(_link, range(first, first + most))
+        found = next((result for result in results if result["violation"]), None)
+    wall = round(time.monotonic() - begun, 1)
+    shown = {"violation": "", "plan": ""} if found is None else {k: found[k] for k in ("violation", "plan")}
+    return {
+        "name": "link",
+        "said": mutant.said,
+        "seeds": 0 if found is None else found["seed"] - first + 1,
+        "wall_s": wall,
+        **shown,
+    }
 
 
 if __name__ == "__main__":

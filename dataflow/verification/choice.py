@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.recording.layout import OUTCOME
+from dataflow.recording.layout import CUT, OUTCOME
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import NotRecorded, ReplayError
 from dataflow.verification.books import Books
@@ -96,6 +96,11 @@ def require_records(recording: Recording, recorded: Collection[str], operators: 
             raise ReplayError(
                 f"{recording.path}: the recorded run ended before operator {name!r} began ({why}): "
                 "there is nothing to verify"
+            )
+        if CUT in recording.metadata:
+            raise ReplayError(
+                f"{recording.path}: this part of a recording has no firing records of operator {name!r}: verify the "
+                "whole (dataflow merge), or other operators (--only)"
             )
         raise ReplayError(
             f"{recording.path}: operator {name!r} left no firing records there; "

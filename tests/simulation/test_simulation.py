@@ -16,6 +16,7 @@ pytest.importorskip("greenlet", reason="simulated runs need the package greenlet
 from simulation import bindings
 from simulation.check import check
 from simulation.mutants import MUTANTS, Mutant
+from simulation.pipes import journey_of, travel
 from simulation.run import Happening, Machine, simulate
 from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
@@ -204,6 +205,13 @@ def test_seeds(first: int, memory: Path) -> None:
             pytest.fail(f"{scenario.describe()}\n{violation}")
 
 
+@pytest.mark.parametrize("first", [0, *(pytest.param(at, marks=pytest.mark.long) for at in range(10, 100, 10))])
+def test_links_between_machines(first: int) -> None:
+    """Frames arrive once and in order, whatever becomes of the link; clocks are known to half the delay."""
+    for seed in range(first, first + 10):
+        travel(journey_of(seed))
+
+
 # Planted faults
 
 FOUND_BY = {
@@ -267,6 +275,22 @@ def test_a_planted_fault_is_found_and_its_plan_shrunk(name: str, memory: Path) -
 
     assert said
     assert len(small.happenings) < len(scenario.happenings)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "seed"), [("part", 36), ("state", 26), ("reload", 37)])
+def test_a_fault_of_what_is_recorded_is_found(name: str, seed: int, memory: Path) -> None:
+    check(scenario_of(seed), memory, replay=False)
+
+    with MUTANTS[name].planted(), pytest.raises(Violation):
+        check(scenario_of(seed), memory, replay=False)
+
+
+def test_a_pipe_that_does_not_notice_what_its_link_lost_is_found() -> None:
+    travel(journey_of(3))
+
+    with MUTANTS["link"].planted(), pytest.raises(Violation, match="did not come"):
+        travel(journey_of(3))
 
 
 def test_planting_a_fault_leaves_nothing_behind() -> None:

@@ -14,6 +14,7 @@ from typing import Any
 ENGINE = (
     "chaos",
     "execution",
+    "machines",
     "process",
     "records",
     "recording",

@@ -120,7 +120,7 @@ def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
     if len(files) < 2:
         return files[0] if files else folder / "run.mcap"
     for file in files:
-        _unchanged(file)
+        _unchanged(file, lacks=not _holds_all(outcome))
     try:
         path = joined(files, folder / "joined.mcap")
     except RecordingError as error:
@@ -138,16 +138,16 @@ def _check_flight(outcome: Outcome) -> str:
         return "no recording"
     kept = kept_by_flight(outcome.report)
     for one in kept:
-        _unchanged(Path(one["path"]))
+        _unchanged(Path(one["path"]), lacks=not _holds_all(outcome))
     return "kept" if kept else "nothing kept"
 
 
-def _unchanged(path: Path) -> None:
-    """A part of a recording verifies without a difference."""
+def _unchanged(path: Path, *, lacks: bool) -> None:
+    """A part of a recording verifies without a difference; `lacks`: what was given is not all in it."""
     try:
         report = verified(path)
     except (ReplayError, RecordingError) as error:
-        if "there is nothing to verify" in str(error):
+        if lacks or "there is nothing to verify" in str(error):
             return
         raise Violation(f"{path.name} cannot be verified: {error}") from error
     if any(v.first is not None for v in report.operators) or report.changed:
@@ -302,6 +302,7 @@ def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) ->
     """Every message that was made is taken by each trigger it reaches, or dropped or missed and counted."""
     counted = 0
     records = _records(path, graph)
+    _check_stale(graph, records)
     for name, node in graph.nodes.items():
         if node.source or report.restarts.get(name):
             continue
@@ -332,6 +333,20 @@ def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) ->
                         f"{sorted(lost)[:5]}"
                     )
     return counted
+
+
+def _check_stale(graph: Graph, records: Records) -> None:
+    """What a dead producer has left is given to no call whose policy drops it."""
+    for name, node in graph.nodes.items():
+        dropping = {
+            port.name
+            for port in node.spec.inputs.values()
+            if node.live.on_stale == "drop" and port.kind == "sampled" and not port.required
+        }
+        for record in records[name]:
+            for port_name in dropping & record.stale:
+                if record.inputs.get(port_name) is not None:
+                    raise Violation(f"{name} was given a stale {port_name} at {record.stamp}, which it drops")
 
 
 def _made(graph: Graph, records: Records, stream: str, report: RunReport) -> dict[Place, int]:

@@ -66,10 +66,11 @@ class Time:
         self.monotonic = self.perf_counter = world.clock
 
     def time(self) -> float:
-        return EPOCH + self._world.clock()
+        task = self._world.task
+        return EPOCH + self._world.clock() + (0.0 if task is None else task.process.ahead)
 
     def time_ns(self) -> int:
-        return round((EPOCH + self._world.clock()) * 1e9)
+        return round(self.time() * 1e9)
 
     def monotonic_ns(self) -> int:
         return round(self._world.clock() * 1e9)
@@ -138,6 +139,41 @@ class Event:
         return self._set
 
 
+class Condition:
+    """`threading.Condition`, with a lock that its holder may take again."""
+
+    def __init__(self, world: World) -> None:
+        self._world, self._lock, self._changed = world, Lock(world), Waiters(world)
+        self._holder: Task | None = None
+        self._depth = 0
+
+    def __enter__(self) -> None:
+        self._world.call()
+        if self._holder is not self._world.task:
+            self._lock.acquire()
+            self._holder = self._world.task
+        self._depth += 1
+
+    def __exit__(self, *error: object) -> None:
+        self._depth -= 1
+        if not self._depth:
+            self._holder = None
+            self._lock.release()
+
+    def wait_for(self, predicate: Callable[[], bool], timeout: float | None = None) -> bool:
+        until = None if timeout is None else self._world.now + timeout
+        while not (found := predicate()) and (until is None or self._world.now < until):
+            depth, self._depth, self._holder = self._depth, 0, None
+            self._lock.release()
+            self._changed.wait(None if until is None else until - self._world.now)
+            self._lock.acquire()
+            self._depth, self._holder = depth, self._world.task
+        return found
+
+    def notify_all(self) -> None:
+        self._changed.notify()
+
+
 class Thread:
     """`threading.Thread`: a task of the process that starts it."""
 
@@ -179,6 +215,7 @@ class Threading:
     def __init__(self, world: World) -> None:
         self.Lock = lambda: Lock(world)
         self.Event = lambda: Event(world)
+        self.Condition = lambda: Condition(world)
         self.Thread = lambda **fields: Thread(world, **fields)
 
 

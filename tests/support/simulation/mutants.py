@@ -8,13 +8,16 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from dataflow.execution.admission import AdmissionQueue, Patience
+from dataflow.execution.calls import Calls
 from dataflow.execution.feeds.window import Window
 from dataflow.execution.live import LiveRunner
 from dataflow.execution.ports import OutputPorts
 from dataflow.execution.runner import OperatorRunner
+from dataflow.machines.pipe import _FRAME, Pipe
 from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import ChannelClosed, QueuedChannel
 from dataflow.process.streams.losses import LossTold
+from dataflow.sinks.parts import PartsSink
 from dataflow.sync import FOREVER, NEVER
 
 
@@ -23,7 +26,7 @@ class Mutant:
 
     said = ""
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         raise NotImplementedError
 
     @contextlib.contextmanager
@@ -45,7 +48,7 @@ class CreditLost(Mutant):
 
     said = "a credit is lost"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         right = Window.cover
 
         heard: Counter[int] = Counter()
@@ -63,7 +66,7 @@ class EarlyAcknowledgement(Mutant):
 
     said = "an acknowledgement comes too early"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         right = Window.cover
 
         def cover(self: Window, frontier: int) -> None:
@@ -79,7 +82,7 @@ class LateRecord(Mutant):
 
     said = "a record is written after its message"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         right = OperatorRunner._record
         publish = OutputPorts.publish
 
@@ -95,7 +98,7 @@ class HighFrontier(Mutant):
 
     said = "a frontier is too high"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         right = OutputPorts.promise
 
         def promise(self: OutputPorts, frontier: int) -> None:
@@ -109,7 +112,7 @@ class SpinningWait(Mutant):
 
     said = "an operator spins on a static input that has not come"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         def exhausted(self: Patience, stamp: int, needs: Mapping[str, int]) -> dict[str, int]:
             if stamp != self._stamp:
                 self._stamp, self._since = stamp, self.clock()
@@ -137,7 +140,7 @@ class BlockingSupervisor(Mutant):
 
     said = "the supervisor waits for a process that is frozen"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         right = QueuedChannel.send
 
         def send(self: QueuedChannel, kind: str, fields: dict[str, Any], *, replaces: bool = False) -> None:
@@ -156,7 +159,7 @@ class SilentGap(Mutant):
 
     said = "a gap is not counted"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         def lost(self: LossTold, stream: str, first: int, following: int) -> None:
             return None
 
@@ -168,7 +171,7 @@ class SilentDrop(Mutant):
 
     said = "a drop is not recorded"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         def drop(self: AdmissionQueue, stream: str, arrival: Any, reason: str = "overflow") -> None:
             return None
 
@@ -180,7 +183,7 @@ class DeafToItself(Mutant):
 
     said = "an operator does not notice what it gives to itself"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         def decide(self: LiveRunner) -> bool:
             fired = OperatorRunner.step(self)
             self._told = fired and self.idle == NEVER
@@ -196,8 +199,71 @@ class SleeplessClock(Mutant):
 
     said = "a pause counts against processes"
 
-    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         return {(AwakeClock, "__call__"): lambda self: self._clock()}
+
+
+class GapTaken(Mutant):
+    """The pipe between machines goes on behind what a reset link has lost."""
+
+    said = "a pipe goes on behind what its link has lost"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        right = Pipe._on_frame
+
+        def on_frame(self: Pipe, sample: Any) -> None:
+            _, number, mark = _FRAME.unpack_from(sample.payload.to_bytes())
+            if number > self._expected and not mark:
+                self._expected = number
+            right(self, sample)
+
+        return {(Pipe, "_on_frame"): on_frame}
+
+
+class NotIntroduced(Mutant):
+    """A part of a recording lacks what stands in for operators that are not called in it."""
+
+    said = "a part lacks operators that rest in it"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        return {(PartsSink, "_introduce_all"): lambda self: None}
+
+
+class StateBefore(Mutant):
+    """An operator records the state that it had at its last snapshot."""
+
+    said = "a state is recorded that is over"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        right = Calls.snapshot
+        last: dict[int, bytes | None] = {}
+
+        def snapshot(self: Calls, place: tuple[int, int]) -> bytes | None:
+            before, last[id(self)] = last.get(id(self)), right(self, place)
+            return last[id(self)] if before is None else before
+
+        return {(Calls, "snapshot"): snapshot}
+
+
+class NotRestored(Mutant):
+    """A reload does not record the state with which the new code goes on."""
+
+    said = "a reload does not record the state that it keeps"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        return {(LiveRunner, "reload"): _unrecorded(LiveRunner.reload)}
+
+
+def _unrecorded(reload: Callable[[LiveRunner], Any]) -> Callable[[LiveRunner], Any]:
+    def without(self: LiveRunner) -> Any:
+        add = self.records.add
+        self.records.add = lambda kind, *args, **fields: None if kind == "restore" else add(kind, *args, **fields)  # type: ignore[method-assign]
+        try:
+            return reload(self)
+        finally:
+            self.records.add = add  # type: ignore[method-assign]
+
+    return without
 
 
 MUTANTS: Mapping[str, Mutant] = {
@@ -211,4 +277,8 @@ MUTANTS: Mapping[str, Mutant] = {
     "drop": SilentDrop(),
     "itself": DeafToItself(),
     "pause": SleeplessClock(),
+    "part": NotIntroduced(),
+    "state": StateBefore(),
+    "reload": NotRestored(),
+    "link": GapTaken(),
 }

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.graph.code import Code, digest_of
-from dataflow.graph.model import Node
+from dataflow.graph.model import Node, import_operator
 from dataflow.operator import Operator
 from dataflow.recording import Recording
 from dataflow.records.cuts import code_in
@@ -32,6 +32,12 @@ class Files:
     stored: frozenset[str] = frozenset()
     last: Mapping[str, int] = {}
 
+    @classmethod
+    def change(cls) -> None:
+        """Writes the next revision; the store has the one before."""
+        cls.stored |= {digest_of(_text(cls.revision))}
+        cls.revision += 1
+
 
 def _text(revision: int) -> bytes:
     return f"revision {revision}".encode()
@@ -48,6 +54,12 @@ def revised(operator: Any, revision: int) -> Any:
 
 def code_now(operator: type[Any], also: Iterable[str] = ()) -> Code:
     return Code(operator, {operator.__module__: _text(getattr(operator, "revision", 0))})
+
+
+def imported(use: str) -> Any:
+    """Stands for `import_operator`: a process that begins has the code of the files."""
+    operator: Any = import_operator(use)
+    return revised(operator, Files.revision)
 
 
 class Replaced:

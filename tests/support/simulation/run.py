@@ -20,7 +20,7 @@ from dataflow.transport.keys import local_key, runtime_key
 from simulation import bindings, machine, memory, network, operators
 from simulation.disk import Disk
 from simulation.processes import SUPERVISOR, Nursery
-from simulation.reloading import Files
+from simulation.reloading import Files, imported
 from simulation.sleep import watched
 from simulation.world import Process, Violation, World
 
@@ -127,6 +127,7 @@ class Simulation:
                 stack.enter_context(bindings.bound(SPLIT_FLUSHES))
             stack.enter_context(watched(self.world))
             stack.enter_context(contextlib.redirect_stderr(_Words(self)))
+            stack.enter_context(contextlib.redirect_stdout(_Words(self)))
             time = machine.Time(self.world)
             before = operators.Effort.sleep, operators.Effort.now
             operators.Effort.sleep, operators.Effort.now = time.sleep, time.time
@@ -213,6 +214,7 @@ class Simulation:
             ("dataflow.recording.mcap.container", "os"): self.disk,
             ("dataflow.recording.parts", "os"): self.disk,
             ("dataflow.sinks.outage", "os"): self.disk,
+            ("dataflow.graph.model", "import_operator"): imported,
             ("dataflow.sinks.flight_files", "queue"): machine.Queue(world),
             ("dataflow.sinks.flight_files", "threading"): threads,
             **QUICKER,
@@ -255,7 +257,7 @@ class Simulation:
                     key = runtime_key(self._plan.graph.namespace, "param", happening.target)
                     self._ask(key, {"name": name, "value": value})
             case "reload":
-                Files.revision += 1
+                Files.change()
                 self._ask(local_key(self._plan.graph.namespace, "reload", happening.target), {"reload": True})
             case "trigger":
                 assert self._supervisor is not None
@@ -283,7 +285,7 @@ class Simulation:
 
 
 class _Words:
-    """`sys.stderr`: what a process prints is its own."""
+    """`sys.stdout` and `sys.stderr`: what a process prints is its own."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation

@@ -41,6 +41,8 @@ class Process:
         self.thawed: list[Callable[[], None]] = []
         self.dead = False
         self.frozen = False
+        self.ahead = 0.0
+        """Seconds by which its machine's wall clock is ahead."""
         self.effects = 0
         """Calls that others can see: what it has sent, written, or put where it outlives it."""
         self.dies_at: int | None = None
