@@ -32,8 +32,8 @@ ROOMS = {
     "network": ("client", "foxglove", "machines", "transport"),
     "process": (
         "analysis", "api", "blame", "capture", "causes", "cli", "debugging", "doctor", "drops", "editing",
-        "environments", "graphs",
-        "operators/perception", "operators/training", "process", "program", "recordings_of", "runtime", "shipped",
+        "environments", "graphs", "operators/perception", "operators/training", "process", "program", "recordings_of",
+        "runtime", "shipped",
         "simulation", "supervision", "tool_server", "verification",
     ),
 }  # fmt: skip

@@ -47,12 +47,15 @@ def _cameras(root: Path) -> Iterator[Device]:
     for file in sorted((root / "dev").glob("video[0-9]*"), key=lambda file: (len(file.name), file.name)):
         about = root / "sys/class/video4linux" / file.name
         note = _refused(file, "video")
+        name = _text(about / "name")
         if _text(about / "index") not in ("", "0"):
             note = note or "further node of its device: may carry no images"
+        elif "RealSense" in name:
+            note = note or "with its depth: use: operators.sources:RealSense"
         yield Device(
             "camera",
             str(file),
-            _text(about / "name"),
+            name,
             "operators.sources:Webcam",
             {"input": str(file)},
             note,

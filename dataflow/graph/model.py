@@ -109,6 +109,7 @@ class Live:
     - `deadline`: longest one firing may take (ns) before the operator counts as hung; None: no limit.
     - `memory`: bytes of resident memory at which its process is restarted; None: no limit.
     - `on_stale`: whether messages of an input whose producer died still serve firings or count as absent.
+    - `corrected`: of a source on another machine, whether its stamps are corrected by the measured offset of the clock.
     """
 
     queue: QueuePolicy
@@ -118,6 +119,7 @@ class Live:
     restart: Restart = Restart()
     memory: int | None = None
     on_stale: StalePolicy = "use"
+    corrected: bool = False
 
 
 @dataclass(frozen=True, slots=True)

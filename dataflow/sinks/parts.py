@@ -309,13 +309,17 @@ class PartsSink:
             part.path.unlink(missing_ok=True)
 
     def _keep_to_limit(self) -> None:
-        """Deletes the oldest parts while all together take more of the disk than they may."""
+        """Deletes the oldest parts while all together take more of the disk than they may; the newest one stays."""
         most = self._storage.keep
-        while most is not None and (self._earlier or self._closed) and self.size > most:
+        while most is not None and self._has_older() and self.size > most:
             oldest = next(iter(self._earlier)) if self._earlier else self._closed.pop(0).path
             self._earlier.pop(oldest, None)
             oldest.unlink(missing_ok=True)
             self._deleted += 1
+
+    def _has_older(self) -> bool:
+        older = len(self._earlier) + len(self._closed)
+        return older > (0 if any(self._open_parts()) else 1)
 
     # Firing records
 

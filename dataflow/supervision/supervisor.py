@@ -29,7 +29,7 @@ from dataflow.supervision.core.compose import core_of
 from dataflow.supervision.core.report import RunFailed, RunReport, Status
 from dataflow.supervision.early_nursery import EarlyNursery
 from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
-from dataflow.supervision.plan import LINK, RunPlan, process_plans
+from dataflow.supervision.plan import LINK, RECORDER, RunPlan, process_plans
 from dataflow.supervision.rings import Pairs, Rings, pairs_of
 from dataflow.transport import registry, reserve_endpoints
 from dataflow.transport.log_file import LogFile
@@ -186,6 +186,8 @@ class Supervisor:
                 raise RunFailed("stopped while other machines were awaited", interrupted=True)
             if self._clock() > deadline:
                 raise self._remote.not_ready(self.plan.start_timeout)
+        if RECORDER in self.core.run.configs:
+            self.core.run.configs[RECORDER][1]["options"]["metadata"].update(self._remote.facts)
 
     def _part(self) -> None:
         """Lets the other machines go (bounded)."""

@@ -119,7 +119,7 @@ class Chessboard(Board):
 
     @property
     def ambiguous(self) -> bool:
-        """Whether it looks the same upside down."""
+        """True where it looks the same upside down."""
         return (self.columns + self.rows) % 2 == 0
 
     def corners(self, grey: Grey) -> tuple[Numbers, Pixels] | None:
@@ -133,7 +133,7 @@ class Chessboard(Board):
         return np.arange(len(pixels)), pixels
 
     def _upside_down(self, grey: Grey, pixels: Pixels) -> bool:
-        """Whether the first square within the corners is brighter than its neighbour in the row."""
+        """True where the first square within the corners is brighter than its neighbour in the row."""
         grid = pixels.reshape(self.rows, self.columns, 2)
         first, second = (
             cv2.getRectSubPix(grey, (3, 3), tuple(grid[:2, k : k + 2].reshape(4, 2).mean(axis=0))).mean()

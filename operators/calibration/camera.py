@@ -88,7 +88,7 @@ def different(views: Sequence[View], width: int, most: int = MOST) -> list[View]
 
 
 def _distance(a: View, b: View) -> float:
-    """How far the board has moved in the image: the mean over corners that both see, infinite without any."""
+    """Returns the mean distance in pixels of corners that both see, infinite without any."""
     _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
     return float(np.linalg.norm(a.pixels[i] - b.pixels[j], axis=1).mean()) if len(i) else float("inf")
 

@@ -137,6 +137,11 @@ class VideoFile(CalibratedImages):
         return self.first_stamp
 
 
+SET_BACK = 1_000_000_000
+"""Nanoseconds from which on a clock that is behind the last stamp was set back: stamps go on from there, as live runs
+allow."""
+
+
 class Webcam(CalibratedImages):
     """Reads a camera: of this machine by its number or device file, of the network by its address (RTSP, HTTP).
 
@@ -147,6 +152,8 @@ class Webcam(CalibratedImages):
     """
 
     real_time = True
+
+    _unplugged = 0
 
     input: str = Param("0", min_length=1, doc="number, device file or address of the camera")
     width: int | None = Param(None, ge=1, unit="px", doc="width to ask for; the camera may give another")
@@ -175,12 +182,15 @@ class Webcam(CalibratedImages):
             stamp = time.time_ns() - self.latency
             if bgr is None:
                 self._look_for_it()
-            elif stamp > last:  # else the clock was set back by less than an image: the next one comes soon
+            elif stamp > last or last - stamp > SET_BACK:  # of less the next image is ahead again: this one is left out
                 last = stamp
                 yield self._image(stamp, np.asarray(bgr, np.uint8))
 
     def stop_reading(self) -> None:
         self._stopped.set()
+
+    def summary(self) -> Mapping[str, int | str]:
+        return {"clock": "machine", "unplugged": self._unplugged}
 
     def close(self) -> None:
         camera: cv2.VideoCapture | None = getattr(self, "_camera", None)
@@ -219,6 +229,7 @@ class Webcam(CalibratedImages):
         """Waits until the camera is back, or the run ends. Raises SourceError for images of another size."""
         if self._stopped.is_set():
             return
+        self._unplugged += 1
         self.log.warning("camera %s gives no image any more: looking for it every %g s", self.input, self.retry * 1e-9)
         self.close()
         self._camera = None

@@ -336,6 +336,18 @@ def test_rgbd_folders_are_read_back_with_the_same_pixels_depths_and_poses(tmp_pa
     assert source.static_outputs()["depth_info"].fx == 50.0
 
 
+def test_images_and_poses_without_a_depth_image_are_counted_as_7scenes_leaves_them_out(tmp_path: Path) -> None:
+    made = frames()
+    made["camera/depth"] = made["camera/depth"][::3]
+
+    with Material(write(tmp_path / "a.mcap", made, STATIC)) as material:
+        done = Exported()
+        DATASETS["7scenes"](material, tmp_path / "out", done)
+
+    assert done.lost["camera/image"]["image without a depth image within 20 ms, left out"] == 2
+    assert done.lost["camera/pose"]["pose without a depth image within 20 ms, left out"] == 2
+
+
 def test_kitti_folder_is_read_back(tmp_path: Path) -> None:
     from operators.sources import KittiOdometry
 

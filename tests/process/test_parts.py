@@ -131,6 +131,13 @@ def test_parts_are_verified_each_and_join_into_the_whole(
         assert set(verdicts(part).values()) <= {"identical", "unverifiable"}, part
 
 
+def test_the_newest_part_stays_however_large_it_is(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    facts = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(every=6 * SECOND), keep=1000)).all()
+
+    assert facts["deleted"] == 1
+    assert facts["parts"] == [str(part) for part in parts_of(tmp_path / "run.mcap")] == [str(tmp_path / "run_001.mcap")]
+
+
 def test_a_part_without_calls_of_an_operator_is_verified(
     recorded: Path, graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -303,6 +303,7 @@ def report_json(report: RunReport) -> dict[str, Any]:
     """A `RunReport` as JSON values."""
     return {
         "graph": report.graph,
+        "namespace": report.namespace,
         "complete": not report.interrupted,
         "wall_s": report.wall,
         "first_stamp": report.first,

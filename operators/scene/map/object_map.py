@@ -69,7 +69,7 @@ class ObjectMap:
 
         An object that was found to be a double of another, or one that is known, keeps its id no longer.
         """
-        s = self._settings
+        s, before = self._settings, {*self.objects, *self.gone}
         seconds = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
         self._stamp = stamp
         if self._updates % _AGAIN == 0:
@@ -98,6 +98,7 @@ class ObjectMap:
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
+        self._forget(before - self.objects.keys() - self.gone.keys())
         return [joined[k] if k in joined else ids[k] for k in range(len(seen))]
 
     @property
@@ -295,6 +296,12 @@ class ObjectMap:
                 chosen.id, chosen.born, chosen.tracks = i, old.born, [*old.tracks, *chosen.tracks]
                 self.objects[i] = chosen
                 self.moved += 1
+
+    def _forget(self, lost: set[int]) -> None:
+        """Forgets what was seen beside objects that are no more: their ids do not come back."""
+        for object in self.objects.values() if lost else ():
+            for i in lost & object.beside.keys():
+                del object.beside[i]
 
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
 
