@@ -93,6 +93,7 @@ def test_words_name_residuals_coverage_and_poor_data(pair: Path, tmp_path: Path)
     assert f"written: {tmp_path}/camera.yaml, {tmp_path}/camera.png" in out
 
 
+@pytest.mark.long
 def test_a_pair_is_found_and_its_files_are_taken_by_sources(pair: Path, tmp_path: Path) -> None:
     found = json.loads(run(f"stereo {pair} {CHARUCO} --out {tmp_path} --tolerance 0.002 --json"))
 
