@@ -33,7 +33,7 @@ class SceneGraph(Message):
     moving: F32 | None = array(
         "float32",
         "N",
-        "probability that each node moves, [0, 1]; NaN where its places alone tell",
+        "probability that each node moves, [0, 1]; NaN where that is left to its places",
         default=None,
         added=True,
     )

@@ -8,11 +8,13 @@ from typing import Any
 import rerun as rr
 
 from dataflow.graph.model import Graph
-from dataflow.operator import FINDING
 from dataflow.records.figures import figures
 
 SCORES = "/viewer/scores"
 """Entity of the scores."""
+
+FINDING = "finding"
+"""Key of what an operator found wrong, as in `dataflow.operator`, which viewers do not import."""
 
 Summaries = Mapping[str, Mapping[str, Any]]
 """Operator → name of a figure → value."""

@@ -27,6 +27,7 @@ from dataflow.messages import (
     Transforms,
     array,
 )
+from dataflow.operator import FINDING
 from dataflow.recording import Recording, RecordingWriter
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
@@ -358,9 +359,9 @@ def test_what_an_operator_found_wrong_stands_before_the_scores() -> None:
         for name, outputs in (("calibration", {"status": "r/calibration/status"}), ("score", {}))
     )
     made = Graph("g", "r", {n.name: n for n in (judge, maker)}, {}, Record(()), Bundle("g.yaml", {"g.yaml": ""}))
-    told = {"score": {"ate_rmse_m": 0.1}, "calibration": {"pairs": 3, "finding": "colour lies beside depth"}}
+    told = {"score": {"ate_rmse_m": 0.1}, "calibration": {"pairs": 3, FINDING: "colour lies beside depth"}}
     assert list(scores_of(told, made).items()) == [
-        ("calibration", {"finding": "colour lies beside depth"}),
+        ("calibration", {FINDING: "colour lies beside depth"}),
         ("score", {"ate_rmse_m": 0.1}),
     ]
 

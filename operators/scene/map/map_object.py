@@ -45,8 +45,8 @@ class MapObject:
     the views that its box is fitted to, `form` which of the ways in which its class stands, -1 while that is open,
     `fresh` how many of them are new since the last fit; `held` whether it was last seen in a hand. `beside` counts by
     id the views in which another object was seen too, in a separate place in the image. `tracks` are the ids of the
-    last tracks in images that were of it, the latest last. `moving` is the probability that it moves, NaN where its
-    place alone tells.
+    last tracks in images that were of it, the latest last. `moving` is the probability that it moves, NaN where that
+    is left to its places.
     """
 
     id: int

@@ -1,4 +1,4 @@
-"""Whether large things that can move do so: by their places, which views show to be taken or empty."""
+"""Finds which large things move, by their places, which views show to be taken or empty."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RecentPlaces:
         self._moments: list[_Moment] = []
 
     def judge(self, stamp: int, movers: Sequence[MapObject], view: RangeView) -> None:
-        """Sets `moving` of the movers of this view; 0.5 where nothing tells yet."""
+        """Sets `moving` of the movers of this view; 0.5 where nothing shows it yet."""
         kept = [m for m in self._moments if 0 <= stamp - m.stamp <= _LONG_AGO * 1e9]
         before = next((m for m in reversed(kept) if stamp - m.stamp >= _AGO * 1e9), None)
         for each in movers:

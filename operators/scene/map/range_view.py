@@ -58,7 +58,8 @@ class RangeView:
     def restored(cls, state: Mapping[str, Any]) -> RangeView:
         """Returns a view of a snapshot, which has no points."""
         made = cls(np.zeros((0, 3)), np.array(state["T"], np.float64), float(state["angle"]))
-        made._first, made._shape = np.array(state["first"]), tuple(map(int, state["shape"]))
+        columns, rows = map(int, state["shape"])
+        made._first, made._shape = np.array(state["first"]), (columns, rows)
         made._nearest, made._farthest = np.array(state["nearest"]), np.array(state["farthest"])
         made.reach = float(state["reach"])
         return made
