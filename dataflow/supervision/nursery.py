@@ -17,6 +17,7 @@ from typing import Any
 
 import msgpack
 
+from dataflow.environments import Environment, environment_of
 from dataflow.process.channel import QueuedChannel
 from dataflow.process.polling import readable
 from dataflow.supervision.core.wording import how_it_ended
@@ -162,17 +163,31 @@ class Leftovers:
     processes: tuple[str, ...]
 
 
+def nurseries_of(envs: Mapping[str, str | None], common: Mapping[str, str]) -> dict[str, Nursery]:
+    """Starts a nursery for each environment of processes; returns those of processes that are in one, by label.
+
+    `envs`: by label of a process what `env:` names; `common`: the variables of processes that are in none. Raises
+    `EnvError`.
+    """
+    found = {env: environment_of(env) for env in envs.values() if env is not None}
+    started = {env: Nursery(common, of) for env, of in found.items()}
+    return {label: started[env] for label, env in envs.items() if env is not None}
+
+
 class Nursery:
     """Starts processes. The first one takes half a second, while the nursery imports the runtime."""
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
-        self.environment = environment
+    def __init__(self, environment: Mapping[str, str], env: Environment | None = None) -> None:
+        """`environment`: the variables of its processes; `env`: the environment that they are in, if any."""
+        self.environment = environment if env is None else env.variables(environment)
+        self._called = "the process that starts the others" + ("" if env is None else f" in {env.folder}")
+        python = sys.executable if env is None else env.python
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "dataflow.supervision.nursery_process", str(theirs.fileno())],
+                [python, "-P", "-m", "dataflow.supervision.nursery_process", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),),
-                env=environment,
+                env=self.environment,
                 stdin=subprocess.DEVNULL,
                 process_group=0,
             )
@@ -233,12 +248,12 @@ class Nursery:
         except BlockingIOError:
             return []
         except OSError as error:
-            raise NurseryFailed(f"the process that starts the others is gone: {error}") from error
+            raise NurseryFailed(f"{self._called} is gone: {error}") from error
         self._pidfds.extend(pidfds)
         if not data:
             with contextlib.suppress(subprocess.TimeoutExpired):  # its end of the socket closes before it is dead
                 self._process.wait(timeout=DIE_WITHIN)
-            raise NurseryFailed(f"the process that starts the others {how_it_ended(self._process.poll())}")
+            raise NurseryFailed(f"{self._called} {how_it_ended(self._process.poll())}")
         self._unpacker.feed(data)
         news = (self._taken(*message) for message in self._unpacker)
         return [each for each in news if each is not None]

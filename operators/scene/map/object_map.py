@@ -26,6 +26,7 @@ from operators.scene.map.matching import (
     outside,
 )
 from operators.scene.map.merging import are_one, may_be_one, merge, smaller_in_place
+from operators.scene.map.moving import RecentPlaces
 from operators.scene.map.presence import has_left, look_at
 from operators.scene.map.range_view import RangeView
 from operators.tracking.assignment import assign
@@ -58,6 +59,7 @@ class ObjectMap:
         self._next = 1
         self._stamp: int | None = None
         self._room, self._updates = RoomHeading(), 0
+        self._recent = RecentPlaces(settings.voxel, settings.margin)
         self._heading: float | None = None
         self.floor: float | None = None
         """Height of the floor, where it is known: what stands on it reaches down to it."""
@@ -89,6 +91,8 @@ class ObjectMap:
                 ids[k] = self._begin(each, cells[k], stamp, view.origin)
             if each.track >= 0:
                 self.objects[joined[k] if k in joined else ids[k]].follow([each.track])
+        movers = [o for o in self.objects.values() if o.seen == stamp and self._kinds.is_mover(o)]
+        self._recent.judge(stamp, [o for o in movers if self._kinds.is_large(o)], view)
         shown = {i: cells[k] for k, i in joined.items()}
         self._note_beside(seen, [joined.get(k) for k in range(len(seen))])
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
@@ -310,12 +314,14 @@ class ObjectMap:
             "room": [self._room.scores, self._room.views],
             "objects": [o.snapshot() for o in self.objects.values()],
             "gone": [[stamp, o.snapshot()] for stamp, o in self.gone.values()],
+            "recent": self._recent.snapshot(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         side = self._settings.voxel
         self._updates, (scores, self._room.views) = int(state["updates"]), state["room"]
         self._room.scores = np.array(scores, np.float64)
+        self._recent.restore(state.get("recent", ()))
         self._next, self._stamp, self.moved = int(state["next"]), state["stamp"], int(state["moved"])
         objects = [MapObject.restored(row, side) for row in state["objects"]]
         self.objects = {o.id: o for o in objects}
