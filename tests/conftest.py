@@ -31,8 +31,9 @@ ROOMS = {
     "docs": ("docs", "scaffold"),
     "network": ("client", "foxglove", "machines", "transport"),
     "process": (
-        "analysis", "api", "blame", "capture", "causes", "cli", "debugging", "doctor", "drops", "editing", "graphs",
-        "operators/perception", "operators/training", "process", "program", "recordings_of", "runtime", "shipped",
+        "analysis", "api", "blame", "capture", "causes", "cli", "debugging", "doctor", "drops", "editing",
+        "environments", "graphs", "operators/perception", "operators/training", "process", "program", "recordings_of",
+        "runtime", "shipped",
         "simulation", "supervision", "tool_server", "verification",
     ),
 }  # fmt: skip

@@ -103,10 +103,10 @@ class _Path:
     wait: dict[str, int] = field(default_factory=dict)
 
 
-def recorded_latencies(recording: Recording, graph: Graph) -> list[PathLatency]:
-    """The latencies of all paths of a recorded run, sources and sinks in graph order. Raises `RecordingError`."""
+def records_of(recording: Recording, graph: Graph) -> dict[str, Iterable[FiringRecord]]:
+    """Returns the records of each operator, in order, read whenever they are iterated over. Raises `RecordingError`."""
     log = FiringLog.read(recording)
-    return latencies(graph, {name: _Recorded(log, node) for name, node in graph.nodes.items()})
+    return {name: _Recorded(log, node) for name, node in graph.nodes.items()}
 
 
 @dataclass(frozen=True, slots=True)

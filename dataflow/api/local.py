@@ -180,6 +180,7 @@ class LocalRun:
             interrupted=self._stopped,
             notes=(),
             waits=_rows(found["waits"]),
+            namespace=self.graph.namespace,
         )
 
 

@@ -19,7 +19,7 @@ from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import graph_as_recorded, graph_that_is_here
 from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.books import Books
-from dataflow.verification.choice import accountable, with_makers
+from dataflow.verification.choice import accountable, env_of, with_makers
 from dataflow.verification.ledger import incomplete_streams
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.workers.processes import Call, Workers, call_workers
@@ -112,7 +112,7 @@ def why(
         return Why(operator, refused=refused)
     assert verification is not None
     alone = _Alone(path, graph, verification, seconds=seconds, stall_timeout=stall_timeout, workers=workers)
-    changed = (*alone.changed, *(f"file {file}" for file in verification.files_changed))
+    changed = (*alone.changed, *(f"file {file}" for file in verification.files_changed), *verification.packages_changed)
     changed += tuple(f"{fact}: {then or 'none'} → {now or 'none'}" for fact, then, now in report.facts)
     try:
         wrote = alone.lines() if verification.wrote else None
@@ -190,7 +190,7 @@ class _Alone:
             self.changed = () if graph is None else _changes(graph_as_recorded(recording), graph, name)
         self.recorded = path.stat().st_mtime
         self._operators = tuple(each for each in played.nodes if each in chosen)
-        self._threads = played.threads
+        self._env, self._threads = env_of(played, self._operators), played.threads
         at = 0 if found.first is None else found.first.index
         far = found.first is not None and at > FROM_THE_START
         self._request = {
@@ -217,6 +217,7 @@ class _Alone:
             {**self._request, "setting": setting.to_wire()},
             self._operators,
             setting.environment(),
+            self._env,
         )
         [answer] = self._workers([call], threads=self._threads, stall_timeout=self._stall_timeout)
         return Rerun.from_wire(answer)

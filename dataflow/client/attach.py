@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from functools import cached_property
 from pathlib import Path
@@ -110,17 +110,17 @@ def network_of(found: RunningGraph) -> NetworkConfig:
     return NetworkConfig(connect=found.endpoints, zenoh=found.settings)
 
 
-def _graphs() -> list[RunningGraph]:
-    """Returns the graphs that run on this machine, or at the endpoint of `elsewhere`."""
+def listing() -> Callable[[], list[RunningGraph]]:
+    """Returns what lists, on any thread, the graphs that run on this machine, or at the endpoint of `elsewhere`."""
     place = _elsewhere.get()
-    return running() if place is None else place.graphs()
+    return running if place is None else place.graphs
 
 
 def find_running(name: str | None, *, wait: float = 0.0) -> RunningGraph:
     """The running graph of that name (or namespace), or the only one. Waits up to `wait` seconds for it."""
     deadline = time.monotonic() + wait
     while True:
-        graphs = _graphs()
+        graphs = listing()()
         found = [g for g in graphs if name is None or name in (g.name, g.namespace, str(g.pid))]
         if len(found) == 1:
             return found[0]

@@ -101,6 +101,11 @@ class Judge:
         changed = {name for name, digest in then.items() if now.get(name) != digest}
         self.result.code_changed = sorted(changed.union(self.result.code_changed))
 
+    def packages(self, then: Mapping[str, str], now: Mapping[str, str]) -> None:
+        """Notes packages of the operator's environment whose versions are not as recorded."""
+        changed = [name for name, version in now.items() if then.get(name) != version]
+        self.result.packages_changed = [f"{name} {then.get(name, '–')} -> {now[name]}" for name in changed]
+
     def differ(self, record: FiringRecord, port: str, expected: str, got: str) -> None:
         """Notes one difference."""
         self.result.differing += 1

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from dataflow.environments import imported_packages
 from dataflow.execution.ports import Emitter
 from dataflow.graph.code import Code, code_now
 from dataflow.operator import Operator
@@ -109,6 +110,8 @@ class FiringLog:
             "files": dict(operator.files),
             "code": (code or code_now(type(operator))).digests,
         }
+        if packages := imported_packages():
+            detail["packages"] = packages
         self.add("setup", NEVER + 1, started, outputs=emissions, detail=detail)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dataflow.environments import imported_packages, installed
 from dataflow.execution.align import align_spec
 from dataflow.execution.calls import Calls
 from dataflow.execution.effects.journal import RecordedJournal
@@ -96,6 +97,8 @@ class RecordedRunner(Runner):
         statics = self.calls.setup()
         if (record := self._repetition.setup) is not None:
             self.judge.files(record, self.operator.files)
+            then = record.detail.get("packages", {})
+            self.judge.packages(then, {name: installed(name) for name in then} or imported_packages())
             self._look_at_code(record)
             for name, message, seq in self.judge.outputs(record, statics):
                 self.ports.emit_as(name, message, seq, record.incarnation)

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from dataflow.execution.calls import Calls
+from dataflow.execution.clock_correction import ClockCorrection
 from dataflow.execution.completion import require_complete
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.generators.loading import LOADS
@@ -54,6 +55,7 @@ class SourceRunner:
         """The time of reading `stream()`."""
         self.first: int | None = None
         self.last = NEVER
+        self.clock = ClockCorrection()
         self._read = NEVER  # the stamp that was read last, on whichever thread
         self._steps: Iterator[Mapping[str, Message]] = iter(())
         self._next: dict[str, Message] | None = None
@@ -116,6 +118,8 @@ class SourceRunner:
                 messages = outputs_of(self.operator, step)
                 if messages:
                     require_complete(self.operator.spec, messages, "stream()")
+                    if shift := self.clock.shift(step_stamp(messages)):
+                        messages = {port: m.replace(stamp=m.stamp + shift) for port, m in messages.items()}
                     self._read = step_stamp(messages)
                     if len(messages) > 1:
                         self._check_stamps(messages)

@@ -66,6 +66,7 @@ class Draft:
     inputs_place: Place
     process: Leaf | None
     machine: Leaf | None
+    env: Leaf | None
     live: Tree | None
     sync: Tree | None
     inputs: dict[str, list[Pattern]] = field(default_factory=dict)
@@ -130,6 +131,7 @@ class Scope:
     use: Place | None
     process: Leaf | None
     machine: Leaf | None
+    env: Leaf | None
     stack: tuple[str, ...]
 
 

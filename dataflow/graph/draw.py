@@ -18,8 +18,8 @@ def tree(graph: Graph) -> Tree:
     title = Text.assemble((graph.name, "bold"), f"  {graph.namespace}  ", (_counts(graph), "dim"))
     root = Tree(title)
     for process, names in grouped.items():
-        machines = {graph.nodes[name].machine for name in names} - {None}
-        where = f" on {', '.join(sorted(m for m in machines if m))}" if machines else ""
+        node = graph.nodes[names[0]]
+        where = f" on {node.machine}" * (node.machine is not None) + f" in {node.env}" * (node.env is not None)
         branch = root.add(Text.assemble(("process ", "dim"), (process, "cyan"), (where, "dim")))
         for name in names:
             node = graph.nodes[name]

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from dataflow.environments import require_environment
 from dataflow.extras import missing_extra
 from dataflow.graph.sections import (
     Network,
@@ -108,6 +109,7 @@ class Live:
     - `deadline`: longest one firing may take (ns) before the operator counts as hung; None: no limit.
     - `memory`: bytes of resident memory at which its process is restarted; None: no limit.
     - `on_stale`: whether messages of an input whose producer died still serve firings or count as absent.
+    - `corrected`: of a source on another machine, whether its stamps are corrected by the measured offset of the clock.
     """
 
     queue: QueuePolicy
@@ -117,6 +119,7 @@ class Live:
     restart: Restart = Restart()
     memory: int | None = None
     on_stale: StalePolicy = "use"
+    corrected: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +131,7 @@ class Node:
     - `params`: every parameter, defaults included, as validated; plain JSON values.
     - `inputs`: input port → names of the streams it takes, sorted; an optional input left out has none.
     - `outputs`: output port → stream name.
-    - `process`, `machine`: labels as the graph gives them, or None.
+    - `process`, `machine`: labels as the graph gives them, or None. `env`: the path of its environment, or None.
     - `tolerance`, `every`: nanoseconds; the class's own, or the graph's `sync:`.
     - `source`, `external`: as the class declares.
     - `file`, `line`: where the graph names the operator.
@@ -142,6 +145,7 @@ class Node:
     live: Live
     process: str | None = None
     machine: str | None = None
+    env: str | None = None
     tolerance: int = 0
     every: int | None = None
     source: bool = False
@@ -173,7 +177,8 @@ class Node:
         return self.spec.inputs[name]
 
     def make(self) -> Operator:
-        """A new operator object with this node's parameters."""
+        """A new operator object with this node's parameters. Raises `EnvError` in a process of another environment."""
+        require_environment(self.name, self.env)
         return self.operator(**self.params)
 
 

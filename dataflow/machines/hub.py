@@ -16,7 +16,7 @@ import msgpack
 import zenoh
 
 from dataflow.machines.gate import Gate, Routes, Word
-from dataflow.machines.keys import GRAPH_KEY, KEYS, OVER_KEY, access, settings
+from dataflow.machines.keys import GRAPH_KEY, KEYS, OVER_KEY, access, own_name, settings
 from dataflow.machines.pipe import AWAY_AFTER, Pipe
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.streams.inbox import Inbox
@@ -113,7 +113,7 @@ class Hub:
         config = self.config
         more = settings(None if config.keys is None else Path(config.keys), config.endpoint)
         if config.keys is not None:
-            more |= access(config.machines, config.namespace)
+            more |= access(config.machines, config.namespace, own_name(Path(config.keys)))
         self._bus = router((config.endpoint, config.listen), config.connect, more)
         self._pipes = {
             name: Pipe(

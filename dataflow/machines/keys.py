@@ -30,6 +30,8 @@ CONNECT_WITHIN = 3000
 DAYS = 3650
 _AUTHORITY, _CERTIFICATE, _KEY = "authority.pem", "certificate.pem", "key.pem"
 _AUTHORITY_KEY = "authority.key"
+_NAME = "name"
+"""The file with the name of a machine that serves."""
 _CURVE = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
 
 
@@ -70,6 +72,8 @@ def issue(authority: Path, folder: Path, name: str, *, serves: Iterable[str] = (
         out = ("-extfile", str(wanted), "-out", str(made / _CERTIFICATE), "-days", str(DAYS))
         _openssl("x509", "-req", "-in", str(request), *by, *out)
         (made / _AUTHORITY).write_bytes((authority / _AUTHORITY).read_bytes())
+        if served:
+            (made / _NAME).write_text(name)
 
 
 @contextlib.contextmanager
@@ -132,10 +136,15 @@ def settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
     return {"transport/link/tls": tls}
 
 
-def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
+def own_name(keys: Path) -> str | None:
+    """Returns the name in the certificate of a machine that serves; None for keys of before this was noted."""
+    return (keys / _NAME).read_text() if (keys / _NAME).is_file() else None
+
+
+def access(machines: Iterable[str], namespace: str, own: str | None = None) -> dict[str, Any]:
     """Returns the access control of a supervisor's machine: a machine gets its own keys and what its processes answer
     with, tools ask and follow, and every other certificate gets nothing. `local_key`s are kept from other machines:
-    only tools on this one ask for them."""
+    only tools on this one, and tools with its keys (`own`: their name), ask for them."""
     asking = ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"]
     answering = ["put", "reply", "declare_queryable", "liveliness_token"]
     every = [*asking, *answering, "delete"]
@@ -159,6 +168,10 @@ def access(machines: Iterable[str], namespace: str) -> dict[str, Any]:
         {"id": "here", "link_protocols": ["unixsock-stream"]},
     ]
     policies = [{"rules": tools, "subjects": ["tools"]}, {"rules": ["all"], "subjects": ["here"]}]
+    if own is not None:
+        rules.append({"id": "orders", **comes, "messages": ["query"], "key_exprs": [here]})
+        subjects.append({"id": "own", "cert_common_names": [own]})
+        policies.append({"rules": [*tools, "orders", "is asked"], "subjects": ["own"]})
     for name in machines:
         rules.append({"id": name, **both, "key_exprs": [f"{KEYS}/machine/{name}/**"]})
         subjects.append({"id": name, "cert_common_names": [name]})

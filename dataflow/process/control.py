@@ -55,6 +55,8 @@ class Control:
             case "go":
                 self.probing, self.released = False, True
                 self._release(fields["first"], fields["at"])
+            case "clock":
+                self._live.clock_measured(fields["offset"])
             case "absent":
                 self._mark(fields["streams"], absent=fields["absent"])
             case "ended_elsewhere":

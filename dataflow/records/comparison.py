@@ -35,7 +35,8 @@ class Verification:
     messages without a record. `not_stored` messages were made again, but are not in the recording.
     `tainted` is the index of the first firing that was given anything other than recorded; `own_fault`: the
     first difference came before that; `states` of the differences are in snapshots, not in messages.
-    `code_changed`: its modules whose code is no longer, in any incarnation, what it was.
+    `code_changed`: its modules whose code is no longer, in any incarnation, what it was. `packages_changed`: packages
+    of its environment (`env:`) of which it ran other versions, such as "numpy 1.26.4 -> 2.4.6".
     `wrote` names the first message that the operator has written into, which others may be given too.
     `effects`: by name of a call how often its recorded answer was `given`, `missed`, and, where calls were made live,
     `again` and of these with the `same` answer.
@@ -65,6 +66,7 @@ class Verification:
     wrote: str = ""
     files_changed: list[str] = field(default_factory=list)
     code_changed: list[str] = field(default_factory=list)
+    packages_changed: list[str] = field(default_factory=list)
     effects: dict[str, dict[str, int]] = field(default_factory=dict)
 
     @property

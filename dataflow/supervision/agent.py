@@ -35,10 +35,11 @@ from dataflow.machines.pipe import AWAY_AFTER, Pipe
 from dataflow.process.awake import AwakeClock
 from dataflow.process.descriptors import take_descriptors
 from dataflow.process.streams.inbox import Inbox
+from dataflow.recording.streams.facts import machine_facts
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.children import Children
 from dataflow.supervision.core import events
-from dataflow.supervision.nursery import Nursery, adopting
+from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
 from dataflow.supervision.plan import ProcessPlan
 from dataflow.supervision.rings import Rings
 from dataflow.transport import Bus, Fanout, reserve_endpoints
@@ -48,6 +49,8 @@ HELLO_EVERY = 0.25
 LEAVE_WITHIN = 2.0
 END_WITHIN = 20.0
 """Seconds that a run gets to end when the agent is stopped."""
+CLOCK_EVERY = 1.0
+"""Seconds between two words to sources about the offset of the clock."""
 TICK = 0.05
 SUPERVISOR = ""
 """Its machine, as gates call it."""
@@ -151,6 +154,8 @@ class Stay:
         self._children: Children | None = None
         self._endpoints: dict[str, str] = {}
         self._wanted: Mapping[str, Any] = {}
+        self._corrected: list[str] = []
+        self._clock_due = 0.0
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._pipe = Pipe(
             bus, machine_key(agent.name, run, "up"), machine_key(agent.name, run, "down"), self._came, bounded=False
@@ -209,6 +214,7 @@ class Stay:
             except (OSError, ValueError, RuntimeError) as error:
                 self._say("", "failed", why=f"{type(error).__name__}: {error}")
         if self._children is not None:
+            self._tell_clock()
             self._children.tick()
             self._children.flush()
 
@@ -288,6 +294,8 @@ class Stay:
             raise files.FilesError(f"files did not arrive: {', '.join(lacks)}")
         graph = Graph.from_json(wanted["graph"])
         processes = {fields["label"]: ProcessPlan(**fields) for fields in wanted["processes"]}
+        corrected = {name for name, node in graph.nodes.items() if node.live.corrected}
+        self._corrected = [label for label, process in processes.items() if corrected & {*process.nodes}]
         gate = wanted["gate"]["label"]
         self._pipe.bounded = wanted["live"]
         rings = Rings([*processes, gate], {(maker, taker): tuple(keys) for maker, taker, keys in wanted["pairs"]})
@@ -300,11 +308,13 @@ class Stay:
         self._gate = self._gate_of(inbox, fanout, Routes.from_json(wanted["routes"]))
         reserved = stack.enter_context(contextlib.closing(reserve_endpoints(len(processes))))
         self._endpoints = dict(zip(processes, reserved.endpoints, strict=True))
-        nursery = Nursery(environment(graph.threads))
+        common = environment(graph.threads)
+        apart = nurseries_of({label: process.env for label, process in processes.items()}, common)
+        nursery = Nursery(common)
         boxes = Boxes(graph, processes, live=wanted["live"])
-        self._children = Children(nursery, self._selector, rings, boxes, self._clock, self._feed, self._printed)
+        self._children = Children(nursery, apart, self._selector, rings, boxes, self._clock, self._feed, self._printed)
         stack.callback(self._children.bury)
-        self._say("", "ready")
+        self._say("", "ready", facts=machine_facts(common))
 
     # Processes
 
@@ -316,7 +326,17 @@ class Stay:
             fields["graph"]["network"] |= {"listen": [], "connect": [self._router], "tls": {}, "access_control": {}}
         elif kind == "go" and (best := self._pipe.clocks.best) is not None:
             fields["at"] -= best[1] * 1e-9
+            self._clock_due = 0.0
+            self._tell_clock()
         self._children.send(label, kind, fields, replaces=replaces)
+
+    def _tell_clock(self) -> None:
+        """Tells processes of sources whose stamps are corrected, now and then, by how much the clock here is ahead."""
+        now, best = time.monotonic(), self._pipe.clocks.best
+        if self._children is not None and best is not None and now >= self._clock_due:
+            self._clock_due = now + CLOCK_EVERY
+            for label in self._corrected:
+                self._children.send(label, "clock", {"offset": -best[1]}, replaces=True)
 
     def _printed(self, label: str, line: str) -> None:
         self._say(label, "printed", line=line)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import selectors
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from dataflow.process.channel import ChannelClosed
@@ -22,11 +22,15 @@ NOT_READING_AFTER = 1.0
 
 
 class Children:
-    """The processes here by label. `feed` takes events, `printed` the lines that a process prints."""
+    """The processes here by label. `feed` takes events, `printed` the lines that a process prints.
+
+    `apart`: by label the nurseries of processes that another one than `nursery` starts.
+    """
 
     def __init__(
         self,
         nursery: Nursery,
+        apart: Mapping[str, Nursery],
         selector: selectors.BaseSelector,
         rings: Rings,
         boxes: Boxes,
@@ -34,11 +38,13 @@ class Children:
         feed: Callable[[events.Event], None],
         printed: Callable[[str, str], None],
     ) -> None:
-        self._nursery, self._selector, self._rings, self._boxes = nursery, selector, rings, boxes
+        self._nursery, self._apart, self._selector, self._rings, self._boxes = nursery, apart, selector, rings, boxes
         self._clock, self._feed, self._printed = clock, feed, printed
         self._children: dict[str, Child] = {}
         self._taken_at: dict[str, float] = {}  # label → when the process last took what was queued for it
-        selector.register(nursery, selectors.EVENT_READ, self._nursery)
+        self._nurseries = tuple(dict.fromkeys((nursery, *apart.values())))
+        for each in self._nurseries:
+            selector.register(each, selectors.EVENT_READ, each)
 
     def pid_of(self, label: str) -> int:
         """Returns the process number of a process that is there."""
@@ -50,8 +56,8 @@ class Children:
 
     def look(self, key: selectors.SelectorKey, mask: int) -> None:
         """Feeds what is to be read from the nursery, or from one process."""
-        if key.data is self._nursery:
-            self._hear_nursery()
+        if key.data in self._nurseries:
+            self._hear(key.data)
             return
         label, what = key.data
         if what == "words":
@@ -59,12 +65,15 @@ class Children:
         elif mask & selectors.EVENT_READ:
             self._read_channel(label)
 
-    def _hear_nursery(self) -> None:
+    def _hear(self, nursery: Nursery) -> None:
         try:
-            news = self._nursery.receive()
+            news = nursery.receive()
         except NurseryFailed as failure:
-            self._selector.unregister(self._nursery)
+            self._selector.unregister(nursery)
             self._feed(events.Aborted(str(failure)))
+            for label in [each for each in self._children if self._nursery_of(each) is nursery]:
+                if self._children[label].pid is None:  # it will not be born
+                    self._ended(label, None)
             return
         for each in news:
             if isinstance(each, End):
@@ -122,18 +131,17 @@ class Children:
 
     def tick(self) -> None:
         """Feeds what nothing but time shows: processes that read nothing, and ends that no nursery reports."""
-        now, deserted = self._clock(), not self._nursery_lives
+        now, living = self._clock(), {key.fileobj for key in self._selector.get_map().values()}
         for label, child in list(self._children.items()):
             stuck = now - self._taken_at.get(label, now)
             if stuck > NOT_READING_AFTER or child.channel.overflowed:
                 waiting, overflowed = child.channel.waiting, child.channel.overflowed
                 self._feed(events.NotReading(label, stuck, waiting, overflowed))
-            if deserted and child.dead:
+            if self._nursery_of(label) not in living and child.dead:
                 self._ended(label, child.bury())
 
-    @property
-    def _nursery_lives(self) -> bool:
-        return self._nursery in {key.fileobj for key in self._selector.get_map().values()}
+    def _nursery_of(self, label: str) -> Nursery:
+        return self._apart.get(label, self._nursery)
 
     # Commands
 
@@ -141,7 +149,7 @@ class Children:
         """Starts a process, which waits for its configuration."""
         try:
             box = self._boxes.make(label)
-            child = self._nursery.spawn((*self._rings.handed(label), *box))
+            child = self._nursery_of(label).spawn((*self._rings.handed(label), *box))
         except (NurseryFailed, OSError) as failure:
             self._feed(events.Aborted(str(failure)))
             return
@@ -193,10 +201,11 @@ class Children:
     def bury(self) -> None:
         """Leaves no process behind, however the run has ended."""
         for child in self._children.values():
-            child.signal(signal.SIGKILL)
-        self._nursery.close()
-        for child in self._children.values():
             self._unregister(child)
+            child.signal(signal.SIGKILL)
+        for nursery in self._nurseries:
+            nursery.close()
+        for child in self._children.values():
             child.close()
         self._children.clear()
         self._boxes.close()

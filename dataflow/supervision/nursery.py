@@ -17,12 +17,15 @@ from typing import Any
 
 import msgpack
 
+from dataflow.environments import Environment, environment_of
 from dataflow.process.channel import QueuedChannel
 from dataflow.process.polling import readable
 from dataflow.supervision.core.wording import how_it_ended
 from dataflow.supervision.nursery_process import DIE_WITHIN, ENVIRONMENT, MORE, MOST_DESCRIPTORS, SPAWN, adopt_orphans
 
 LEAVE_WITHIN = 15.0
+LIBRARIES = ("cv2", "scipy.fft", "scipy.ndimage", "scipy.optimize", "scipy.sparse.csgraph", "scipy.spatial")
+"""Those that operators need most, and that start no threads when they load."""
 WORDS_AT_ONCE = 65536
 _PR_GET_CHILD_SUBREAPER = 37
 
@@ -160,17 +163,31 @@ class Leftovers:
     processes: tuple[str, ...]
 
 
+def nurseries_of(envs: Mapping[str, str | None], common: Mapping[str, str]) -> dict[str, Nursery]:
+    """Starts a nursery for each environment of processes; returns those of processes that are in one, by label.
+
+    `envs`: by label of a process what `env:` names; `common`: the variables of processes that are in none. Raises
+    `EnvError`.
+    """
+    found = {env: environment_of(env) for env in envs.values() if env is not None}
+    started = {env: Nursery(common, of) for env, of in found.items()}
+    return {label: started[env] for label, env in envs.items() if env is not None}
+
+
 class Nursery:
     """Starts processes. The first one takes half a second, while the nursery imports the runtime."""
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
-        self.environment = environment
+    def __init__(self, environment: Mapping[str, str], env: Environment | None = None) -> None:
+        """`environment`: the variables of its processes; `env`: the environment that they are in, if any."""
+        self.environment = environment if env is None else env.variables(environment)
+        self._called = "the process that starts the others" + ("" if env is None else f" in {env.folder}")
+        python = sys.executable if env is None else env.python
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "dataflow.supervision.nursery_process", str(theirs.fileno())],
+                [python, "-P", "-m", "dataflow.supervision.nursery_process", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),),
-                env=environment,
+                env=self.environment,
                 stdin=subprocess.DEVNULL,
                 process_group=0,
             )
@@ -185,16 +202,16 @@ class Nursery:
         return self._socket.fileno()
 
     def give(self, environment: Mapping[str, str]) -> None:
-        """Gives the processes to come another environment. What libraries read when they load has been read already.
+        """Gives the processes to come another environment, and the libraries that are loaded here already, whose
+        loading takes a third of a second. What those of the runtime read when they load has been read before.
 
         Raises `NurseryFailed`.
         """
         self.environment = environment
+        given = {os.fsencode(name): os.fsencode(value) for name, value in environment.items()}
         try:
             with os.fdopen(os.memfd_create("environment"), "wb") as file:
-                file.write(
-                    msgpack.packb({os.fsencode(name): os.fsencode(value) for name, value in environment.items()})
-                )
+                file.write(msgpack.packb([given, [name for name in LIBRARIES if name in sys.modules]]))
                 file.flush()
                 socket.send_fds(self._socket, [ENVIRONMENT], [file.fileno()])
         except OSError as error:
@@ -231,12 +248,12 @@ class Nursery:
         except BlockingIOError:
             return []
         except OSError as error:
-            raise NurseryFailed(f"the process that starts the others is gone: {error}") from error
+            raise NurseryFailed(f"{self._called} is gone: {error}") from error
         self._pidfds.extend(pidfds)
         if not data:
             with contextlib.suppress(subprocess.TimeoutExpired):  # its end of the socket closes before it is dead
                 self._process.wait(timeout=DIE_WITHIN)
-            raise NurseryFailed(f"the process that starts the others {how_it_ended(self._process.poll())}")
+            raise NurseryFailed(f"{self._called} {how_it_ended(self._process.poll())}")
         self._unpacker.feed(data)
         news = (self._taken(*message) for message in self._unpacker)
         return [each for each in news if each is not None]

@@ -121,6 +121,8 @@ class ProcessPlan:
     options: Mapping[str, Any] = field(default_factory=dict)
     machine: str | None = None
     """The machine that it runs on; None: that of the supervisor."""
+    env: str | None = None
+    """The environment of its operators; None: this installation."""
 
 
 def replaced_in(graph: Graph, log: LogPlan | None) -> set[str]:
@@ -186,14 +188,13 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
         if plan.keeps_records:
             publish |= {firings_key(graph.namespace, node): 1 for node in nodes if node in firings}
         subscribe = tuple(s for s in sorted(streams) if label in taken_in[s] and made_in[s] != label)
-        plans[label] = ProcessPlan(
-            label,
-            tuple(node for node in nodes if node not in replaced),
-            publish,
-            subscribe,
-            has_log=bool(replaced & set(nodes)),
-            machine=_machine_of(plan, label, nodes),
+        running = tuple(node for node in nodes if node not in replaced)
+        machine, env, has_log = (
+            _machine_of(plan, label, nodes),
+            _env_of(graph, label, running),
+            bool(replaced & {*nodes}),
         )
+        plans[label] = ProcessPlan(label, running, publish, subscribe, has_log=has_log, machine=machine, env=env)
     for label, (kind, taken, chosen) in sinks.items():
         process = ProcessPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
         plans[label] = replace(process, firings=firings) if kind == "record" else process
@@ -209,6 +210,15 @@ def _machine_of(plan: RunPlan, label: str, nodes: list[str]) -> str | None:
         named = ", ".join(sorted(machine or "this one" for machine in found))
         raise ValueError(f"process {label!r} would be on several machines ({named}): place its operators apart")
     return found.pop()
+
+
+def _env_of(graph: Graph, label: str, nodes: tuple[str, ...]) -> str | None:
+    """Returns the environment of a process. Raises ValueError where the placement puts operators of two into it."""
+    found = {graph.nodes[node].env for node in nodes}
+    if len(found) > 1:
+        named = ", ".join(sorted(env or "this one" for env in found))
+        raise ValueError(f"process {label!r} would be in several environments ({named}): place its operators apart")
+    return found.pop() if found else None
 
 
 def taken_keys(graph: Graph, process: ProcessPlan) -> set[str]:

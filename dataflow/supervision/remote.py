@@ -17,6 +17,7 @@ from dataflow.graph.sections import Network
 from dataflow.machines import files
 from dataflow.machines.gate import Routes
 from dataflow.names import firings_key
+from dataflow.recording.streams.facts import FACTS, record_elsewhere
 from dataflow.records.black_box import Reached, Remains
 from dataflow.supervision.children import Children
 from dataflow.supervision.core import events
@@ -61,6 +62,8 @@ class Remote:
         self._pieces: dict[str, Iterator[dict[str, Any]]] = {}
         self.taken = 0
         """Pieces of files that machines took."""
+        self.facts: dict[str, dict[str, str]] = {}
+        """Metadata of a recording: the facts of each machine (`machine_facts`), as its agent reports them."""
         self._noted: set[str] = set()
         self._ending = False
         self.ended = False
@@ -278,6 +281,9 @@ class Remote:
                 self.taken += 1
                 self._send_piece(machine)
             case "ready":
+                for group in FACTS & fields["facts"].keys():
+                    values = {str(name): str(value) for name, value in fields["facts"][group].items()}
+                    self.facts[record_elsewhere(group, machine)] = values
                 del self._missing[machine]
             case "failed":
                 raise RunFailed(f"machine {machine!r}: {fields['why']}")

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from dataflow.environments import EnvError
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.threads import environment
 from dataflow.process.awake import LONGEST_STEP, AwakeClock
@@ -27,8 +28,8 @@ from dataflow.supervision.core import commands, events
 from dataflow.supervision.core.compose import core_of
 from dataflow.supervision.core.report import RunFailed, RunReport, Status
 from dataflow.supervision.early_nursery import EarlyNursery
-from dataflow.supervision.nursery import Nursery, adopting
-from dataflow.supervision.plan import LINK, RunPlan, process_plans
+from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
+from dataflow.supervision.plan import LINK, RECORDER, RunPlan, process_plans
 from dataflow.supervision.rings import Pairs, Rings, pairs_of
 from dataflow.transport import registry, reserve_endpoints
 from dataflow.transport.log_file import LogFile
@@ -111,8 +112,16 @@ class Supervisor:
             stack.callback(self._words.close)
             self._selector = stack.enter_context(selectors.DefaultSelector())
             self._clock = AwakeClock()
+            apart = self._nurseries_apart(here)
             self._here = Children(
-                self._start_nursery(), self._selector, rings, self._boxes, self._clock, self._feed_here, self._heard
+                self._start_nursery(),
+                apart,
+                self._selector,
+                rings,
+                self._boxes,
+                self._clock,
+                self._feed_here,
+                self._heard,
             )
             stack.callback(self._here.bury)
             self._selector.register(self._woken, selectors.EVENT_READ, None)
@@ -138,6 +147,13 @@ class Supervisor:
         try:
             return Nursery(environment(threads))
         except OSError as error:
+            raise RunFailed(f"cannot start a process: {error}") from error
+
+    def _nurseries_apart(self, here: list[str]) -> dict[str, Nursery]:
+        envs = {label: self._processes[label].env for label in here if label != LINK}
+        try:
+            return nurseries_of(envs, environment(self.plan.graph.threads))
+        except (OSError, EnvError) as error:
             raise RunFailed(f"cannot start a process: {error}") from error
 
     def _meet(self, pairs: Pairs) -> None:
@@ -170,6 +186,8 @@ class Supervisor:
                 raise RunFailed("stopped while other machines were awaited", interrupted=True)
             if self._clock() > deadline:
                 raise self._remote.not_ready(self.plan.start_timeout)
+        if RECORDER in self.core.run.configs:
+            self.core.run.configs[RECORDER][1]["options"]["metadata"].update(self._remote.facts)
 
     def _part(self) -> None:
         """Lets the other machines go (bounded)."""

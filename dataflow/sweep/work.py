@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,34 +154,25 @@ def replayed(report: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
     digests: dict[str, list[str]] = {}
     for stream, facts in sorted(report["streams"].items()):
         digests.setdefault(stream.rpartition("/")[0], []).append(f"{stream}={facts['digest']}")
-    namespace = _namespace(digests, report["operators"])
     rows = []
     for name, counts in report["operators"].items():
-        own = digests.get(f"{namespace}{name}", [])
+        own = digests.get(f"{report['namespace']}/{name}", [])
         rows.append(
             {
                 "operator": name,
                 **{key: counts[key] for key in ("firings", "emitted", "dropped", "cpu_ms", "wall_ms")},
                 "restarts": report["restarts"].get(name, 0),
                 "digest": xxhash.xxh3_128_hexdigest("\n".join(own).encode()) if own else None,
-                "figures": _numbers(report["summaries"].get(name, {})),
+                "figures": numbers(report["summaries"].get(name, {})),
             }
         )
     more = {name for name in report["summaries"] if name not in report["operators"]}
-    rows += [{"operator": name, "figures": _numbers(report["summaries"][name])} for name in sorted(more)]
+    rows += [{"operator": name, "figures": numbers(report["summaries"][name])} for name in sorted(more)]
     return tuple(rows)
 
 
-def _namespace(nodes: Collection[str], operators: Collection[str]) -> str:
-    """Returns what stands before the operators' names in the names of streams: that which fits the most."""
-    found = {node.removesuffix(name) for node in nodes for name in operators if node.endswith(name)}
-    fitting = {
-        given: sum(node.startswith(given) and node[len(given) :] in operators for node in nodes) for given in found
-    }
-    return max(sorted(fitting), key=lambda given: fitting[given], default="")
-
-
-def _numbers(summary: Mapping[str, Any]) -> dict[str, float]:
+def numbers(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Returns the figures of a summary that are numbers, also where JSON has words for them."""
     named = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
     values = {name: named.get(v, v) if isinstance(v, str) else v for name, v in summary.items()}
     return {name: float(v) for name, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)}

@@ -71,6 +71,20 @@ def unfed_operators(
     return found
 
 
+def env_of(graph: Graph, operators: Iterable[str]) -> str | None:
+    """Returns the environment of operators that one process repeats. Raises `ReplayError` where they have several."""
+    found = {name: graph.nodes[name].env for name in operators}
+    if len({*found.values()}) < 2:
+        return next(iter(found.values()), None)
+    for edge in graph.edges():
+        if found.keys() >= {edge.consumer, edge.producer} and found[edge.consumer] != found[edge.producer]:
+            raise ReplayError(
+                f"{edge.producer!r} and {edge.consumer!r} run in two environments, so no process can repeat both, and "
+                f"the recording does not hold (all of) {edge.stream!r}: record it"
+            )
+    raise ReplayError(f"operators run in several environments, so no process can repeat all: {', '.join(found)}")
+
+
 def require_records(recording: Recording, recorded: Collection[str], operators: Iterable[str]) -> None:
     """Raises `ReplayError` for the first operator that is not among those that left firing records."""
     outcome = recording.metadata.get(OUTCOME, {}).get("outcome", "")

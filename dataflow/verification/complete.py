@@ -17,7 +17,7 @@ from typing import Any
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA
+from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA, logs_topic
 from dataflow.recording.streams.copying import Origin
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import decode_batch
@@ -29,7 +29,7 @@ from dataflow.supervision.core.report import Watch
 from dataflow.supervision.replay import plan_replay
 from dataflow.sync import Entry
 from dataflow.verification.books import Books, Places
-from dataflow.verification.choice import require_records
+from dataflow.verification.choice import env_of, require_records
 from dataflow.verification.ledger import read_ledger
 from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.processes import Call, call_workers
@@ -91,7 +91,8 @@ def complete(
         feeding = _plan(recording, played)  # refuses here what would fail there
     part = out.with_name(f"{out.name}.part")
     request = {"path": str(path), "part": str(part), "graph": played.to_json()}
-    call = Call(f"{__name__}:{complete_part.__name__}", request, feeding.operators)
+    env = env_of(played, feeding.operators)
+    call = Call(f"{__name__}:{complete_part.__name__}", request, feeding.operators, env=env)
     try:
         [found] = call_workers([call], threads=played.threads, watch=watch)
         made = Completion(
@@ -183,7 +184,9 @@ class _Store:
                 self.sink.writer.add_attachment(origin.file.attachment(place))
         self._copied = 0
         self._taken = {stream: Places() for stream in self.streams}
-        for stream in sorted(recording.streams.keys() - graph.streams.keys()):
+        for said, line in recording.logs():
+            self.sink.writer.write_log(said, line)
+        for stream in sorted(recording.streams.keys() - {*graph.streams, logs_topic(graph.namespace)}):
             self._copy(recording, stream)
 
     def _copy(self, recording: Recording, stream: str) -> None:

@@ -28,6 +28,7 @@ from dataflow.verification.books import Books
 from dataflow.verification.choice import (
     accountable,
     chosen_operators,
+    env_of,
     require_ports,
     require_records,
     stored_checks,
@@ -117,11 +118,12 @@ def verify(
         raise ReplayError(f"{jobs} jobs: expected 1 or more")
     workers = workers or call_workers
     task = _prepare(path, graph, first, only, start, jobs, early)
-    options: dict[str, Any] = {"threads": task.graph.threads, "stall_timeout": stall_timeout, "watch": watch}
+    played = task.graph
+    options: dict[str, Any] = {"threads": played.threads, "stall_timeout": stall_timeout, "watch": watch}
     options |= {"early": early, "locate": _locate(task)}
     request = {
         "path": str(path),
-        "graph": task.graph.to_json(),
+        "graph": played.to_json(),
         "records": task.records,
         "begin": task.begin,
         "incomplete": sorted(task.incomplete),
@@ -135,14 +137,13 @@ def verify(
 
     def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
         function = f"{part.__name__}:{part.verify_part.__name__}"
-        made = [Call(function, {**request, **more, "operators": list(names)}, names) for more, names in calls]
-        return workers(made, **options)
+        asked = [({**request, **more, "operators": list(names)}, names, env_of(played, names)) for more, names in calls]
+        return workers([Call(function, about, names, env=env) for about, names, env in asked], **options)
 
     answers = attempt((one.request(), one.operators) for one in task.parts)
     divided, left = slices.answer(task.books, answers)
-    if left:
-        needed = tuple(n for n in task.operators if n in with_makers(task.held, task.graph, left))
-        answers += attempt([({}, needed)])
+    for env in {played.nodes[name].env for name in left}:
+        answers += attempt([({}, _in(env, played, [n for n in task.operators if n in left], task.held))])
     answers.append(divided)
     report = _report(task, answers, tolerance, start)
     if report.culprits:
@@ -187,9 +188,7 @@ def _prepare(
         sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
         stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, books, n)]
         checks, unchecked = stored_checks(recording, played, books, [*operators, *stand_ins])
-        cores = len(os.sched_getaffinity(0))
-        halves = start is None
-        parts = partition.planned(played, log, books, operators, held=held, jobs=jobs, cores=cores, divide=halves)
+        parts = _parts(played, log, books, operators, held=held, jobs=jobs, divide=start is None)
         begin, last = _span(recording, start)
         return _Task(
             path=path,
@@ -209,9 +208,26 @@ def _prepare(
             span=(last - begin) * 1e-9,
             unfed=unfed,
             torn=recording.torn or RECOVERED in recording.metadata,
-            placed=processes_of(recording),
+            placed={
+                n: f"{at} {played.nodes[n].env or ''}" for n, at in processes_of(recording).items() if n in played.nodes
+            },
             absent=absent,
         )
+
+
+def _parts(
+    graph: Graph, log: FiringLog, books: Books, operators: Sequence[str], *, held: Collection[str], **options: Any
+) -> list[partition.Job]:
+    """Returns the parts of the operators of each environment by itself."""
+    plan = partial(partition.planned, graph, log, books, held=held, cores=len(os.sched_getaffinity(0)), **options)
+    envs = dict.fromkeys(graph.nodes[name].env for name in operators)
+    return [part for env in envs for part in plan(_in(env, graph, operators, held))]
+
+
+def _in(env: str | None, graph: Graph, operators: Iterable[str], held: Collection[str]) -> tuple[str, ...]:
+    """Returns the operators of an environment, and those that make what these take and is not `held`."""
+    chosen = with_makers(held, graph, {name for name in operators if graph.nodes[name].env == env})
+    return tuple(name for name in operators if name in chosen)
 
 
 def _read_records(recording: Recording, graph: Graph, start: float | None) -> FiringLog:
@@ -356,6 +372,8 @@ def _span(recording: Recording, start: float | None) -> tuple[int, int]:
         first = first if part.start is None else part.start
         last = last if part.end is None else min(last, part.end)
     begin = first + round((start or 0.0) * 1e9)
+    if start is None and last < first:
+        raise ReplayError(f"{recording.path}: it has no message from the stamp {first} on: there is nothing to verify")
     if not first <= begin <= last:
         raise ReplayError(f"--start {start:g}: the recording is {(last - first) * 1e-9:.3g} s long")
     return begin, last

@@ -3,33 +3,20 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from diamond_records import DIAMOND, MS, message, one_round, record
 from typer.testing import CliRunner
 
 from dataflow.analysis.latency import batch_latencies, latencies
 from dataflow.cli.main import app
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph
-from dataflow.records.firing import WITHHELD, Emission, FiringRecord, encode_batch
-from dataflow.sync import InputRef, MessageRef, RunRef
+from dataflow.records.firing import WITHHELD, encode_batch
+from dataflow.sync import RunRef
 
-sys.path.append(str(Path(__file__).resolve().parent))
-
-MS = 1_000_000
-DIAMOND = """
-graph: diamond
-operators:
-  camera: {use: latency_operators:Device}
-  lidar: {use: latency_operators:Device}
-  fast: {use: latency_operators:Relay, inputs: {x: camera/value}}
-  slow: {use: latency_operators:Relay, inputs: {x: camera/value}}
-  join: {use: latency_operators:Join, inputs: {a: fast/y, b: slow/y, hint: lidar/value}}
-"""
 TIMER = """
 graph: timer
 operators:
@@ -38,58 +25,9 @@ operators:
 """
 
 
-def record(
-    operator: str,
-    index: int,
-    begin: float,
-    work: float,
-    inputs: Mapping[str, InputRef] | None = None,
-    seq: int = -2,
-    stamp: int | None = None,
-) -> FiringRecord:
-    """A call that began at `begin` ms and took `work` ms, and emitted its `index`-th message, or that of `seq`. Its
-    stamp is its index where none is given."""
-    stamp = index if stamp is None else stamp
-    output = Emission(index if seq == -2 else seq, stamp, bytes(16))
-    return FiringRecord(
-        operator,
-        0,
-        index,
-        "fire",
-        stamp,
-        inputs=inputs or {},
-        outputs=(output,),
-        wall_start=round(begin * MS),
-        duration=round(work * MS),
-    )
-
-
-def message(graph: Graph, operator: str, seq: int) -> MessageRef:
-    return MessageRef(next(iter(graph.nodes[operator].outputs.values())), 0, seq)
-
-
 @pytest.fixture
 def diamond() -> Graph:
     return load_text(DIAMOND)
-
-
-def one_round(graph: Graph, index: int, begin: float, slow: float) -> dict[str, list[FiringRecord]]:
-    """The camera gives at `begin`; `fast` works 1 ms, `slow` as long as said, the join 2 ms after a wait of 3."""
-    camera, end = message(graph, "camera", index), begin + 1 + slow
-    return {
-        "camera": [record("camera", index, begin, 0.5)],
-        "fast": [record("fast", index, begin + 1, 1, {"x": camera})],
-        "slow": [record("slow", index, begin + 1, slow, {"x": camera})],
-        "join": [
-            record(
-                "join",
-                index,
-                end + 3,
-                2,
-                {"a": message(graph, "fast", index), "b": message(graph, "slow", index), "hint": None},
-            )
-        ],
-    }
 
 
 def test_a_latency_ends_with_the_sink_and_is_shared_along_the_critical_path(diamond: Graph) -> None:

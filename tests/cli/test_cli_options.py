@@ -40,6 +40,7 @@ TRIED: tuple[str, ...] = (
     "capture RECORDING --op sum --firing 3 --predicate stamp --graph GRAPH --set count=30 --path HERE --to OUT.py"
     " --overwrite --json",
     "blame RECORDING --field mean@0 --budget 60 --tolerance 0.1 --graph GRAPH --set count=30 --path HERE --json",
+    "env GRAPH --anew --path HERE",
     "check GRAPH --path HERE --set count=4 --json",
     "show GRAPH --path HERE --set count=4 --json",
     "show GRAPH --mermaid",
@@ -55,7 +56,7 @@ TRIED: tuple[str, ...] = (
     "split RECORDING --out OUT --size 1MB",
     "merge RECORDING OTHER --prefix OTHER=other/ --out OUT.mcap --overwrite --compression lz4 --quiet --json",
     "recover RECORDING --out OUT.mcap --overwrite --compression lz4 --quiet --json",
-    "latency RECORDING --path HERE --json",
+    "latency RECORDING --path HERE --spans OUT.jsonl --overwrite --json",
     "lint RECORDING --write-contract OUT.yaml --overwrite --quick --json",
     "lint RECORDING --contract CONTRACT",
     "view RECORDING --to OUT.rrd --overwrite --stream left/* --without fast --start 0 --end 1 --clock auto",
@@ -96,9 +97,7 @@ UNANSWERED: tuple[str, ...] = (
 """Commands for a running graph, where none runs: `test_cli_live.py`, `test_param_top.py` and others have one."""
 
 REMOTE: tuple[str, ...] = tuple(
-    f"{line} --connect tls/127.0.0.1:1 --keys AUTHORITY/tools"
-    for line in UNANSWERED
-    if not line.startswith(("logs", "health", "reload"))
+    f"{line} --connect tls/127.0.0.1:1 --keys AUTHORITY/tools" for line in UNANSWERED if not line.startswith("logs")
 )
 """Commands for a graph of another machine, where nothing listens: `tests/machines/test_links.py` has one."""
 
@@ -110,6 +109,7 @@ REFUSED: tuple[tuple[str, str], ...] = (
     ("run GRAPH --live --listen tls/127.0.0.1:1 --keys HERE", "place one there by `machine: NAME`"),
     ("debug RECORDING smooth --dap TAKEN", "Address already in use"),
     ("metrics --port TAKEN --folder HERE", "cannot listen on port"),
+    ("metrics --port 0 --connect tls/127.0.0.1:1 --keys HERE", "no authority.pem"),
 )
 """Commands that would go on until they are ended, where they cannot begin, and the words that name the reason."""
 

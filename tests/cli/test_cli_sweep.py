@@ -189,12 +189,23 @@ def test_streams_are_those_of_the_operator_that_makes_them() -> None:
         counts = {"firings": 1, "emitted": 1, "dropped": 0, "cpu_ms": 1.0, "wall_ms": 1.0}
         streams = {"ns/detector/boxes": {"digest": "a"}, "ns/front/detector/boxes": {"digest": digest}}
         operators = {"detector": counts, "front/detector": counts}
-        return {"operators": operators, "streams": streams, "restarts": {}, "summaries": {"detector": {"error": "NaN"}}}
+        summaries = {"detector": {"error": "NaN"}}
+        run = {"operators": operators, "streams": streams, "restarts": {}, "summaries": summaries}
+        return run | {"namespace": "ns"}
 
     one, other = replayed(report("b")), replayed(report("c"))
     assert one[0]["digest"] == other[0]["digest"]
     assert one[1]["digest"] != other[1]["digest"]
     assert math.isnan(one[0]["figures"]["error"])
+
+
+def test_streams_are_told_apart_where_a_namespace_ends_as_an_operator_begins() -> None:
+    counts = {"firings": 1, "emitted": 1, "dropped": 0, "cpu_ms": 1.0, "wall_ms": 1.0}
+    run = {"operators": {"x": counts, "ns/x": counts}, "restarts": {}, "summaries": {}}
+
+    rows = replayed({**run, "namespace": "ns/ns", "streams": {"ns/ns/x/o": {"digest": "a"}}})
+
+    assert [row["digest"] is None for row in rows] == [False, True]
 
 
 def test_each_recording_counts_once_whatever_its_name_and_its_parts(folder: Path, tmp_path: Path) -> None:
@@ -310,6 +321,10 @@ def test_two_settings_are_compared_pair_by_pair(dataflow, folder: Path, tmp_path
     assert (figure["figure"], figure["a"], figure["b"]) == ("scaled: total error", 132.0, 198.0)
     assert dict(figure["recordings"]) == {"first.mcap": 66.0, "deep/second.mcap": 66.0}
     assert told["operators"] == [{"operator": "scaled", "recordings": 2, "first": 2}]
+
+    words = ("--set", "b:scaled.by=3", "--explain", "total error")  # the operator that judges is the one that changed
+    refused = dataflow("compare", folder / "graph.yaml", *given, *words, "--rerun", tmp_path / "b.rrd", code=2)
+    assert "scaled: total error: no operator in front of scaled has other outputs" in refused.stderr
 
     words = ("--set", "b:scaled.by=3", "--set", "a:scaled.fail_at=5")
     failed = json.loads(dataflow("compare", folder / "graph.yaml", *given, *words, code=1).stdout)

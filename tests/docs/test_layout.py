@@ -26,7 +26,7 @@ LONG = {
     "dataflow.cli.commands.run:run": 106,
     "dataflow.cli.commands.verification:verify": 132,
     "dataflow.process.operator_process:OperatorProcess.__init__": 80,
-    "dataflow.supervision.plan:process_plans": 67,
+    "dataflow.supervision.plan:process_plans": 66,
     "dataflow.verification.verify:verify": 72,
     "operators.scene.commands:show": 64,
     "operators.scene.map.cuboid:fit_cuboid": 81,

@@ -337,6 +337,19 @@ CASES = {
         "5:59: process 'p' is on two machines: a on left, b on right",
         "give them the same 'machine:', or different 'process:' labels",
     ),
+    "two_environments_for_one_process": (
+        operator(
+            'a: {use: "graph_operators:Camera", process: p, env: one}\n'
+            '  b: {use: "graph_operators:Camera", process: p, env: two}'
+        ),
+        "5:55: process 'p' is in two environments: a in one, b in two",
+        "give them the same 'env:', or different 'process:' labels",
+    ),
+    "corrected_clock_of_this_machine": (
+        operator('a: {use: "graph_operators:Camera", live: {clock: corrected}}'),
+        "4:52: a: 'clock: corrected' is for a source on another machine (machine:)",
+        "",
+    ),
     "record_matches_nothing": (
         HEAD + "record: {topics: [camera/imge]}\n",
         "4:19: record: 'camera/imge' is no stream of this graph",
@@ -410,7 +423,7 @@ CASES = {
     "live_of_a_nested_graph": (
         operator("n: {use: graph.yaml, live: {}}"),
         "4:24: unknown key 'live' in the nested graph 'n'",
-        "known here: use, when, inputs, params, process, machine",
+        "known here: use, when, inputs, params, process, machine, env",
     ),
 }
 

@@ -13,14 +13,14 @@ import zenoh
 from needed_programs import need
 
 from dataflow.machines.hub import machine_key, router
-from dataflow.machines.keys import GRAPH_KEY, TOOLS, access, issue, new_authority, settings, tool_settings
+from dataflow.machines.keys import GRAPH_KEY, TOOLS, access, issue, new_authority, own_name, settings, tool_settings
 from dataflow.transport import Bus, NetworkConfig
 from dataflow.transport.keys import local_key, runtime_key
 from dataflow.transport.publisher import undeclare
 
 SPACE = "test"
 WITHIN = 5.0
-HOLDERS = ("tools", "robot", "elsewhere")
+HOLDERS = ("tools", "robot", "elsewhere", "laptop")
 
 
 @pytest.fixture(scope="module")
@@ -30,17 +30,17 @@ def buses(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Bus]]:
     folder = tmp_path_factory.mktemp("access")
     new_authority(folder / "authority")
     issue(folder / "authority", folder / "laptop", "laptop", serves=["127.0.0.1"])
-    for name in HOLDERS:
+    for name in HOLDERS[:-1]:
         issue(folder / "authority", folder / name, TOOLS if name == "tools" else name)
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = f"tls/127.0.0.1:{server.getsockname()[1]}"
     inside = f"unixsock-stream/{folder / 'inside'}"
     with ExitStack() as stack:
-        more = settings(folder / "laptop", endpoint) | access(["robot"], SPACE)
+        more = settings(folder / "laptop", endpoint) | access(["robot"], SPACE, own_name(folder / "laptop"))
         found = {"here": stack.enter_context(Bus(NetworkConfig(listen=(inside,))))}
         stack.enter_context(closing(router((endpoint,), (inside,), more)))
         for name in HOLDERS:
-            if name == "tools":
+            if name in ("tools", "laptop"):
                 held = Bus(NetworkConfig(connect=(endpoint,), zenoh=tool_settings(folder / name, endpoint)))
             else:
                 own = f"unixsock-stream/{folder / name}.sock"
@@ -135,3 +135,12 @@ def test_a_machine_that_is_not_in_the_graph_gets_and_gives_nothing(buses: dict[s
     assert not is_answered(elsewhere, here, GRAPH_KEY, waits=False)
     assert not is_answered(elsewhere, here, PARAM, waits=False)
     assert not is_answered(here, elsewhere, PARAM, waits=False)
+
+
+def test_tools_with_the_keys_of_the_machine_that_runs_the_graph_load_code_again(buses: dict[str, Bus]) -> None:
+    here, laptop = buses["here"], buses["laptop"]
+
+    assert is_answered(laptop, here, RELOAD)
+    assert is_answered(laptop, here, PARAM)
+    assert not puts_reach(laptop, here, STREAM, closed=ACK)
+    assert not is_answered(here, laptop, RELOAD, waits=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -213,20 +214,41 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
     found: dict[str, Any] = {}
 
     def tool(*words: str, held: str = "tools") -> subprocess.CompletedProcess[str]:
+        started = started_tool(*words, held=held)
+        said, complaint = started.communicate(timeout=60)
+        return subprocess.CompletedProcess(words, started.returncode, said, complaint)
+
+    def started_tool(*words: str, held: str = "tools") -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "dataflow.cli.main", *words, "--connect", endpoint, "--keys", str(keys / held)]
         env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": str(HERE)}
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, env=env, check=False)
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env)
 
     def follow(supervisor: Supervisor) -> None:
         try:
             while supervisor.status.phase == "starting":
                 time.sleep(0.05)
+            viewer = tmp_path / "view.rrd"
+            found["view"] = started_tool("view", "--to", str(viewer))
+            foxglove = started_tool("foxglove", "--port", "0")
             found["echo"] = tool("echo", "there/y", "-n", "3", "--json")
             found["echo here"] = tool("echo", "here/y", "-n", "3", "--json")
             found["top"] = tool("top", "--json")
+            found["hz"] = tool("hz", "there/y", "--seconds", "1", "--json")
+            found["health"] = tool("health", "--over", "0.3", "--json")
+            found["reload"] = tool("reload", "there", "--json", held="laptop")
+            found["refused"] = tool("reload", "there", "--timeout", "1")
+            for word in ("playback", "trigger"):
+                found[word] = tool(*((word, "pause") if word == "playback" else (word,)))
+            found["pub"] = tool("pub", "given", '{"linear": [1, 0, 0], "angular": [0, 0, 0], "frame": "base"}')
+            assert foxglove.stderr is not None
+            found["foxglove"] = foxglove.stderr.readline()
+            foxglove.send_signal(signal.SIGINT)
+            foxglove.communicate(timeout=60)
             found["set"] = tool("param", "set", "there.gain", "7")
             found["record"] = tool("record", "there/y", "-o", str(tmp_path / "part.mcap"), "--seconds", "0.5")
             found["stranger"] = tool("echo", "there/y", "-n", "1", held="stranger")
+            while not viewer.exists() or not viewer.stat().st_size:
+                time.sleep(0.05)
         finally:
             supervisor.stop()
 
@@ -238,9 +260,13 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
         following.join()
 
     meeting = Meeting(endpoint, keys / "laptop")
-    run(load_text(GRAPH.replace("steps: 400", "steps: 1000000")), machines=meeting, live=True, controls=controls)
+    graph = GRAPH.replace("steps: 400", "steps: 1000000") + '  given: {use: "dataflow.remote:Twist"}\n'
+    run(load_text(graph), machines=meeting, live=True, controls=controls)
 
     end(robot)
+    assert found["view"].communicate(timeout=60) is not None
+    assert found["view"].returncode == 0
+    assert "ws://" in found["foxglove"]
     assert len(found["echo"].stdout.splitlines()) == 3, found["echo"]
     assert len(found["echo here"].stdout.splitlines()) == 3, found["echo here"]
     top = json.loads(found["top"].stdout)
@@ -248,6 +274,13 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
     robot_state = top["machines"]["robot"]
     assert robot_state["up"]
     assert abs(robot_state["offset"]) <= robot_state["delay"] / 2  # it is this machine's clock
+    assert json.loads(found["hz"].stdout), found["hz"]
+    assert "live" in found["playback"].stderr
+    assert "flight recorder" in found["trigger"].stderr
+    assert found["pub"].returncode == 0, found["pub"]
+    assert json.loads(found["health"].stdout)["reasons"] == [], found["health"]
+    assert json.loads(found["reload"].stdout)["operator"] == "there", found["reload"]
+    assert "there is not reloaded" in found["refused"].stderr
     assert found["set"].returncode == 0, found["set"]
     assert found["record"].returncode == 0, found["record"]
     assert found["stranger"].returncode != 0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -15,6 +17,7 @@ import pytest
 from joined_agents import HERE, Robot, end, join
 
 from dataflow.graph import load_text
+from dataflow.recording import Recording
 from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import Meeting
 from dataflow.supervision.run import run
@@ -58,6 +61,45 @@ def test_a_run_over_two_machines_loses_nothing_and_its_recording_verifies_on_one
     verified = verify(tmp_path / "two.mcap", jobs=1)
     assert verified.identical, verified.as_json()
     assert {v.operator for v in verified.operators} == {"here", "there", "beside", "last"}
+    with Recording(tmp_path / "two.mcap") as recording:
+        assert recording.metadata["dataflow:packages of robot"] == recording.metadata["packages"]
+        assert recording.metadata["dataflow:machine of robot"]["python"] == platform.python_version()
+
+
+AHEAD = 3600 * 1_000_000_000
+SET = f"""\
+import time
+of_this_machine, seconds = time.time_ns, time.time
+time.time_ns = lambda: of_this_machine() + {AHEAD}
+time.time = lambda: seconds() + {AHEAD // 1_000_000_000}
+"""
+CLOCKS = """\
+graph: clocks
+operators:
+  plain: {use: "machine_operators:Sensor", params: {steps: 30}, machine: robot}
+  right: {use: "machine_operators:Sensor", params: {steps: 30}, machine: robot, live: {clock: corrected}}
+  here: {use: "machine_operators:Scale", inputs: {x: right/count}, live: {queue: block}}
+  other: {use: "machine_operators:Scale", inputs: {x: plain/count}, live: {queue: block}}
+"""
+
+
+def test_stamps_of_a_machine_whose_clock_is_wrong_are_corrected_where_the_graph_asks(tmp_path: Path) -> None:
+    shutil.copytree(HERE, tmp_path / "code")
+    (tmp_path / "code" / "sitecustomize.py").write_text(SET)
+    endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
+    agent = join("robot", endpoint, tmp_path / "files", code=tmp_path / "code")
+    began = time.time_ns()
+
+    run(load_text(CLOCKS), machines=Meeting(endpoint), live=True, record=tmp_path / "clocks.mcap")
+
+    ended = time.time_ns()
+    end(agent)
+    with Recording(tmp_path / "clocks.mcap") as recording:
+        right, plain = (recording.streams[f"clocks/{name}/count"] for name in ("right", "plain"))
+    assert right.count == plain.count == 30
+    assert began < right.first < right.last < ended
+    assert began + AHEAD < plain.first < plain.last < ended + AHEAD
+    assert verify(tmp_path / "clocks.mcap", jobs=1).identical
 
 
 def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
@@ -122,6 +164,7 @@ def test_a_machine_that_does_not_join_is_named_with_the_command_that_joins_it(tm
         run(load_text(GRAPH.replace("SIZE", "1").replace(", MORE", "")), machines=meeting, start_timeout=0.2)
 
 
+@pytest.mark.long
 def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:
     graph = load_text(GRAPH.replace("SIZE", "1").replace(", MORE", ""))
     with pytest.raises(RunFailed, match=r"machine robot: say where machines join .* or run all of it here"):

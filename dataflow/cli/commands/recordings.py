@@ -92,6 +92,7 @@ def _facts(described: Description) -> Table:
     from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RECOVERED, RUN
     from dataflow.recording.mcap.attachments import tells_of_run
     from dataflow.recording.streams.cutting import cut_of
+    from dataflow.recording.streams.facts import group_of
     from dataflow.sync.stamps import format_stamp
 
     grid = Table.grid(padding=(0, 2))
@@ -110,9 +111,11 @@ def _facts(described: Description) -> Table:
         row("graph", f"{made[GRAPH].get('name', '')}, namespace {made.get(RECORDING, {}).get('namespace', '')}")
     if RUN in made:
         row("made by", _made_by(made[RUN]))
-    if "machine" in made:
-        machine = made["machine"]
-        row("machine", f"{machine.get('cpu', '')}, {machine.get('cores', '?')} cores, {machine.get('os', '')}")
+    for record, machine in sorted(made.items()):
+        group, of = group_of(record)
+        if group == "machine":
+            what = f"{machine.get('cpu', '')}, {machine.get('cores', '?')} cores, {machine.get('os', '')}"
+            row(f"machine {of}".rstrip(), what)
     if OUTCOME in made:
         outcome = made[OUTCOME].get("outcome", "")
         row("outcome", outcome, "" if outcome == "complete" else "yellow")

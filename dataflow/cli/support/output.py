@@ -164,6 +164,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     """(message, details, exit code) of an error that users can do something about; None for a bug."""
     from dataflow.chaos.plan import ChaosError
     from dataflow.client.attach import Lost, NotRunning
+    from dataflow.environments import EnvError
     from dataflow.graph import GraphError, OperatorImportError
     from dataflow.interop.mapping import MappingError
     from dataflow.machines.keys import KeysError
@@ -179,6 +180,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         BusError,
         RecordingError,
         ReplayError,
+        EnvError,
         ParameterError,
         MessageError,
         OperatorImportError,

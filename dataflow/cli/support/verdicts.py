@@ -242,6 +242,8 @@ def _notes(report: VerifyReport) -> Iterator[str]:
             made = f"{plural(stand_in.missing, 'message')} that it made, not in the recording"
             yield f"{stand_in.operator}: {made} (never sent, or lost{first})"
     for v in report.operators:
+        for change in v.packages_changed:
+            yield f"{v.operator}: {change} in its environment"
         yield from _effects(v)
     for stream in report.unchecked:
         yield f"{stream}: not compared with its records: messages of its type are not read as they were written"

@@ -33,8 +33,8 @@ NOT = "not "
 TOP_KEYS = (
     "graph", "namespace", "params", "inputs", "operators", "outputs", "record", "view", "seed", "threads", "network",
 )  # fmt: skip
-OPERATOR_KEYS = ("use", "when", "inputs", "params", "process", "machine", "live", "sync")
-NESTED_KEYS = ("use", "when", "inputs", "params", "process", "machine")
+OPERATOR_KEYS = ("use", "when", "inputs", "params", "process", "machine", "env", "live", "sync")
+NESTED_KEYS = ("use", "when", "inputs", "params", "process", "machine", "env")
 OPTIONAL = "?"
 """Ends the type of an input of a nested graph that need not be given."""
 ReadFile = Callable[[str], str]
@@ -157,7 +157,7 @@ class Expander:
         self.settings = read_settings(self.words, self.problems)
         if tree is None:
             return None
-        scope = Scope(file, shown, "", "", {}, {}, None, None, None, (file,))
+        scope = Scope(file, shown, "", "", {}, {}, None, None, None, None, (file,))
         table = self.top(tree, scope)
         if table is None:
             return None
@@ -166,7 +166,7 @@ class Expander:
             self.problems.add(table.place, "the graph has no name", "begin with 'graph: some_name'")
         namespace = self.fields.namespace(table.get("namespace")) or name or "graph"
         self.out = Expansion(table, name or "graph", namespace)
-        scope = Scope(file, shown, "", namespace, {}, {}, None, None, None, (file,))
+        scope = Scope(file, shown, "", namespace, {}, {}, None, None, None, None, (file,))
         self.body(table, scope)
         self.unused_settings()
         return self.out
@@ -346,6 +346,7 @@ class Expander:
                 inputs_place=given.key.place if given else entry.key.place,
                 process=self.fields.label(table.get("process"), "process") or scope.process,
                 machine=self.fields.label(table.get("machine"), "machine") or scope.machine,
+                env=self.fields.path(table.get("env"), "env") or scope.env,
                 live=table.get("live"),
                 sync=table.get("sync"),
             )
@@ -388,6 +389,7 @@ class Expander:
             use=place,
             process=self.fields.label(table.get("process"), "process") or scope.process,
             machine=self.fields.label(table.get("machine"), "machine") or scope.machine,
+            env=self.fields.path(table.get("env"), "env") or scope.env,
             stack=(*scope.stack, file),
         )
         body = self.top(tree, inner) if tree is not None else None

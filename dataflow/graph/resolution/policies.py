@@ -9,7 +9,7 @@ from dataflow.graph.model import Live, QueuePolicy, Restart, StalePolicy
 from dataflow.graph.problems import did_you_mean
 from dataflow.graph.yaml.fields import Fields
 from dataflow.graph.yaml.tree import Leaf, Table, Tree
-from dataflow.operator import InputPort, OperatorSpec
+from dataflow.operator import InputPort, OperatorSpec, is_source
 
 QUEUE_SIZE = 16
 """Undecided messages on each trigger stream, by default."""
@@ -53,7 +53,7 @@ def sync_every(draft: Draft, fields: Fields) -> int | None:
 
 def live_policy(draft: Draft, devices: bool, fields: Fields) -> Live:
     """The operator's `live:`. `devices`: something upstream is a source that cannot wait."""
-    keys = ("queue", "size", "wait", "deadline", "restart", "memory", "on_stale")
+    keys = ("queue", "size", "wait", "deadline", "restart", "memory", "on_stale", "clock")
     table = fields.table(draft.live, "live", keys)
     get = table.get if table else lambda _: None
     spec = draft.cls.spec
@@ -71,7 +71,17 @@ def live_policy(draft: Draft, devices: bool, fields: Fields) -> Live:
         restart=Restart(attempts or 0, Restart().backoff if backoff is None else backoff),
         memory=fields.size(get("memory"), "memory"),
         on_stale=fields.choice(get("on_stale"), "on_stale", _STALE) or "use",
+        corrected=_corrected(get("clock"), draft, fields),
     )
+
+
+def _corrected(tree: Tree | None, draft: Draft, fields: Fields) -> bool:
+    """Returns whether stamps are corrected by the measured offset of the machine's clock."""
+    chosen = fields.choice(tree, "clock", {"own": "own", "corrected": "corrected"})
+    if tree is not None and chosen == "corrected" and not (draft.machine and is_source(draft.cls)):
+        why = f"{draft.name}: 'clock: corrected' is for a source on another machine (machine:)"
+        fields.problems.add(tree.place, why)
+    return chosen == "corrected"
 
 
 def _waits(tree: Tree | None, draft: Draft, devices: bool, fields: Fields) -> dict[str, int | None]:

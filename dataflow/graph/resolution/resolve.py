@@ -41,7 +41,7 @@ class Resolver:
         self.check_graph_inputs()
         wired = [self.wire(draft) for draft in drafts]
         refuse_stuck_cycles(wired, self.streams, self.problems)
-        self.check_machines(drafts)
+        self.check_processes(drafts)
         live_fed = fed_by_devices(wired, self.streams, live=self.live)
         nodes = {w.draft.name: self.node(w, w.draft.name in live_fed) for w in wired}
         root = self.expansion.root
@@ -184,22 +184,22 @@ class Resolver:
 
     # -- the graph as a whole ------------------------------------------------------------------------------------
 
-    def check_machines(self, drafts: Iterable[Draft]) -> None:
-        """Operators that share a process must be on one machine."""
+    def check_processes(self, drafts: Iterable[Draft]) -> None:
+        """Operators that share a process must be on one machine and in one environment."""
         owners: dict[str, Draft] = {}
         for draft in drafts:
             label = draft.process.value if draft.process else draft.name
             first = owners.setdefault(label, draft)
-            here = draft.machine.value if draft.machine else None
-            there = first.machine.value if first.machine else None
-            if here != there:
-                place = (draft.machine or first.machine or draft.process or Leaf(None, draft.place)).place
-                self.problems.add(
-                    place,
-                    f"process {label!r} is on two machines: {first.name} on {there or 'this one'}, "
-                    f"{draft.name} on {here or 'this one'}",
-                    "give them the same 'machine:', or different 'process:' labels",
-                )
+            for key, words in (("machine", ("on", "machines")), ("env", ("in", "environments"))):
+                mine, other = getattr(draft, key), getattr(first, key)
+                here, there = (leaf.value if leaf else None for leaf in (mine, other))
+                if here != there:
+                    self.problems.add(
+                        (mine or other or draft.process or Leaf(None, draft.place)).place,
+                        f"process {label!r} is {words[0]} two {words[1]}: {first.name} {words[0]} "
+                        f"{there or 'this one'}, {draft.name} {words[0]} {here or 'this one'}",
+                        f"give them the same '{key}:', or different 'process:' labels",
+                    )
 
     # -- the resolved parts --------------------------------------------------------------------------------------
 
@@ -215,6 +215,7 @@ class Resolver:
             live=live_policy(draft, devices, self.fields),
             process=draft.process.value if draft.process else None,
             machine=draft.machine.value if draft.machine else None,
+            env=draft.env.value if draft.env else None,
             tolerance=sync_tolerance(draft, self.fields),
             every=sync_every(draft, self.fields),
             source=is_source(draft.cls),

@@ -129,6 +129,11 @@ class Fields:
                 return None
         return word
 
+    def path(self, tree: Tree | None, what: str) -> Leaf | None:
+        """A path, with its place."""
+        word = self.text(tree, what)
+        return None if word is None or tree is None else Leaf(word, tree.place, word)
+
     def label(self, tree: Tree | None, what: str) -> Leaf | None:
         """A name, with its place."""
         word = self.text(tree, what)

@@ -66,6 +66,22 @@ CPU_FEATURES = frozenset(_FEATURES.split())
 """Instruction sets that numeric libraries choose their kernels by."""
 
 
+FACTS = frozenset(("machine", "packages", "device"))
+"""Metadata records whose values may differ between machines of one run."""
+_ELSEWHERE = "dataflow:{group} of {machine}"
+
+
+def record_elsewhere(group: str, machine: str) -> str:
+    """Returns the name of the metadata record with facts of another machine: "dataflow:packages of robot"."""
+    return _ELSEWHERE.format(group=group, machine=machine)
+
+
+def group_of(record: str) -> tuple[str, str]:
+    """Returns the group of facts of a metadata record and the machine that they are of; "" for the supervisor's."""
+    group, _, machine = record.removeprefix("dataflow:").partition(" of ")
+    return (group, machine) if record == record_elsewhere(group, machine) else (record, "")
+
+
 def machine_facts(environment: Mapping[str, str] | None = None) -> dict[str, dict[str, str]]:
     """Metadata records `machine`, `packages`, `threads` and `device`, keys sorted; equal on an equal machine.
 

@@ -43,6 +43,7 @@ def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport
             for node, found in status.waits.items()
             if found
         },
+        namespace=run.graph.namespace,
     )
 
 

@@ -100,6 +100,7 @@ class RunReport:
     waits: Mapping[str, tuple[tuple[str, str, int], ...]] = field(default_factory=dict)
     """Each operator's (input, "timeout" or "late", count): waits that were given up, which drops nothing, and messages
     that came after what needed them was decided, of which those for a trigger are among the drops too."""
+    namespace: str = ""
 
     def digests(self) -> dict[str, str]:
         return {stream: digest for stream, (_, digest) in sorted(self.streams.items())}

@@ -39,9 +39,9 @@ class Started:
         """Returns the descriptors that the worker inherits."""
         return self.theirs, self.letter, self.board, self.words.fileno()
 
-    def spawn(self, variables: Mapping[str, str]) -> None:
+    def spawn(self, variables: Mapping[str, str], python: str = sys.executable) -> None:
         """Starts its process with an environment."""
-        self._process = _spawn([self], variables)
+        self._process = _spawn([self], variables, python)
         self.pid = self._process.pid
 
     def hear(self) -> bool:
@@ -78,13 +78,15 @@ def _await_end(pid: int) -> None:
         os.close(handle)
 
 
-def _spawn(workers: list[Started], variables: Mapping[str, str]) -> subprocess.Popen[bytes]:
+def _spawn(
+    workers: list[Started], variables: Mapping[str, str], python: str = sys.executable
+) -> subprocess.Popen[bytes]:
     """Starts the process of one worker; or one that forks itself for each, and ends: they are this process's then."""
     handed = [worker.handed() for worker in workers]
     slots = [",".join(map(str, each)) for each in handed]
     try:
         return subprocess.Popen(
-            [sys.executable, "-P", "-m", "dataflow.verification.workers.worker", *slots],
+            [python, "-P", "-m", "dataflow.verification.workers.worker", *slots],
             pass_fds=[descriptor for each in handed for descriptor in each],
             env=variables,
             stdin=subprocess.DEVNULL,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +17,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
+from dataflow.environments import environment_of
 from dataflow.execution.threads import environment
 from dataflow.process.channel import ChannelClosed, ready
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, Status, Watch
@@ -33,13 +35,15 @@ LAST_WORDS = 4000
 class Call:
     """A call for a worker: the function as `module:name`, plain values for it, and the operators it will run.
 
-    `environment`: variables of its process besides those of `execution.threads`.
+    `environment`: variables of its process besides those of `execution.threads`; `env`: the environment of its
+    operators (`dataflow.environments`), if any.
     """
 
     function: str
     request: Mapping[str, Any]
     operators: tuple[str, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
+    env: str | None = None
 
 
 Locate = Callable[[Call, str, int], str]
@@ -70,7 +74,7 @@ def call_workers(
         stack.enter_context(interrupts(interrupted.set))
         workers: list[_Worker] = []
         for number, call in enumerate(calls, start=1):
-            started = None if early is None else early.take(threads)
+            started = None if early is None or call.env is not None else early.take(threads)
             workers.append(stack.enter_context(_Worker(number, call, started, threads, locate)))
         shown = 0.0
         while left := [worker for worker in workers if not worker.answered]:
@@ -112,10 +116,13 @@ class _Worker:
 
     def __init__(self, number: int, call: Call, started: Started | None, threads: int, locate: Locate) -> None:
         """`started`: a process that waits already."""
-        variables = {**environment(threads), **call.environment}
+        variables, python = {**environment(threads), **call.environment}, sys.executable
+        if call.env is not None:
+            env = environment_of(call.env)
+            variables, python = env.variables(variables), env.python
         if started is None:
             started = Started()
-            started.spawn(variables)
+            started.spawn(variables, python)
         self.number, self.call, self._locate, self._started = number, call, locate, started
         self.answered, self.answer = False, None
         self._letter, self.channel, self._words = started.letter, started.channel, started.words

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import time
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,18 @@ def test_a_camera_that_is_unplugged_goes_on_when_it_is_back(monkeypatch: pytest.
     assert all(a.stamp < b.stamp for a, b in pairwise(found))
     assert first.released
     assert second.released
+
+
+def test_images_go_on_when_the_clock_was_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = webcam(monkeypatch, Camera([picture(0), *(picture(10) for _ in range(4))]))
+    source.setup()
+    hour = 3600 * 1_000_000_000
+    clock = iter([2 * hour, 2 * hour - 5, hour, hour + 5])
+    monkeypatch.setattr(time, "time_ns", lambda: next(clock))
+
+    stamps = [step["image"].stamp for step in islice(source.stream(), 3)]
+
+    assert stamps == [2 * hour, hour, hour + 5]
 
 
 def test_a_camera_that_comes_back_with_another_size_ends_the_source(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,7 @@ PORT = 9464
 HERE = Path()
 
 Folder = Annotated[
-    Path, typer.Option("--folder", metavar="DIR", help="Where recordings are written: its disk is looked at.")
+    Path, typer.Option("--folder", metavar="DIR", help="Where recordings are written: its disk, here, is looked at.")
 ]
 
 
@@ -109,19 +109,22 @@ def metrics(
     """Serve figures of all graphs that run here to Prometheus, at http://127.0.0.1:PORT/metrics, until Ctrl-C.
 
     Firings, messages, losses, waits, CPU and wall time, restarts and lag of every operator, and the free space of a
-    disk, as they are when they are asked for. Graphs may come and go. Nothing listens beyond loopback.
+    disk, as they are when they are asked for. Graphs may come and go. Nothing listens beyond loopback. With --connect
+    they are those of the graph of another machine.
 
     Examples:
 
       dataflow metrics
       dataflow metrics --port 9500 --folder out
     """
+    from dataflow.client.attach import listing
     from dataflow.client.metrics import MetricsServer, collect
-    from dataflow.transport.registry import running
 
     with friendly_errors():
+        graphs = listing()
+        graphs()  # keys that are wrong are known at once
         try:
-            server = MetricsServer(lambda: collect(running(), [folder]), port)
+            server = MetricsServer(lambda: collect(graphs(), [folder]), port)
         except OSError as error:
             raise fail(f"cannot listen on port {port} of loopback: {error.strerror}") from None
         say(f"http://127.0.0.1:{server.port}/metrics")

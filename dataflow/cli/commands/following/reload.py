@@ -27,7 +27,8 @@ def reload(
     Its module is imported again, with the modules of the same code that have changed, between two firings. It keeps its
     state where it gives one (`snapshot`) and the new code takes it, and its messages that wait. Where the new code
     fails, or declares other ports, the old code goes on. The recording holds this as a restart, with the digests of
-    both codes. Sources, and modules that declare message types, are not reloaded.
+    both codes. Sources, and modules that declare message types, are not reloaded. With --connect it takes the keys of
+    the machine that runs the graph; those of tools load no code.
 
     Exit codes: 0 reloaded; 1 refused: the old code goes on, or no answer; 2 no such graph or operator.
 

@@ -1,0 +1,12 @@
+"""Virtual environments of operators: packages of other versions than those of this installation."""
+
+from dataflow.environments.environment import (
+    EnvError,
+    Environment,
+    environment_of,
+    imported_packages,
+    installed,
+    require_environment,
+)
+
+__all__ = ["EnvError", "Environment", "environment_of", "imported_packages", "installed", "require_environment"]

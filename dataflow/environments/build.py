@@ -1,0 +1,71 @@
+"""Builds the environment of a file of requirements, and locks the versions that were chosen."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dataflow.environments import lock
+from dataflow.environments.environment import EnvError
+
+_WITHIN = 3600.0
+_SHOWN = 3
+
+
+def build(requirements: Path, *, anew: bool = False) -> bool:
+    """Builds the environment, by its lock where that is of these requirements; returns whether there was a need to.
+
+    `anew`: chooses versions anew. Raises `EnvError`; what was half built is removed.
+    """
+    if not anew and not lock.fault(requirements):
+        return False
+    if not requirements.is_file():
+        raise EnvError(f"there is no file {requirements}")
+    folder = lock.folder_of(requirements)
+    try:
+        _run([sys.executable, "-m", "venv", "--clear", "--without-pip", str(folder)], f"{folder} cannot be made")
+        (folder / ".gitignore").write_text("*\n")
+        pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet"]
+        if not anew and lock.is_locked(requirements):
+            locked = str(lock.lock_of(requirements))
+            _run([*pip, "--no-deps", "-r", locked], f"{locked} cannot be installed")
+        else:
+            with tempfile.NamedTemporaryFile(suffix=".json") as report:
+                _run([*pip, "--report", report.name, "-r", str(requirements)], f"{requirements} does not resolve")
+                lock.write(requirements, [*_options(requirements), *_pins(json.load(report))])
+        lock.note_built(requirements)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return True
+
+
+def _options(requirements: Path) -> list[str]:
+    """Returns the lines that say where packages are looked for."""
+    lines = [line.strip() for line in requirements.read_text().splitlines()]
+    return [line for line in lines if line.startswith("--") and not line.startswith(("--requirement", "--constraint"))]
+
+
+def _pins(report: Mapping[str, Any]) -> list[str]:
+    found = []
+    for each in report["install"]:
+        name, version = each["metadata"]["name"], each["metadata"]["version"]
+        found.append(f"{name} @ {each['download_info']['url']}" if each["is_direct"] else f"{name}=={version}")
+    return sorted(found, key=str.lower)
+
+
+def _run(command: list[str], fault: str) -> None:
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=_WITHIN)
+    except subprocess.CalledProcessError as error:
+        lines = [line for line in f"{error.stdout}\n{error.stderr}".splitlines() if line.strip()]
+        said = [line.removeprefix("ERROR: ") for line in lines if line.startswith("ERROR")] or lines
+        raise EnvError(f"{fault}: {'; '.join(said[-_SHOWN:]) or f'exit code {error.returncode}'}") from error
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise EnvError(f"{fault}: {error}") from error

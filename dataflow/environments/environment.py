@@ -1,0 +1,129 @@
+"""Finds the virtual environment that `env:` names, and gives the variables of processes in it.
+
+Its packages come first; this installation's, the engine among them, serve what it lacks. So both have the same minor
+version of Python.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import Distribution, PackageNotFoundError, distributions, version
+from pathlib import Path, PurePath
+
+from dataflow.environments import lock
+
+_MARK = "DATAFLOW_ENV"
+"""Variable of processes in an environment: its folder and the folders of its packages."""
+_PROBE = (
+    "import importlib.util, json, os, sys; std = os.path.dirname(os.__file__); "
+    "own = [p for p in sys.path if not p.endswith('.zip') and p not in (std, std + '/lib-dynload')]; "
+    "engine = importlib.util.find_spec('dataflow'); "
+    "print(json.dumps([sys.version_info[:2], own, engine and engine.origin]))"
+)
+_PROBE_WITHIN = 20.0
+_ENGINE = str(Path(__file__).resolve().parent.parent / "__init__.py")
+
+
+class EnvError(ValueError):
+    """An environment cannot serve; the message names it, and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Environment:
+    """An environment: its folder, its interpreter, and the folders of its packages in the order of its `sys.path`."""
+
+    folder: Path
+    python: str
+    path: tuple[str, ...]
+
+    def variables(self, common: Mapping[str, str]) -> dict[str, str]:
+        """Returns the variables of a process in it; `common` are those of one in this installation."""
+        return {
+            **common,
+            "PYTHONPATH": os.pathsep.join((*self.path, common["PYTHONPATH"], *_editable())),
+            _MARK: os.pathsep.join((str(self.folder), *self.path)),
+        }
+
+
+def environment_of(env: str) -> Environment:
+    """Returns the environment that `env:` names: by its folder, or by the file of requirements that it is built from.
+
+    A relative path is from the current folder. Raises `EnvError`.
+    """
+    folder = _folder(env)
+    if lock.is_requirements(env) and (fault := lock.fault(Path(env))):
+        raise EnvError(f"env {env!r}: {fault}: `dataflow env GRAPH` builds it")
+    python = folder / "bin" / "python"
+    if not python.exists():
+        raise EnvError(
+            f"env {env!r} is no environment: {python} is missing; `{sys.executable} -m venv {env}` makes one"
+        )
+    try:
+        probe = [str(python), "-I", "-c", _PROBE]
+        answer = subprocess.run(probe, capture_output=True, text=True, timeout=_PROBE_WITHIN, check=True).stdout
+        python_version, path, engine = json.loads(answer)
+    except (OSError, subprocess.SubprocessError, ValueError) as error:
+        why = (getattr(error, "stderr", "") or str(error)).strip().rpartition("\n")[2]
+        raise EnvError(f"env {env!r}: its Python cannot be run: {why}") from error
+    if tuple(python_version) != sys.version_info[:2]:
+        raise EnvError(
+            f"env {env!r} has Python {python_version[0]}.{python_version[1]}, and this one is "
+            f"{sys.version_info[0]}.{sys.version_info[1]}: make it with `{sys.executable} -m venv {env}`"
+        )
+    if engine is not None and os.path.realpath(engine) != _ENGINE:
+        raise EnvError(
+            f"env {env!r} has another dataflow, {engine}: uninstall it there (`{python} -m pip uninstall "
+            "robot-dataflow`); operators run with this one"
+        )
+    return Environment(folder, str(python), tuple(path))
+
+
+def require_environment(operator: str, env: str | None) -> None:
+    """Raises `EnvError` where this process is not in the environment that an operator needs."""
+    here = os.environ.get(_MARK, "").partition(os.pathsep)[0]
+    if env is not None and str(_folder(env)) != here:
+        raise EnvError(
+            f"operator {operator!r} needs the environment {env!r}, and this process is in "
+            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay` and `verify` start processes in it"
+        )
+
+
+def imported_packages() -> dict[str, str]:
+    """Returns the versions of the environment's packages of which this process has imported something, by name; none
+    in a process that is in no environment."""
+    _, *path = os.environ.get(_MARK, "").split(os.pathsep)
+    loaded = {name.partition(".")[0] for name in sys.modules}
+    found: dict[str, str] = {}
+    for each in distributions(path=path) if path else ():
+        if each.metadata["Name"] not in found and loaded & _modules(each):
+            found[each.metadata["Name"]] = each.version
+    return dict(sorted(found.items()))
+
+
+def installed(package: str) -> str:
+    """Returns the version of a package that this process imports; "–" where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "–"
+
+
+def _modules(distribution: Distribution) -> set[str]:
+    """Returns the top-level names that a package installs."""
+    listed = (distribution.read_text("top_level.txt") or "").split()
+    return set(listed) or {PurePath(file).parts[0].partition(".")[0] for file in distribution.files or ()}
+
+
+def _editable() -> list[str]:
+    """Returns the folders of packages that this installation finds by import hooks: those installed with `pip -e`."""
+    maps = [getattr(each, "MAPPING", {}) for name, each in sys.modules.items() if name.startswith("__editable__")]
+    return sorted({os.path.dirname(path) for mapping in maps for path in mapping.values()})
+
+
+def _folder(env: str) -> Path:
+    return Path(os.path.abspath(lock.folder_of(Path(env)) if lock.is_requirements(env) else env))

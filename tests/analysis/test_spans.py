@@ -1,0 +1,71 @@
+"""Firings as spans of OpenTelemetry: traces from sources' messages, in the encoding that the specification gives."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from diamond_records import DIAMOND, message, one_round, record
+
+from dataflow.analysis.spans import AT_ONCE, Spans
+from dataflow.graph import load_text
+from dataflow.records.firing import FiringRecord
+from dataflow.sync import RunRef
+
+
+def spans_of(graph_text: str, records: Mapping[str, list[FiringRecord]]) -> list[dict[str, Any]]:
+    """Reads what a collector reads: each line a request. The operator that the resource names is added."""
+    found = []
+    for line in Spans(load_text(graph_text)).lines(records):
+        (resource,) = json.loads(line)["resourceSpans"]
+        about = {each["key"]: each["value"]["stringValue"] for each in resource["resource"]["attributes"]}
+        (scope,) = resource["scopeSpans"]
+        found += [{**span, "operator": about["service.name"]} for span in scope["spans"]]
+    return found
+
+
+def test_a_trace_runs_from_a_message_of_a_source_to_all_that_it_caused() -> None:
+    graph = load_text(DIAMOND)
+    rounds = [one_round(graph, k, 100.0 + 20 * k, slow=10) for k in range(2)]
+
+    spans = spans_of(DIAMOND, {name: [r for each in rounds for r in each[name]] for name in rounds[0]})
+
+    by_id = {span["spanId"]: span for span in spans}
+    assert len(by_id) == len(spans) == 8
+    parents = {span["operator"]: by_id[p]["operator"] for span in spans if (p := span.get("parentSpanId"))}
+    assert parents == {"fast": "camera", "slow": "camera", "join": "fast"}
+    assert len({span["traceId"] for span in spans}) == 2
+    assert {by_id[link["spanId"]]["operator"] for span in spans for link in span["links"]} == {"slow"}
+    join = next(span for span in spans if span["operator"] == "join")
+    assert int(join["endTimeUnixNano"]) - int(join["startTimeUnixNano"]) == 2_000_000
+    for span in spans:
+        assert re.fullmatch("[0-9a-f]{32}", span["traceId"])
+        assert re.fullmatch("[0-9a-f]{16}", span["spanId"])
+
+
+def test_an_error_has_its_text_and_a_message_that_is_not_known_no_parent() -> None:
+    graph = load_text(DIAMOND)
+    lost = record("fast", 0, 1, 1, {"x": message(graph, "camera", 99)})
+    failed = replace(lost, index=1, outcome="error", detail={"error": "ValueError: no"})
+
+    first, second = spans_of(DIAMOND, {"fast": [lost, failed]})
+
+    assert "parentSpanId" not in first
+    assert "status" not in first
+    assert second["status"] == {"code": 2, "message": "ValueError: no"}
+
+
+def test_the_newest_message_of_a_batch_is_the_cause_and_long_runs_come_in_parts() -> None:
+    graph = load_text(DIAMOND)
+    camera = [record("camera", k, k, 0.5) for k in range(AT_ONCE + 1)]
+    stream = message(graph, "camera", 0).stream
+    batch = record("fast", 0, AT_ONCE + 5, 1, {"x": (RunRef(stream, 0, 0, 7),)})
+
+    assert len(list(Spans(graph).lines({"camera": camera}))) == 2
+    spans = spans_of(DIAMOND, {"camera": camera, "fast": [batch]})
+
+    (cause,) = [span for span in spans if span["spanId"] == spans[-1]["parentSpanId"]]
+    assert [each["value"]["intValue"] for each in cause["attributes"]][:2] == ["7", "7"]

@@ -1,0 +1,152 @@
+"""Operators in virtual environments of different packages: run, recorded and verified in them; what cannot serve."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from made_environments import environment, install, packages
+
+from dataflow.environments import EnvError, environment_of, lock
+from dataflow.graph import Graph, GraphError
+from dataflow.graph.load import load_text
+from dataflow.recording import Recording
+from dataflow.records.reading import FiringLog
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.core.report import RunFailed
+from dataflow.supervision.run import run
+from dataflow.verification.verify import verify
+
+TEXT = """
+graph: gains
+record: {record}
+operators:
+  count: {{use: "env_operators:Count"}}
+  first: {{use: "env_operators:Gain", inputs: {{x: count/count}}, env: {folder}/one}}
+  second: {{use: "env_operators:Gain", inputs: {{x: first/y}}, env: {folder}/two}}
+"""
+
+
+def graph(folder: Path, record: str = "all") -> Graph:
+    return load_text(TEXT.format(folder=folder, record=record))
+
+
+@pytest.fixture(scope="module")
+def environments(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two environments that have the same package in two versions."""
+    folder = tmp_path_factory.mktemp("environments")
+    environment(folder / "one", "1.0", 2.0)
+    environment(folder / "two", "2.0", 5.0)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recorded(environments: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    run(graph(environments), record=path)
+    return path
+
+
+def test_each_operator_runs_with_the_packages_of_its_environment(recorded: Path) -> None:
+    with Recording(recorded) as recording:
+        values = [float(m.message.vectors[0, 0]) for m in recording.messages(["gains/second/y"])]
+        packages = {
+            name: next(iter(FiringLog.read(recording).ordered(node))).detail.get("packages")
+            for name, node in graph(Path("x")).nodes.items()
+        }
+
+    assert values == [k * 2.0 * 5.0 for k in range(20)]
+    assert packages == {"count": None, "first": {"tiny": "1.0"}, "second": {"tiny": "2.0"}}
+
+
+def test_a_verification_repeats_each_operator_in_its_environment_and_names_other_versions(
+    recorded: Path, environments: Path
+) -> None:
+    report = verify(recorded)
+    assert report.identical
+    assert [v.packages_changed for v in report.operators] == [[], []]
+
+    install(environments / "one", "1.5", 2.5)
+    try:
+        report = verify(recorded)
+    finally:
+        install(environments / "one", "1.0", 2.0)
+
+    assert report.culprits == ("first",)
+    assert [v.packages_changed for v in report.operators] == [["tiny 1.0 -> 1.5"], []]
+
+
+def test_operators_of_two_environments_share_no_process(environments: Path) -> None:
+    text = TEXT.format(folder=environments, record="all").replace("env:", "process: gains, env:")
+    with pytest.raises(GraphError, match=r"process 'gains' is in two environments: first in .*one, second in .*two"):
+        load_text(text)
+
+    with pytest.raises(ValueError, match=r"process 'all' would be in several environments .*one.*two"):
+        run(graph(environments), placement="one_process")
+
+
+def test_operators_that_only_one_process_could_repeat_are_refused(environments: Path, tmp_path: Path) -> None:
+    run(graph(environments, record="{exclude: first/y}"), record=tmp_path / "thin.mcap")
+
+    with pytest.raises(ReplayError, match=r"'first' and 'second' run in two environments, .* 'gains/first/y': record"):
+        verify(tmp_path / "thin.mcap")
+
+
+def test_an_operator_is_not_made_in_a_process_of_another_environment(environments: Path) -> None:
+    with pytest.raises(
+        EnvError, match=r"operator 'first' needs the environment .*one', and this process is in that of"
+    ):
+        graph(environments).nodes["first"].make()
+
+
+def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_path: Path) -> None:
+    broken = environment(tmp_path / "one", "1.0", 2.0)
+    environment(tmp_path / "two", "1.0", 2.0)
+    (packages(broken) / "msgpack.py").write_text("raise SystemExit(3)\n")
+
+    with pytest.raises(RunFailed, match=f"starts the others in {re.escape(str(broken))} "):
+        run(graph(tmp_path))
+
+
+def test_an_environment_that_cannot_serve_is_refused_with_what_would_be_right(tmp_path: Path) -> None:
+    with pytest.raises(EnvError, match=r"no environment: .*bin/python is missing; `.* -m venv .*none` makes one"):
+        environment_of(str(tmp_path / "none"))
+
+    python = tmp_path / "other" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text("#!/bin/sh\necho '[[3, 9], [], null]'\n")
+    python.chmod(0o755)
+    with pytest.raises(EnvError, match=rf"has Python 3\.9, and this one is 3\.{sys.version_info[1]}: make it with"):
+        environment_of(str(tmp_path / "other"))
+
+    python.write_text("#!/bin/sh\necho no library >&2; exit 127\n")
+    with pytest.raises(EnvError, match=r"its Python cannot be run: no library"):
+        environment_of(str(tmp_path / "other"))
+
+    python.write_text(f"#!/bin/sh\necho '[{list(sys.version_info[:2])}, [], \"/x/dataflow/__init__.py\"]'\n")
+    with pytest.raises(EnvError, match=r"has another dataflow, /x/dataflow/__init__.py: uninstall it there"):
+        environment_of(str(tmp_path / "other"))
+
+
+def test_requirements_without_their_lock_or_environment_are_refused(tmp_path: Path) -> None:
+    requirements = tmp_path / "gains.txt"
+
+    def why() -> str:
+        with pytest.raises(EnvError, match=r"`dataflow env GRAPH` builds it") as caught:
+            environment_of(str(requirements))
+        return str(caught.value)
+
+    assert "there is no file" in why()
+    requirements.write_text("tiny\n")
+    assert "gains.lock is missing" in why()
+    lock.write(requirements, ["tiny==1.0"])
+    assert "gains.env is not built" in why()
+    environment(tmp_path / "gains.env", "1.0", 2.0)
+    lock.note_built(requirements)
+    assert environment_of(str(requirements)).folder == tmp_path / "gains.env"
+    lock.write(requirements, ["tiny==1.1"])
+    assert "gains.env was built from another lock" in why()
+    requirements.write_text("tiny>1\n")
+    assert "gains.lock is out of date" in why()
