@@ -21,8 +21,8 @@ NO_SCHEMA = SchemaText("", "", b"")
 
 
 class Db3Bag:
-    """Reads SQLite databases of rosbag2 whose topics belong together. What a write-ahead log (`-wal`) holds counts, and
-    a rollback journal (`-journal`) takes back what was half written.
+    """Reads SQLite databases of rosbag2 whose topics belong together. The messages in a write-ahead log (`-wal`) count,
+    and a rollback journal (`-journal`) takes back those that were half written.
 
     `compressed`: each message is a zstd frame.
     """
@@ -161,7 +161,7 @@ class Db3Bag:
 
 
 _WHOLE = "(typeof(timestamp) = 'integer' and typeof(data) = 'blob')"
-"""What a row has to hold; SQLite takes values of any type in any column."""
+"""Of a row that is a message; SQLite takes values of any type in any column."""
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 
 

@@ -10,17 +10,18 @@ from __future__ import annotations
 import heapq
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from dataflow.records.cuts import held_by
-from dataflow.records.firing import FiringRecord
+from dataflow.records.firing import KINDS, FiringRecord, Rows, decode_rows
 
 Place = tuple[int, int]
 """(incarnation, number) of a message in its stream, or (incarnation, index) of a record."""
-STEP = 64
+STEP = 8
 """Batches between two at which reading can begin."""
+_CUT = KINDS.index("cut")
 Read = Callable[[int, int | None], Iterator[FiringRecord]]
 """Reads the records of the batches from one number to before another."""
 
@@ -80,7 +81,23 @@ class Outliner:
 
     def take(self, number: int, record: FiringRecord) -> None:
         """Takes the next record of the file, which is in batch `number`."""
-        place, last = (record.incarnation, record.index), self._last
+        self._follow(number, (record.incarnation, record.index))
+        self._rise(record)
+
+    def take_batch(self, number: int, batch: Rows) -> None:
+        """Takes the records of the next batch of the file, of which no more is decoded than is needed."""
+        if any(row[0] == _CUT for row in batch.rows):
+            for record in decode_rows(batch):
+                self.take(number, record)
+            return
+        life = batch.incarnation
+        for index, row in enumerate(batch.rows, batch.first):
+            self._follow(number, (life, index))
+            made = zip(self._outputs, row[6])  # noqa: B905 - a failed call has none
+            self._rise_to((stream, (life, e[0])) for stream, e in made if e is not None and e[0] >= 0)
+
+    def _follow(self, number: int, place: Place) -> None:
+        last = self._last
         back = place <= last
         if back or (self._repeats and place > (last[0], last[1] + 1)):
             self._runs.append(Run(self._begin, number, self._first, tuple(self._steps)))
@@ -91,16 +108,17 @@ class Outliner:
         elif number >= self._end and number >= (self._steps[-1][1] if self._steps else self._begin) + STEP:
             self._steps.append((place, number))
         self._last, self._end = place, number + 1
-        self._rise(record)
 
     def _rise(self, record: FiringRecord) -> None:
-        newest = self._newest
         if record.kind == "cut":
-            sent = [(stream, at) for stream, at, _ in emitted(record, self._outputs)]
+            self._rise_to((stream, at) for stream, at, _ in emitted(record, self._outputs))
         else:
             life = record.incarnation
             made = zip(self._outputs, record.outputs)  # noqa: B905 - a failed call has none
-            sent = [(stream, (life, e.seq)) for stream, e in made if e is not None and e.seq >= 0]
+            self._rise_to((stream, (life, e.seq)) for stream, e in made if e is not None and e.seq >= 0)
+
+    def _rise_to(self, sent: Iterable[tuple[str, Place]]) -> None:
+        newest = self._newest
         for stream, at in sent:
             if at <= newest[stream]:
                 self._scattered.add(stream)

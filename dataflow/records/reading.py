@@ -149,8 +149,12 @@ class FiringLog:
         if maker.name not in self._outlines:
             found = Outliner(tuple(maker.outputs.values()))
             for number, payload in enumerate(self.batches(maker.name)):
-                for record in self.decoded(maker.name, payload):
-                    found.take(number, record)
+                batch = _unpacked(payload, maker.name, self._origin)
+                try:
+                    found.take_batch(number, batch)
+                except (TypeError, IndexError):
+                    self.decoded(maker.name, payload)  # names the damage
+                    raise
             self.outlined(maker, found)
         return self._outlines[maker.name]
 

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataflow.recording import Recording, RecordingError
+from dataflow.records import reading
 from dataflow.records.firing import Emission, FiringRecord, encode_batch
 from dataflow.records.reading import FiringLog, recorded_firings, whole
 from dataflow.records.repetition import Repetition, look_at
@@ -126,6 +127,19 @@ def test_records_of_a_long_run_are_not_in_memory_while_they_are_gone_through() -
 
     assert repetition.calls == 199
     assert max(held() - before for number, _ in enumerate(repetition) if number % 90 == 0) < 10
+
+
+def test_records_from_a_place_on_are_decoded_from_near_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    count, each = 64, 8
+    batches = [encode_batch([record("a", n) for n in range(at, at + each)]) for at in range(0, count * each, each)]
+    log, decoded = FiringLog({"a": batches}, "run.mcap"), []
+    decode = reading.decode_rows
+    monkeypatch.setattr(reading, "decode_rows", lambda batch: decoded.append(batch.first) or decode(batch))
+
+    first = next(iter(log.since(SimpleNamespace(name="a", outputs={}), (0, 300))))
+
+    assert first.index == 300
+    assert min(decoded) > 200
 
 
 def test_a_batch_that_is_none_names_file_and_operator() -> None:

@@ -19,7 +19,7 @@ from dataflow.recording.layout import BAG, RECORDING
 
 
 def distinct(names: Iterable[str], called: Callable[[str], str], taken: Iterable[str] = ()) -> dict[str, str]:
-    """What each of some names is called in an output: `called(name)`, `_2` or more behind one that is taken.
+    """Returns the name of each in an output: `called(name)`, `_2` or more behind one that is taken.
 
     Names that are called as they are keep their name.
     """
