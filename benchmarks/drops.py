@@ -100,7 +100,7 @@ def made(seeds: range) -> int:
     return int(right < len(seeds))
 
 
-def branch(path: Path) -> tuple[Cost, float]:
+def branch(path: Path, budget: float) -> tuple[Cost, float]:
     """Has the odometry branch of a recording lose 400 messages, and looks for those that cost its error."""
     draw = random.Random(0)
     late = {("depth_png", k): 400 for k in draw.sample(range(20, 200), 20)}
@@ -114,7 +114,7 @@ def branch(path: Path) -> tuple[Cost, float]:
             made = held_runs.recorded(graph, held_runs.Faults(late, still), Path(folder) / "run.mcap", played)
         began = time.process_time()
         with Recording(made) as recording:
-            cost = Drops(recording, "ate_rmse_m > 0.015", budget=600.0).find()
+            cost = Drops(recording, "ate_rmse_m > 0.015", budget=budget).find()
             return cost, time.process_time() - began
 
 
@@ -122,11 +122,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="0:20", help="FIRST:END")
     parser.add_argument("--demo", type=Path, help="recordings/demo.mcap")
+    parser.add_argument("--budget", type=float, default=600.0, help="seconds for that")
     given = parser.parse_args()
     first, end = map(int, given.seeds.split(":"))
     wrong = made(range(first, end))
     if given.demo is not None:
-        cost, used = branch(given.demo)
+        cost, used = branch(given.demo, given.budget)
         print(
             f"\n{len(cost.named)} of {cost.losses} losses named, {cost.replays} replays, {cost.calls:,} calls made, ",
             end="",

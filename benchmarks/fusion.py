@@ -2,11 +2,14 @@
 
     python benchmarks/fusion.py euroc DATA/euroc_v1_01_imu --seeds 0-20
     python benchmarks/fusion.py simulator --seeds 0-50
+    python benchmarks/fusion.py hours --seeds 0-10 --seconds 3600
 
 EuRoC: positions at 20 Hz are the truth with 2 cm of noise an axis and 10 % outliers of 0.5 m an axis; the last 3 s of
 every 12 s have none. The RMSE leaves out the first 0.2 s after an outage; the heading is not given. Simulator: inertial
 samples, positions of 2 cm horizontally, 4 cm vertically at 20 Hz, none in the last 3 s of every 12 s, made of the true
-trajectories of its worlds; NEES of position and orientation at the end of each outage and 2 s after.
+trajectories of its worlds; NEES of position and orientation at the end of each outage and 2 s after. Hours: the same at
+50 Hz with positions at 5 Hz, drives of even seeds with wheels at 10 Hz: warnings where nothing is wrong, NEES and the
+standard deviation that is claimed.
 """
 
 from __future__ import annotations
@@ -15,8 +18,9 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,15 +30,24 @@ import numpy as np
 PERIOD, OUTAGE = 12.0, 3.0
 
 
-def fed(operator: Any, samples: Sequence[Any], fixes: Sequence[Any]) -> Iterator[Any]:
+def fed(operator: Any, samples: Sequence[Any], others: Sequence[Any]) -> Iterator[Any]:
     """Gives an operator its messages in the order of their stamps; yields its odometry."""
+    for given in fired(operator, samples, others):
+        if given["odometry"] is not None:
+            yield given["odometry"]
+
+
+def fired(operator: Any, samples: Sequence[Any], others: Sequence[Any]) -> Iterator[Any]:
+    """Gives an operator its messages in the order of their stamps; yields its outputs."""
+    from dataflow.messages import Odometry
     from dataflow.operator import Context
 
-    for message in sorted([*samples, *fixes], key=lambda m: (m.stamp, m.SCHEMA)):
-        name = "ns/sensor/imu" if message.SCHEMA == samples[0].SCHEMA else "ns/sensor/fix"
+    names = {samples[0].SCHEMA: "ns/sensor/imu", Odometry.SCHEMA: "ns/sensor/wheels"}
+    for message in sorted([*samples, *others], key=lambda m: (m.stamp, m.SCHEMA)):
+        name = names.get(message.SCHEMA, "ns/sensor/fix")
         given = operator.process({name: message}, Context(message.stamp))
-        if given is not None and given["odometry"] is not None:
-            yield given["odometry"]
+        if given is not None:
+            yield given
 
 
 @cache
@@ -100,7 +113,7 @@ def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
     return math.sqrt(float(np.mean(np.square(errors)))), ends, text
 
 
-def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
+def driven(seed: int, seconds: int, rate: int = 100):  # type: ignore[no-untyped-def]
     """Inertial samples, positions of the antenna, true poses by stamp, and extrinsics of a drive in the simulator.
 
     They are made of the true trajectory: nothing is drawn, so that many runs are cheap.
@@ -110,7 +123,7 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
     from operators.simulator.worlds.make import make_world
 
     rng = np.random.default_rng([seed, 7])
-    imu, gnss, rate = Inertial(), Gnss(), 100
+    imu, gnss = Inertial(), Gnss()
     world = ("office", "corridor", "table_top")[seed % 3]
     path = make_world(world, seed, speed=0.5, hold=0.0, movers=False).path
     t = np.arange(seconds * rate) / rate
@@ -147,7 +160,7 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
     sigma = np.array([0.02, 0.02, 0.04])
     covariance = np.diag([*sigma**2, 1.0, 1.0, 1.0])
     fixes = []
-    for stamp in stamps[:: rate // 20]:
+    for stamp in stamps[:: max(rate // 20, 1)]:
         if stamp * 1e-9 % PERIOD < PERIOD - OUTAGE:
             place = truth[stamp][:3, :3] @ gnss.mount[:3] + truth[stamp][:3, 3] + sigma * rng.standard_normal(3)
             fixes.append(
@@ -167,7 +180,7 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
         translations=np.array([imu.mount[:3], gnss.mount[:3]]),
         rotations=np.tile([0.0, 0, 0, 1], (2, 1)),
     )
-    heading = float(motion.yaw[50]) + 0.05 * rng.standard_normal()
+    heading = float(motion.yaw[rate // 2]) + 0.05 * rng.standard_normal()
     return samples, fixes, truth, extrinsics, heading
 
 
@@ -213,16 +226,88 @@ def simulator(
     return ends, nees, errors, expected
 
 
+def wheels_of(truth: Mapping[int, Any], every: int, rng: np.random.Generator) -> list[Any]:
+    """Returns odometry of wheels of every so many true poses (4, 4) by stamp, with noise of 1 cm/s and 0.01 rad/s."""
+    from dataflow.messages import Odometry
+    from operators.geometry import se3
+
+    made, stamps = [], sorted(truth)
+    for before, stamp in list(pairwise(stamps))[::every]:
+        twist = se3.log(np.linalg.inv(truth[before]) @ truth[stamp]) / ((stamp - before) * 1e-9)
+        made.append(
+            Odometry(
+                stamp=stamp,
+                frame="odom",
+                child_frame="base_link",
+                position=np.zeros(3),
+                orientation=np.array([0.0, 0, 0, 1]),
+                linear=np.array([twist[0] + rng.normal(0, 0.01), 0, 0]),
+                angular=np.array([0, 0, twist[5] + rng.normal(0, 0.01)]),
+                twist_covariance=np.eye(6) * 1e-4,
+            )
+        )
+    return made
+
+
+def faultless(seed: int, seconds: int) -> tuple[list[str], list[float], list[float]]:
+    """Returns the warnings of a drive without faults, and NEES/3 of the position and its deviation (m) every 10 s."""
+    from dataflow.messages.diagnostics import Level
+    from operators.fusion import EkfFusion
+    from operators.fusion.sensors.settings import SensorSettings
+
+    samples, fixes, truth, extrinsics, heading = driven(seed, seconds, 50)
+    others = fixes[::5]  # of 25 Hz
+    sensors = {"sensor/fix": SensorSettings(use="position")}
+    if seed % 2 == 0:
+        others = [*others, *wheels_of(truth, 5, np.random.default_rng([seed, 8]))]
+        sensors["sensor/wheels"] = SensorSettings(use="wheels", sigma=0.03)
+    operator = EkfFusion(heading=heading, heading_sigma=0.05, rest=0.5, patience=0.5, sensors=sensors)
+    operator.setup()
+    mounted = SimpleNamespace(process=lambda messages, context: operator.process(messages, context, extrinsics))
+    warnings, nees, claimed, standing = list[str](), list[float](), list[float](), set[str]()
+    for given in fired(mounted, samples, others):
+        if (status := given["status"]) is not None:
+            rows = zip(status.names, status.levels, status.messages, strict=True)
+            now = {f"{name}: {text}" for name, level, text in rows if level == Level.WARN}
+            warnings += [f"{status.stamp * 1e-9:.1f} s {text}" for text in sorted(now - standing)]
+            standing = now
+        pose = given["odometry"]
+        if pose is not None and pose.stamp > 10**10 and pose.stamp % 10**10 == 0:
+            off, C = truth[pose.stamp][:3, 3] - pose.position, pose.pose_covariance[:3, :3]
+            nees.append(float(off @ np.linalg.solve(C, off)) / 3)
+            claimed.append(math.sqrt(float(np.trace(C))))
+    return warnings, nees, claimed
+
+
+def hours(seeds: range, seconds: int) -> None:
+    """Prints what a filter warns of, and how sure it is, in drives without faults."""
+    counts, every, deviations = 0, list[float](), list[float]()
+    for seed in seeds:
+        warnings, nees, claimed = faultless(seed, seconds)
+        counts, every, deviations = counts + len(warnings), every + nees, deviations + claimed
+        print(
+            f"seed {seed}: {len(warnings)} warnings, NEES/3 {np.mean(nees):.2f}, claims {np.mean(claimed):.4f} m",
+            flush=True,
+        )
+        print("".join(f"  {text}\n" for text in warnings), end="", flush=True)
+    spent = len(seeds) * seconds / 3600
+    print(f"{counts} warnings in {spent:.2f} h; NEES/3 {np.mean(every):.2f} of {len(every)} poses; "
+          f"claims {np.mean(deviations):.4f} m")  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["euroc", "simulator"])
+    parser.add_argument("what", choices=["euroc", "simulator", "hours"])
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--seconds", type=int, default=36, help="of a drive in the simulator")
+    parser.add_argument("--seconds", type=int, default=36, help="of a made drive")
     parser.add_argument("--seeds", default="0-20", help="from, and the one to stop before")
     parser.add_argument("--slip", type=float, help="m/s: the robot rolls (simulator; `EkfFusion`'s parameter)")
     arguments = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     first, stop = (int(word) for word in arguments.seeds.split("-"))
+    if arguments.what == "hours":
+        hours(range(first, stop), arguments.seconds)
+        return
     began, all_ends, all_nees, all_expected, squares = time.process_time(), [], [], [], []
     for seed in range(first, stop):
         if arguments.what == "euroc":

@@ -86,9 +86,9 @@ def often_detected(data: Path, scene: str, recording: Path) -> list[str]:
     """Returns the plain things that the detector finds in `OFTEN` images or more."""
     labels = json.loads((data / "scenes" / f"{scene}.json").read_text())
     K = np.array(labels["K_color"])
-    T_depth_image = _matrix(labels["T_depth_image"])
+    T_depth_image = matrix_of(labels["T_depth_image"])
     times = np.array([pose[1] for pose in labels["poses"]])
-    T_first_camera = [_matrix(pose[2:9]) @ T_depth_image for pose in labels["poses"]]
+    T_first_camera = [matrix_of(pose[2:9]) @ T_depth_image for pose in labels["poses"]]
     stream = dataflow.open(recording)
     name = next(name for name in stream if name.endswith("detector/detections"))
     images = [m for m in stream[name] if isinstance(m, Detections2D)]
@@ -99,13 +99,13 @@ def often_detected(data: Path, scene: str, recording: Path) -> list[str]:
         names = np.array(image.labels())
         for thing in (each for each in labels["objects"] if each["kind"] in ("object", "moving")):
             own = image.boxes[np.isin(names, thing["classes"])]
-            box = _moved_box(thing, at, times, T_first_camera, K)
+            box = moved_box(thing, at, times, T_first_camera, K)
             if box is not None and len(own):
                 found[thing["id"]] += bool((overlap(own.astype(np.float64), box[None]) >= IOU).any())
     return [thing for thing, count in found.items() if count >= OFTEN]
 
 
-def _moved_box(
+def moved_box(
     thing: Mapping[str, Any],
     at: int,
     times: NDArray[np.float64],
@@ -138,7 +138,7 @@ def _pixel(
     return float(K[0, 0] * x / z + K[0, 2]), float(K[1, 1] * y / z + K[1, 2]), float(z)
 
 
-def _matrix(numbers: Sequence[float]) -> NDArray[np.float64]:
+def matrix_of(numbers: Sequence[float]) -> NDArray[np.float64]:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
     return T

@@ -1,12 +1,16 @@
 """Recognition networks trained here beside the same data given to torchvision's, and to baselines that learn nothing.
 
     python benchmarks/recognition.py objects WORLDS           classes of objects; WORLDS: a folder of simulated_worlds
+    python benchmarks/recognition.py photographs COCO128 [--backbone FILE]    the same of photographs, every second one
+    python benchmarks/recognition.py people RECORDING --backbone FILE    people known again
     python benchmarks/recognition.py streets CAMVID [--backbone FILE]    classes of pixels of photographs of streets
 
 `objects`: the objects of simulated worlds (`python -m operators.training.simulated_worlds WORLDS`) cut out by their
-true boxes; trained in some worlds, scored in others. `streets`: every second image of CamVid to train on, the others
-scored; `--backbone` is a state dict of torchvision's mobilenet_v2. All networks get the same images, variations, steps
-and optimiser; the last epoch is scored, not the best. Nothing that is trained is kept.
+true boxes; trained in some worlds, scored in others. `people`: a recording of images and tracks whose ids are right;
+of each track the first half of its cut-outs is known, the rest is asked for, and the nearest decides. `streets`: every
+second image of CamVid to train on, the others scored. `--backbone` is a state dict of torchvision's mobilenet_v2. All
+networks get the same images, variations, steps and optimiser; the last epoch is scored, not the best. Nothing that is
+trained is kept.
 """
 
 from __future__ import annotations
@@ -16,7 +20,8 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +34,11 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 import torchvision  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
+from places import extractor, with_head  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
+import dataflow  # noqa: E402
+from dataflow.messages import TrackState  # noqa: E402
 from operators.detection.custom.folder import read_detection_data  # noqa: E402
 from operators.learning.backbone import current_names  # noqa: E402
 from operators.learning.loop import Settings, train  # noqa: E402
@@ -43,8 +51,8 @@ from operators.training.running import prepare  # noqa: E402
 
 CAMVID = ("sky", "building", "pole", "road", "pavement", "tree", "sign", "fence", "car", "pedestrian", "bicyclist")
 SIDE = (64, 64)
-MOST, LEAST = 150, 24
-"""Cut-outs of a class at most to train on; width and height in pixels at least."""
+MOST, LEAST, FEW = 150, 24, 6
+"""Cut-outs of a class at most to train on; width and height in pixels at least; cut-outs of a class at least."""
 
 
 class Torchvision(ClassifierTask):
@@ -107,9 +115,15 @@ def trained(task: Any, epochs: int, batch: int) -> dict[str, float]:
         return train(task, settings, Path(folder) / "network.onnx").history[-1]
 
 
-def cut_out(worlds: Path, folder: Path) -> ClassificationData:
-    """Writes the objects of a folder of detection data as images; those that are to be ignored are left out."""
+def cut_out(worlds: Path, folder: Path, *, halves: bool = False) -> ClassificationData:
+    """Writes the objects of a folder of detection data as images; those that are to be ignored are left out.
+
+    With `halves` every second image is to be scored, and classes with less than `FEW` cut-outs in either are left out.
+    """
     read = read_detection_data(worlds, 0)
+    if halves:
+        images = sorted((*read.training, *read.validation), key=lambda image: image.file)
+        read = replace(read, training=tuple(images[::2]), validation=tuple(images[1::2]))
     parts: dict[str, list[LabelledImage]] = {"training": [], "validation": []}
     for part, images in (("training", read.training), ("validation", read.validation)):
         count = np.zeros(len(read.classes), np.int64)
@@ -131,7 +145,61 @@ def cut_out(worlds: Path, folder: Path) -> ClassificationData:
                 cv2.imwrite(str(file), pixels[y1:y2, x1:x2])
                 parts[part].append(LabelledImage(file, int(label)))
                 count[label] += 1
-    return ClassificationData(tuple(read.classes), tuple(parts["training"]), tuple(parts["validation"]))
+    data = ClassificationData(tuple(read.classes), tuple(parts["training"]), tuple(parts["validation"]))
+    return frequent(data) if halves else data
+
+
+def frequent(data: ClassificationData) -> ClassificationData:
+    """Returns the classes with `FEW` cut-outs to train on and to score."""
+    sides = [
+        np.bincount([i.label for i in part], minlength=len(data.classes)) for part in (data.training, data.validation)
+    ]
+    kept = np.flatnonzero(np.minimum(*sides) >= FEW).tolist()
+    parts = [
+        tuple(LabelledImage(i.file, kept.index(i.label)) for i in part if i.label in kept)
+        for part in (data.training, data.validation)
+    ]
+    return ClassificationData(tuple(data.classes[k] for k in kept), *parts)
+
+
+def described(images: Sequence[LabelledImage], backbone: Path) -> NDArray[np.float64]:
+    """Returns the vectors (N, D) of images by `FeatureExtractor` with torchvision's mobilenet_v2."""
+    with tempfile.TemporaryDirectory() as folder:
+        whole = with_head(backbone, Path(folder) / "mobilenet_v2.pt")
+        describe = extractor(model="mobilenet_v2", checkpoint=str(whole))
+    return np.array([describe(image.read()) for image in images], np.float64)
+
+
+def people(recording: Path, backbone: Path) -> None:
+    """Prints how often the nearest known cut-out is of the same person: by colours, by features of ImageNet."""
+    stream = dataflow.open(recording)
+    images, tracks = (next(name for name in stream if name.endswith(end)) for end in ("camera/image", "tracker/tracks"))
+    at = {m.stamp: m for m in stream[tracks]}
+    with tempfile.TemporaryDirectory() as folder:
+        of: dict[int, list[LabelledImage]] = {}
+        for image in stream[images]:
+            found = at.get(image.stamp)
+            if found is None:
+                continue
+            for k in np.flatnonzero((found.states == TrackState.CONFIRMED) & (found.unseen == 0)).tolist():
+                x1, y1, x2, y2 = np.clip(found.boxes[k], 0, (image.width, image.height) * 2).round().astype(int)
+                if found.labels()[k] == "person" and min(x2 - x1, y2 - y1) >= LEAST:
+                    file = Path(folder) / f"{found.ids[k]}_{image.stamp}.png"
+                    cv2.imwrite(str(file), image.data[y1:y2, x1:x2, ::-1])
+                    of.setdefault(int(found.ids[k]), []).append(LabelledImage(file, int(found.ids[k])))
+        of = {i: each for i, each in of.items() if len(each) >= 2 * FEW}
+        known = [image for each in of.values() for image in each[: len(each) // 2]]
+        asked = [image for each in of.values() for image in each[len(each) // 2 :]]
+        labels, truth = (np.array([image.label for image in part]) for part in (known, asked))
+        print(f"{len(of)} people, {len(known)} cut-outs known, {len(asked)} asked for")
+        values, counts = np.unique(labels, return_counts=True)
+        rows = {"the most frequent person": scored(np.full(len(truth), values[counts.argmax()]), truth)}
+        a, b = (np.array([histogram(i) for i in part]) for part in (known, asked))
+        rows["the nearest colour histogram"] = scored(labels[(b @ a.T).argmax(axis=1)], truth)
+        a, b = (described(part, backbone) for part in (known, asked))
+        rows["FeatureExtractor, torchvision's mobilenet_v2"] = scored(labels[(b @ a.T).argmax(axis=1)], truth)
+    for name, row in rows.items():
+        print(f"| {name} | {row['accuracy']:.3f} | {row['mean_accuracy']:.3f} |")
 
 
 def histogram(image: LabelledImage) -> NDArray[np.float64]:
@@ -140,15 +208,20 @@ def histogram(image: LabelledImage) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(counts / counts.sum()))
 
 
-def objects(worlds: Path, epochs: int) -> dict[str, Any]:
+def objects(worlds: Path, epochs: int, backbone: Path | None = None, *, halves: bool = False) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
-        data = cut_out(worlds, Path(folder))
+        data = cut_out(worlds, Path(folder), halves=halves)
         labels = np.array([image.label for image in data.training])
         truth = np.array([image.label for image in data.validation])
         print(f"{len(labels)} cut-outs to train on, {len(truth)} to score, {len(data.classes)} classes")
         rows = {"the most frequent class": scored(np.full(len(truth), np.bincount(labels).argmax()), truth)}
         known, asked = (np.array([histogram(i) for i in part]) for part in (data.training, data.validation))
         rows["the nearest colour histogram"] = scored(labels[(asked @ known.T).argmax(axis=1)], truth)
+        if backbone is not None:
+            known, asked = (described(part, backbone) for part in (data.training, data.validation))
+            rows["the nearest features of torchvision's mobilenet_v2"] = scored(
+                labels[(asked @ known.T).argmax(axis=1)], truth
+            )
         for name, task in (
             ("plain", ClassifierTask(data, SIDE)),
             ("residual", ClassifierTask(data, SIDE, architecture="residual")),
@@ -238,15 +311,20 @@ def shade(pixels: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["objects", "streets"])
+    parser.add_argument("what", choices=["objects", "photographs", "people", "streets"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--backbone", type=Path, help="state dict of torchvision's mobilenet_v2")
-    parser.add_argument("--epochs", type=int, help="8 for objects, 60 for streets")
+    parser.add_argument("--epochs", type=int, help="8 for objects, 60 for photographs and streets")
     parser.add_argument("--json", type=Path, help="file for all figures")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
+    if arguments.what == "people":
+        people(arguments.folder, arguments.backbone)
+        return
     if arguments.what == "objects":
         rows = objects(arguments.folder, arguments.epochs or 8)
+    elif arguments.what == "photographs":
+        rows = objects(arguments.folder, arguments.epochs or 60, arguments.backbone, halves=True)
     else:
         rows = streets(arguments.folder, arguments.backbone, arguments.epochs or 60)
     if arguments.json:

@@ -1,6 +1,6 @@
 """Scene graphs of simulated worlds against truth: relations, activities, goals; from sensors and fed with true nodes.
 
-    python benchmarks/scene_graph.py CACHE [--first 600] [--worlds 10] [--every 1]
+    python benchmarks/scene_graph.py CACHE [--first 600] [--worlds 10] [--every 1] [--rough]
 
 From sensors: the shipped detector and segmenter, depth, true camera poses, `SemanticMap`, `SceneGraphBuilder`; no other
 truth goes in. The map at the end is scored as by semantic_map.py. Relations are scored at every second of the last half
@@ -141,10 +141,11 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=10)
     parser.add_argument("--every", type=int, default=1, help="take every so many frames of the sensors")
     parser.add_argument("--fed", choices=["true", "sensors", "both"], default="both")
+    parser.add_argument("--rough", action="store_true", help="a real camera's noise, and calibrations that are off")
     parser.add_argument("--out", type=Path, help="JSON file for all figures")
     options = parser.parse_args()
     rows: dict[str, list[dict[str, Any]]] = {"true": [], "sensors": []}
-    for world in sensed(range(options.first, options.first + options.worlds), options.cache):
+    for world in sensed(range(options.first, options.first + options.worlds), options.cache, rough=options.rough):
         for fed in rows if options.fed == "both" else [options.fed]:
             found = run(world, options.every, true=fed == "true")
             rows[fed].append({"world": world.name} | found)

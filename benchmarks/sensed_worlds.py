@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dataflow.messages import (
     Activity,
@@ -39,6 +40,8 @@ Route = Literal["tour", "watch"]
 KINDS = ("office", "table_top", "corridor")
 RATE = 4.0
 SECONDS: dict[Route, int] = {"tour": 50, "watch": 30}
+ROUGH_DEPTH: dict[str, Any] = {"noise": 0.004, "quantum": 0.006, "specks": 0.08, "edge_holes": 1.0}
+"""Errors of a structured-light or stereo camera: 4 mm and steps of 6 mm at 1 m, 8 % holes, no return at edges."""
 SEARCH: dict[str, Any] = {"voxel": 0.08, "period": 2.0}
 """Parameters of PlaneSegmenter, as in graphs/core/perception.yaml."""
 
@@ -138,15 +141,27 @@ def mapped(world: World) -> list[Mapped]:
     return found
 
 
-def sense(kind: str, seed: int, route: Route) -> World:
+def miscalibrated(static: dict[str, Any]) -> dict[str, Any]:
+    """Returns calibrations with a focal length of colour 1 % too long, and depth turned by 0.3 degrees twice."""
+    info, tree = static["image_info"], static["extrinsics"]
+    K = info.K.copy()
+    K[[0, 1], [0, 1]] *= 1.01
+    turned, depth = tree.rotations.copy(), tree.child_frames.index(static["depth_info"].frame)
+    turned[depth] = (Rotation.from_quat(turned[depth]) * Rotation.from_euler("xy", [0.3, 0.3], degrees=True)).as_quat()
+    return static | {"image_info": info.replace(K=K), "extrinsics": tree.replace(rotations=turned)}
+
+
+def sense(kind: str, seed: int, route: Route, *, rough: bool) -> World:
+    """Drives through a world; `rough`: with the noise of a real camera, and calibrations that are off."""
+    color, depth = ({"read_noise": 3.0, "shutter": "15ms"}, ROUGH_DEPTH) if rough else ({}, {})
     robot = SimulatedRobot(
         world=kind,
         seed=seed,
         people=3,
         route=route,
         duration=f"{SECONDS[route]}s",
-        color_camera={"rate": RATE, "width": 640, "height": 480},
-        depth_camera={"rate": RATE},
+        color_camera={"rate": RATE, "width": 640, "height": 480, **color},
+        depth_camera={"rate": RATE, **depth},
         truth={
             "poses": RATE,
             "relations": RATE,
@@ -164,6 +179,7 @@ def sense(kind: str, seed: int, route: Route) -> World:
     for operator in (robot, builder, detector, segmenter):
         operator.setup()
     static: dict[str, Any] = dict(robot.static_outputs())
+    static = miscalibrated(static) if rough else static
     frames = []
     for messages in robot.stream():
         m: dict[str, Any] = dict(messages)
@@ -184,14 +200,15 @@ def sense(kind: str, seed: int, route: Route) -> World:
     return World(f"{kind} {seed}", static["image_info"], static["extrinsics"], frames)
 
 
-def sensed(seeds: Iterable[int], folder: Path, route: Route = "tour") -> Iterator[World]:
+def sensed(seeds: Iterable[int], folder: Path, route: Route = "tour", *, rough: bool = False) -> Iterator[World]:
     """Yields a world of each seed, the kinds in turn; those that the folder has are read from it."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
         kind = KINDS[seed % len(KINDS)]
-        file = folder / f"{kind}_{seed}{'' if route == 'tour' else f'_{route}'}.pickle"
+        more = ("" if route == "tour" else f"_{route}") + ("_rough" if rough else "")
+        file = folder / f"{kind}_{seed}{more}.pickle"
         if not file.is_file():
             partial = file.with_suffix(".partial")
-            partial.write_bytes(pickle.dumps(sense(kind, seed, route)))
+            partial.write_bytes(pickle.dumps(sense(kind, seed, route, rough=rough)))
             partial.replace(file)
         yield pickle.loads(file.read_bytes())

@@ -1,11 +1,13 @@
 """2-D tracking against SORT and ByteTrack of the `trackers` package, on made detections, judged by trackeval.
 
     python benchmarks/tracking.py VENV [--seeds 10] [--search N]
+    python benchmarks/tracking.py VENV --real
 
 VENV is a virtual environment with `trackers`, `trackeval` and `motmetrics`, whose two ground truths are used beside the
 simulator's. Detections are made from the truth by a seeded model: misses that come in spells, false boxes, jitter, and
 scores that tell a little of each. `--search` tries N parameter sets of each peer on seeds that are not reported, and
-reports the best as well.
+reports the best as well. `--real`: the boxes that another program found in the images of the two street sequences, of
+which `motmetrics` carries a tracker's output; its ids are left out, and it gives no scores.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ SEARCH = {
 }
 
 
-def motmetrics_truth(venv: Path, name: str) -> list[list[list[float]]]:
-    (file,) = venv.glob(f"lib/python3*/site-packages/motmetrics/data/{name}/gt.txt")
+def motmetrics_boxes(venv: Path, name: str, file_name: str = "gt.txt") -> list[list[list[float]]]:
+    (file,) = venv.glob(f"lib/python3*/site-packages/motmetrics/data/{name}/{file_name}")
     frames: dict[int, list[list[float]]] = {}
     for row in csv.reader(file.open()):
         frame, id, x, y, w, h = (float(v) for v in row[:6])
@@ -127,6 +129,21 @@ def sequences(truths: dict[str, Any], seeds: range) -> dict[str, Any]:
     return made
 
 
+def real_sequences(venv: Path) -> dict[str, Any]:
+    """Returns the two street sequences with boxes that a program found in their images, all with the score 1."""
+    made = {}
+    for name, size in SIZES.items():
+        truth = motmetrics_boxes(venv, name)
+        found = motmetrics_boxes(venv, name, "test.txt")
+        found += [[] for _ in range(len(truth) - len(found))]
+        frames = [
+            {"truth": [r[:5] for r in t], "found": [[*r[1:5], 1.0] for r in f]}
+            for t, f in zip(truth, found, strict=True)
+        ]
+        made[f"{name}/real"] = {"rate": 25.0, "size": size, "frames": frames}
+    return made
+
+
 def judged(venv: Path, made: dict[str, Any], settings: dict[str, BoxTrackerSettings], peers: dict[str, Any]) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         results = {label: {name: ours(sequence, s) for name, sequence in made.items()} for label, s in settings.items()}
@@ -153,7 +170,7 @@ def bootstrap(first: dict[str, Any], second: dict[str, Any], metric: str) -> tup
 
 
 def truths(venv: Path, first_world: int, seconds: int) -> dict[str, Any]:
-    found: dict[str, Any] = {n: (25.0, size, motmetrics_truth(venv, n)) for n, size in SIZES.items()}
+    found: dict[str, Any] = {n: (25.0, size, motmetrics_boxes(venv, n)) for n, size in SIZES.items()}
     for world, offset in WORLDS:
         seed = first_world + offset
         found[f"{world} {seed}"] = (10.0, (320, 240), simulated_truth(world, seed, seconds))
@@ -184,6 +201,7 @@ def main() -> None:
     parser.add_argument("venv", type=Path)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--search", type=int, default=0)
+    parser.add_argument("--real", action="store_true", help="on boxes that were found in real images")
     options = parser.parse_args()
     peers = {
         "SORT": {"use": "SORTTracker", "parameters": {}},
@@ -192,7 +210,10 @@ def main() -> None:
     if options.search:
         chosen_on = sequences(truths(options.venv, 500, 12), range(CHOSEN_ON, CHOSEN_ON + 2))
         peers |= searched(options.venv, chosen_on, options.search)
-    made = sequences(truths(options.venv, 600, 20), range(REPORTED, REPORTED + options.seeds))
+    if options.real:
+        made = real_sequences(options.venv)
+    else:
+        made = sequences(truths(options.venv, 600, 20), range(REPORTED, REPORTED + options.seeds))
     figures = judged(options.venv, made, {"ours": BoxTrackerSettings()}, peers)
     print(f"{len(made)} sequences, {sum(len(s['frames']) for s in made.values())} frames")
     print("| tracker | HOTA | IDF1 | MOTA | worst HOTA | ours - it: HOTA | IDF1 | MOTA |\n" + "| --- " * 8 + "|")

@@ -16,22 +16,27 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SUPPORT = REPOSITORY / "tests" / "support"
 sys.path.append(str(SUPPORT))
 
-from zoo.cages import CAGES, Cage  # noqa: E402
+from zoo.cages import AT_THE_END, CAGES, Cage  # noqa: E402
+from zoo.operators import STEPS  # noqa: E402
 
+from dataflow.recording import Recording, RecordingError  # noqa: E402
+from dataflow.records.reading import FiringLog  # noqa: E402
 from dataflow.verification.verify import verify  # noqa: E402
 
 WAYS = ("run", "live", "killed")
 PLACEMENTS = {"each": "process_each", "one": "one_process"}
 STARTED_WITHIN = 120.0
-RECORDS = 60_000
-"""Bytes of a recording after which its run is killed."""
+RECORDED = 10**18 + 1_500_000_000
+"""The stamp (ns) up to which each operator has recorded calls when its run is killed: behind its first two states."""
+LONG = 1500
+"""Steps of a run that is killed."""
 
 RUN = """
 import sys
@@ -39,24 +44,35 @@ sys.path.append({support!r})
 from pathlib import Path
 from zoo.cages import CAGES
 from dataflow.supervision.run import run
-run(CAGES[{cage!r}].graph(), placement={placement!r}, record=Path({path!r}), live={live!r})
+run(CAGES[{cage!r}].graph({steps}), placement={placement!r}, record=Path({path!r}), live={live!r})
 """
 
 
 def record(name: str, way: str, placement: str, path: Path) -> None:
-    """Records a run of a cage in a process; that is killed when it has written for a while, if asked for."""
+    """Records a run of a cage in a process; that is killed when all its operators have recorded calls, if asked for."""
     made = {"support": str(SUPPORT), "cage": name, "path": str(path), "live": way != "run"}
-    program = RUN.format(placement=PLACEMENTS[placement], **made)
+    steps = LONG if way == "killed" else STEPS
+    program = RUN.format(placement=PLACEMENTS[placement], steps=steps, **made)
     with subprocess.Popen(
         [sys.executable, "-c", program], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
     ) as running:
         deadline = time.monotonic() + STARTED_WITHIN
         while way == "killed" and running.poll() is None and time.monotonic() < deadline:
-            if path.exists() and path.stat().st_size > RECORDS:
+            time.sleep(0.5)
+            if all(stamp > RECORDED for stamp in _recorded(path, CAGES[name].operators).values()):
                 os.kill(running.pid, signal.SIGKILL)
                 break
-            time.sleep(0.02)
         running.communicate(timeout=STARTED_WITHIN)
+
+
+def _recorded(path: Path, operators: Iterable[str]) -> Mapping[str, int]:
+    """The last stamp that each operator has recorded; 0 for none."""
+    try:
+        with Recording(path) as recording:
+            log = FiringLog.read(recording)
+            return {o: max((record.stamp for record in log.of(o)), default=0) for o in operators}
+    except RecordingError:  # not there yet
+        return dict.fromkeys(operators, 0)
 
 
 def verdicts(path: Path) -> Mapping[str, str]:
@@ -65,8 +81,12 @@ def verdicts(path: Path) -> Mapping[str, str]:
     return {v.operator: report.verdict(v) for v in report.operators}
 
 
-def right(cage: Cage, placement: str) -> Mapping[str, str]:
-    return cage.verdicts if placement == "each" else cage.together
+def right(cage: Cage, way: str, placement: str) -> Mapping[str, str]:
+    verdicts = cage.verdicts if placement == "each" else cage.together
+    return {
+        o: "identical" if way == "killed" and use in AT_THE_END else verdicts[o]
+        for o, (use, _) in cage.operators.items()
+    }
 
 
 def main() -> int:
@@ -90,7 +110,7 @@ def main() -> int:
             cells = []
             for way, placement in columns:
                 verdict = found[way, placement][operator]
-                mistaken = verdict != right(cage, placement)[operator]
+                mistaken = verdict != right(cage, way, placement)[operator]
                 wrong, total = wrong + mistaken, total + 1
                 cells.append(f"{'! ' if mistaken else ''}{verdict} |")
             print(f"| {use} ({operator}, {name}) |" if use != operator else f"| {use} |", *cells, flush=True)

@@ -276,7 +276,7 @@ class Operator:
         return dict(self.state.counts) if issubclass(self.spec.state or object, Counts) else {}
 
     def finding(self) -> str:
-        """Returns in a line what is wrong with what was given, "" for nothing: for `dataflow top` and a run's end."""
+        """Returns in a line what is wrong with what was given, "" for nothing: for `top`, the log and a run's end."""
         return ""
 
     @classmethod

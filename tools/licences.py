@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 REPOSITORY = Path(__file__).resolve().parents[1]
 PARTS = ("", "perception", "view", "bags", "foxglove", "notebook", "sim", "torch", "train")
 """The dependencies that users install: those of the package itself, and its extras but `dev` and the unlisted."""
-UNLISTED = ("mcp", "ray")
+UNLISTED = ("lidar", "mcp", "ray", "realsense")
 """Extras that development does not install; what they bring cannot be looked up."""
 COPYLEFT = re.compile(r"\bA?GPL|(?<!Lesser )(?<!Library )General Public License", re.IGNORECASE)
 
@@ -72,8 +72,9 @@ imports nothing that is under the GPL or AGPL, directly or through what it impor
 wheel brings FFmpeg with x264 and x265 (GPL-2.0): with them tests encode clips of made patterns. Neither `dataflow` nor
 `operators` imports one of the two: video is decoded by OpenCV's FFmpeg, which has no such encoders.
 
-`[ray]` and `[mcp]` are not in the table: Ray is under Apache-2.0, fsspec under BSD-3-Clause, mcp under MIT; what
-mcp brings is under MIT, Apache-2.0, BSD and PSF-2.0.
+`[ray]`, `[mcp]`, `[lidar]` and `[realsense]` are not in the table: Ray and pyrealsense2 are under Apache-2.0, fsspec
+and velodyne-decoder under BSD-3-Clause, mcp under MIT; what mcp brings is under MIT, Apache-2.0, BSD and PSF-2.0, what
+velodyne-decoder brings under Apache-2.0, BSD and MIT, and libusb under LGPL-2.1, loaded at run time.
 """
 
 

@@ -55,7 +55,7 @@ class Line:
     ) -> None:
         """`made` is called before each call that is made again, `read` with the bytes of the inputs of each that is
         read."""
-        self._debugger = Debugger(recording, operator, graph)
+        self._debugger = Debugger(recording, operator, graph, most_bytes=0)  # `shots` holds what is needed
         self.node = node = self._debugger.node
         records = list(FiringLog.read(recording).ordered(node))
         self.records = [record for record in records if record.kind in CALLS]

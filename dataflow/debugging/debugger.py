@@ -16,6 +16,7 @@ from types import CodeType
 from typing import Any
 
 from dataflow.debugging.fired import Abandoned, Call, Fired, Made, Probe, Process, States, Through, call_of
+from dataflow.debugging.ring import MOST_BYTES as MOST_HELD
 from dataflow.debugging.ring import Held, Ring
 from dataflow.debugging.sources import Sources
 from dataflow.execution.calls import value_of
@@ -52,7 +53,7 @@ class DebugError(ReplayError):
 
 class Debugger:
     """One operator of a recorded run. `calls` are its recorded calls, in order; `at` is the one that was made last.
-    `live_effects`: a call outside that is not recorded is made.
+    `live_effects`: a call outside that is not recorded is made. `most_bytes`: of the messages of calls that are kept.
 
     Runs the operator in this process, which should have the environment of operators (`threads.environment`): what
     depends on the hashes of strings else repeats only by chance. Raises `DebugError`, `ReplayError`, `RecordingError`,
@@ -60,7 +61,13 @@ class Debugger:
     """
 
     def __init__(
-        self, recording: Recording, operator: str, graph: Graph | None = None, *, live_effects: bool = False
+        self,
+        recording: Recording,
+        operator: str,
+        graph: Graph | None = None,
+        *,
+        live_effects: bool = False,
+        most_bytes: int = MOST_HELD,
     ) -> None:
         self._recording, self._live_effects = recording, live_effects
         self.graph = graph_that_is_here(recording)[0] if graph is None else graph
@@ -80,10 +87,12 @@ class Debugger:
         """The stamp up to which records are read; None for all of them."""
         self._setup: FiringRecord | None = None
         """The record of the first `setup()`."""
-        self._ring = Ring()
+        self._ring = Ring(most_bytes)
         self._probe: Probe | None = None
         self._reached = -1
         self.at: Fired | None = None
+        self.between: Callable[[], object] = lambda: None
+        """Called behind each call that is made on the way to another; what it raises ends the way there."""
 
     # ------------------------------------------------------------------------------------------------- going
 
@@ -182,6 +191,12 @@ class Debugger:
         for held in self._onwards():
             if held.number >= number:
                 break
+            self.between()
+        return self._reached
+
+    @property
+    def reached(self) -> int:
+        """Returns the number of the call that was made last on a way; -1 where none was."""
         return self._reached
 
     def _nearest_kept(self, number: int) -> int:

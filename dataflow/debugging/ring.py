@@ -54,9 +54,10 @@ class Held:
 
 
 class Ring:
-    """The last calls, up to `MOST_CALLS` and `MOST_BYTES`, by their number."""
+    """The last calls, up to `MOST_CALLS` and `most_bytes`, by their number."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_bytes: int = MOST_BYTES) -> None:
+        self._most_bytes = most_bytes
         self._held: dict[int, Held] = {}
         self._holders: Counter[bytes] = Counter()
         self._nbytes = 0
@@ -70,7 +71,7 @@ class Ring:
         self.drop(held.number)
         self._held[held.number] = held
         self._count(held, 1)
-        while len(self._held) > MOST_CALLS or (self._nbytes > MOST_BYTES and len(self._held) > 1):
+        while len(self._held) > MOST_CALLS or (self._nbytes > self._most_bytes and len(self._held) > 1):
             self.drop(next(iter(self._held)))
 
     def drop(self, number: int) -> None:

@@ -31,6 +31,13 @@ class Device:
         return f"use: {self.use}\nparams: {{{params}}}"
 
 
+SERIAL = (
+    "if it is a satellite receiver (NMEA 0183), at the rate that it has; an IMU with VectorNav's messages: "
+    "use: operators.sources:VectorNavImu, baud: 115200"
+)
+"""A device file does not name what is connected to it."""
+
+
 def find_devices(root: Path = Path("/")) -> list[Device]:
     """Returns the cameras, then the serial devices. `root` is the folder that holds `dev` and `sys`."""
     return [*_cameras(root), *_serial_devices(root)]
@@ -40,12 +47,15 @@ def _cameras(root: Path) -> Iterator[Device]:
     for file in sorted((root / "dev").glob("video[0-9]*"), key=lambda file: (len(file.name), file.name)):
         about = root / "sys/class/video4linux" / file.name
         note = _refused(file, "video")
+        name = _text(about / "name")
         if _text(about / "index") not in ("", "0"):
             note = note or "further node of its device: may carry no images"
+        elif "RealSense" in name:
+            note = note or "with its depth: use: operators.sources:RealSense"
         yield Device(
             "camera",
             str(file),
-            _text(about / "name"),
+            name,
             "operators.sources:Webcam",
             {"input": str(file)},
             note,
@@ -64,7 +74,7 @@ def _serial_devices(root: Path) -> Iterator[Device]:
             _text((root / "sys/class/tty" / file.name / "device").resolve().parent / "product"),
             "operators.sources:NmeaGnss",
             {"input": str(path), "baud": 9600},
-            _refused(file, "dialout") or "if it is a satellite receiver (NMEA 0183), at the rate that it has",
+            _refused(file, "dialout") or SERIAL,
         )
 
 

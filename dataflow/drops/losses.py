@@ -67,6 +67,30 @@ def losses_of(node: Node, records: Sequence[FiringRecord], sent: Sent, static: f
     return sorted(found.values())
 
 
+def bursts_of(losses: Sequence[Loss], sent: Sent) -> list[list[Loss]]:
+    """Returns the losses by bursts: an operator lost every message of a stream between the first and the last, and what
+    it lost of its other streams meanwhile. They are ordered by their first losses."""
+    number = {(stream, stamp): k for stream, messages in sent.items() for k, (_, stamp) in enumerate(messages)}
+    runs: dict[tuple[str, str, str], list[list[Loss]]] = {}
+    for loss in sorted(losses):
+        here = runs.setdefault((loss.operator, loss.input, loss.stream), [])
+        before = number.get((loss.stream, here[-1][-1].stamp), -2) if here else -2
+        if number.get((loss.stream, loss.stamp)) == before + 1:
+            here[-1].append(loss)
+        else:
+            here.append([loss])
+    found: list[list[Loss]] = []
+    last: dict[str, list[Loss]] = {}
+    for run in sorted(run for each in runs.values() for run in each):
+        burst = last.get(run[0].operator)
+        if burst is not None and run[0].stamp <= max(loss.stamp for loss in burst):
+            burst += run
+        else:
+            last[run[0].operator] = run
+            found.append(run)
+    return found
+
+
 def _firings(records: Sequence[FiringRecord], name: str, stream: str) -> list[tuple[int, list[Place]]]:
     """Stamps of the firings, with what they were given of a stream; and of those that were none for want of it."""
     found: list[tuple[int, list[Place]]] = []

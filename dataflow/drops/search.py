@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.capture.reduce import needed, smallest
+from dataflow.capture.reduce import needed, shortest_end, smallest
 from dataflow.drops.branch import Branch, Figures
-from dataflow.drops.losses import Loss, losses_of, sent_by
+from dataflow.drops.losses import Loss, Sent, bursts_of, losses_of, sent_by
 from dataflow.drops.player import Player
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.threads import limited_threads
@@ -158,18 +158,18 @@ class Drops:
         began = time.monotonic()
         if not self.worse.is_true(self._recorded):
             raise DropsError(f"the recorded figures are not {self.worse.text}: {self.worse.values(self._recorded)}")
-        feeding, losses = self._plan()
+        feeding, losses, sent = self._plan()
         if not losses:
             raise DropsError("nothing was lost, or came late, between the sources and these figures")
         branch = self._branch(feeding, losses)
         try:
             with limited_threads(self.graph.threads):
-                return self._search(branch, feeding, losses, began)
+                return self._search(branch, feeding, bursts_of(losses, sent), began)
         finally:
             self._close()
 
-    def _plan(self) -> tuple[Feeding, list[Loss]]:
-        """The operators between losses and figures, with what feeds them, and the losses."""
+    def _plan(self) -> tuple[Feeding, list[Loss], Sent]:
+        """The operators between losses and figures, with what feeds them, the losses, and the messages sent."""
         graph = self.graph
         above = _above(graph, self.worse.operators)
         sent: dict[str, Sequence[tuple[tuple[int, int], int]]] = {}
@@ -184,7 +184,7 @@ class Drops:
         between = [name for name in graph.nodes if name in above and losing & _above(graph, [name])]
         inside = {s for name in between for s in graph.nodes[name].outputs.values()}
         outer = plan_feeding(self._recording, graph, between, incomplete=inside)
-        return outer, sorted(losses)
+        return outer, sorted(losses), sent
 
     def _branch(self, feeding: Feeding, losses: Sequence[Loss]) -> Branch:
         version = seeding_of(self._recording)
@@ -195,7 +195,8 @@ class Drops:
         self._players += players.values()
         return Branch(self._recording, self.graph, feeding, players, losses)
 
-    def _search(self, branch: Branch, feeding: Feeding, losses: Sequence[Loss], began: float) -> Cost:
+    def _search(self, branch: Branch, feeding: Feeding, bursts: Sequence[Sequence[Loss]], began: float) -> Cost:
+        losses = _flat(bursts)
         before = self._replay(branch, ())
         self._check(branch, before)
         best = self._replay(branch, losses)
@@ -215,9 +216,12 @@ class Drops:
             except (OperatorFailure, ReplayError):  # what comes then cannot be coped with, or gives no figure
                 return False
 
-        named = needed(losses, heals)
-        if in_time:
-            named = smallest(named, heals)
+        def heal(part: Sequence[Sequence[Loss]]) -> bool:
+            return heals(_flat(part))
+
+        named = _flat(needed(shortest_end(sorted(bursts, key=len), heal), heal))  # the longest of them at first
+        if in_time and len(named) > 1:
+            named = smallest(needed(named, heals), heals)
         undone = self._replay(branch, named)
         again = self._branch(feeding, losses)
         if self.worse.values(self._replay(again, named)) != self.worse.values(undone):
@@ -272,6 +276,11 @@ class Drops:
     def _close(self) -> None:
         for player in self._players:
             player.close()
+
+
+def _flat(bursts: Sequence[Sequence[Loss]]) -> list[Loss]:
+    """Returns the losses of some bursts, sorted."""
+    return sorted(loss for burst in bursts for loss in burst)
 
 
 def _above(graph: Graph, operators: Sequence[str]) -> set[str]:

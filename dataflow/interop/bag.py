@@ -70,12 +70,26 @@ class Bag(Protocol):
 
 def shortfalls(bag: Bag) -> list[str]:
     """Says of which topics a bag holds fewer messages than its metadata promise."""
-    found = []
+    return [_promise(*counts) for counts in _counts(bag) if counts[2] < counts[1]]
+
+
+def surpluses(bag: Bag) -> list[str]:
+    """Says of which topics a bag holds more messages than its metadata promise."""
+    return [_promise(*counts) for counts in _counts(bag) if counts[2] > counts[1]]
+
+
+def _counts(bag: Bag) -> Iterator[tuple[str, int, int]]:
+    """Of each topic that is promised: its name, how many messages are promised, and how many are there."""
     for name, promised in sorted(bag.promised.items()):
-        held = sum(t.count for t in bag.topics.values() if t.name == name or t.name.startswith(f"{name} ("))
-        if held < promised:
-            found.append(f"topic {name}: {promised:,} messages are promised, {held:,} are there")
-    return found
+        yield (
+            name,
+            promised,
+            sum(t.count for t in bag.topics.values() if t.name == name or t.name.startswith(f"{name} (")),
+        )
+
+
+def _promise(name: str, promised: int, held: int) -> str:
+    return f"topic {name}: {promised:,} messages are promised, {held:,} are there"
 
 
 def is_static(topic: str) -> bool:

@@ -45,9 +45,11 @@ def join(channels: Iterable[tuple[Key, Topic]]) -> Joined[Key]:
                 called = f"{name} ({topic.schema.name})"
                 while called in topics or called in named:
                     called += "'"
+                most = kinds[0][1]
+                what = "definitions" if topic.schema.name == most.schema.name else "types"
                 notes.append(
-                    f"topic {name} holds messages of two types: {topic.count:,} of {topic.schema.name} are the topic "
-                    f"{called!r} here, beside {kinds[0][1].count:,} of {kinds[0][1].schema.name}"
+                    f"topic {name} holds messages of two {what}: {topic.count:,} of {topic.schema.name} are the topic "
+                    f"{called!r} here, beside {most.count:,} of {most.schema.name}"
                 )
             topics[called] = replace(topic, name=called)
             owner |= dict.fromkeys(keys, called)

@@ -26,6 +26,8 @@ STAYS = 10
 """Messages before and after a step back that show it."""
 SOME = 10
 """A topic of which more than one in so many headers carries no time is stamped by the log, and all others with it."""
+UNITS_WITHIN = 0.2
+"""Of a thousand or a million, by which headers of another unit go on faster or more slowly than the log."""
 NEAR = 1_000_000_000
 """Headers that differ from log time by less (ns, in the middle) are of the recorder's own clock."""
 
@@ -112,7 +114,26 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     why = "when it was measured"
     if shift:
         why += f"; it runs {abs(typical) * 1e-9:.3f} s {'behind' if typical > 0 else 'ahead of'} the recorder's clock"
-    return Clock("header", why, shift, notes)
+    return Clock("header", why, shift, (*notes, *_other_units(with_header)))
+
+
+def _other_units(topics: Sequence[Times]) -> tuple[str, ...]:
+    """A note on topics whose headers go on a thousand or a million times as slowly, or as fast, as the log."""
+    for power in (-2, -1, 1, 2):
+        found = [t.topic for t in topics if not t.latched and abs(_pace(t) * 1000.0**-power - 1) < UNITS_WITHIN]
+        if found:
+            much = f"{1000 ** abs(power):,} times {'as slowly as' if power < 0 else 'faster than'} the log"
+            return (
+                f"the headers of {', '.join(found)} go on {much}: are they in another unit? --clock log plays by it",
+            )
+    return ()
+
+
+def _pace(times: Times) -> float:
+    """How much time the headers of a topic take in one second of the log; 1 where that is not known."""
+    assert times.header is not None
+    span, logged = (int(np.ptp(values)) if len(values) > STAYS else 0 for values in (times.header, times.log))
+    return span / logged if logged and (times.header > 0).all() else 1.0
 
 
 def _stays_back(times: Times) -> bool:

@@ -27,15 +27,15 @@ from dataflow.recording.streams.pixels import as_depth, as_millimetres
 
 def image_of(message: CompressedImage) -> Image:
     """Decodes a JPEG, PNG or WebP file."""
-    pixels = _decoded(message.data, message.format)
+    pixels = decoded(message.data, message.format)
     if pixels.dtype != np.uint8:
         pixels = (pixels >> 8).astype(np.uint8)
-    return Image(stamp=message.stamp, frame=message.frame, data=_rgb(pixels))
+    return Image(stamp=message.stamp, frame=message.frame, data=rgb(pixels))
 
 
 def depth_of(message: CompressedDepth) -> DepthImage:
     """Decodes a 16-bit PNG; 0 stays no return."""
-    units = _decoded(message.data, "png")
+    units = decoded(message.data, "png")
     known = units > 0
     metres = np.zeros(units.shape, np.float32)
     if message.quantizer == "linear":
@@ -48,10 +48,10 @@ def depth_of(message: CompressedDepth) -> DepthImage:
 
 def image16_of(message: CompressedImage) -> Image16:
     """Decodes a PNG of 16 bits; raises `RecordingError` for one of 8."""
-    pixels = _decoded(message.data, message.format)
+    pixels = decoded(message.data, message.format)
     if pixels.dtype != np.uint16:
         raise RecordingError(f"a {message.format} image of 8 bits is no Image16")
-    return Image16(stamp=message.stamp, frame=message.frame, data=_rgb(pixels))
+    return Image16(stamp=message.stamp, frame=message.frame, data=rgb(pixels))
 
 
 def upper_bits(message: Image16) -> Image:
@@ -119,7 +119,8 @@ def odometry_of(message: Pose) -> Odometry:
     )
 
 
-def _decoded(data: Any, format_: str) -> Any:
+def decoded(data: Any, format_: str) -> Any:
+    """The pixels of an encoded image, as OpenCV has them: BGR, of any depth. Raises `RecordingError`."""
     import cv2
 
     pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -128,7 +129,8 @@ def _decoded(data: Any, format_: str) -> Any:
     return pixels
 
 
-def _rgb(pixels: Any) -> Any:
+def rgb(pixels: Any) -> Any:
+    """Pixels of OpenCV as RGB or grey, without an alpha channel."""
     return np.ascontiguousarray(pixels[..., 2::-1]) if pixels.ndim == 3 else pixels
 
 

@@ -14,13 +14,15 @@ import zstandard
 
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
 from dataflow.interop.channels import join
+from dataflow.interop.zstd_frames import unpacked_message
 from dataflow.recording.streams.codecs import SchemaText
 
 NO_SCHEMA = SchemaText("", "", b"")
 
 
 class Db3Bag:
-    """Reads SQLite databases of rosbag2 whose topics belong together. What a write-ahead log (`-wal`) holds counts.
+    """Reads SQLite databases of rosbag2 whose topics belong together. What a write-ahead log (`-wal`) holds counts, and
+    a rollback journal (`-journal`) takes back what was half written.
 
     `compressed`: each message is a zstd frame.
     """
@@ -30,18 +32,20 @@ class Db3Bag:
         self.promised: Mapping[str, int] = {}
         self._databases: list[tuple[Path, sqlite3.Connection]] = []
         self._copies = TemporaryDirectory(prefix="dataflow-db3-")
-        self._decompress = zstandard.ZstdDecompressor().decompress if compressed else None
-        notes = []
+        self._decompress = unpacked_message if compressed else None
+        notes: list[str] = []
         try:
             for file in files:
                 self._databases.append((file, self._open(file)))
                 wal = file.with_name(f"{file.name}-wal")
                 if wal.is_file() and wal.stat().st_size:
                     notes.append(f"{file.name} was not closed by its recorder: what {wal.name} holds is read too")
+                if _half_written(file):
+                    notes.append(f"{file.name} was not closed by its recorder: what it wrote last is taken back")
             joined = join(
                 ((number, identity), topic)
                 for number, (file, database) in enumerate(self._databases)
-                for identity, topic in self._channels(file, database)
+                for identity, topic in self._channels(file, database, notes)
             )
         except BaseException:
             self.close()
@@ -50,23 +54,26 @@ class Db3Bag:
         self.notes: tuple[str, ...] = (*notes, *joined.notes)
 
     def _open(self, file: Path) -> sqlite3.Connection:
-        """Opens a database read-only; a copy of one with a write-ahead log where its folder cannot be written to."""
+        """Opens a database read-only; a copy of one that is rolled back, or that has a write-ahead log where its folder
+        cannot be written to."""
         wal = file.with_name(f"{file.name}-wal")
-        logged = wal.is_file() and wal.stat().st_size > 0
+        logged, half = wal.is_file() and wal.stat().st_size > 0, _half_written(file)
         try:
-            return _connected(file, immutable=not logged)
+            if not half:
+                return _connected(file, "mode=ro" if logged else "immutable=1")
         except sqlite3.Error as error:
             if not logged or not isinstance(error, sqlite3.OperationalError):
                 raise self._broken(file, error) from error
         copy = Path(self._copies.name) / file.name
         shutil.copyfile(file, copy)
-        shutil.copyfile(wal, copy.with_name(f"{copy.name}-wal"))
+        beside = "-journal" if half else "-wal"
+        shutil.copyfile(file.with_name(f"{file.name}{beside}"), copy.with_name(f"{copy.name}{beside}"))
         try:
-            return _connected(copy, immutable=False)
+            return _connected(copy, "mode=rw" if half else "mode=ro")
         except sqlite3.Error as error:
             raise self._broken(file, error) from error
 
-    def _channels(self, file: Path, database: sqlite3.Connection) -> Iterator[tuple[int, Topic]]:
+    def _channels(self, file: Path, database: sqlite3.Connection, notes: list[str]) -> Iterator[tuple[int, Topic]]:
         try:
             tables = {row[0] for row in database.execute("select name from sqlite_master where type = 'table'")}
             if not {"messages", "topics"} <= tables:
@@ -86,9 +93,12 @@ class Db3Bag:
             spans = {
                 row[0]: row[1:]
                 for row in database.execute(
-                    "select topic_id, count(*), min(timestamp), max(timestamp) from messages group by topic_id"
+                    f"select topic_id, count(*), min(timestamp), max(timestamp) from messages where {_WHOLE} group by 1"
                 )
             }
+            (odd,) = database.execute(f"select count(*) from messages where not {_WHOLE}").fetchone()
+            if odd:
+                notes.append(f"{file.name}: rows without a whole time or bytes, which are no messages: {odd:,}")
             query = f"select id, name, type, serialization_format, {qos} from topics"
             for identity, name, kind, encoding, profiles in database.execute(query):
                 held, first, last = spans.pop(identity, (0, None, None))
@@ -127,7 +137,10 @@ class Db3Bag:
         if not names:
             return
         marks = ", ".join("?" * len(names))
-        query = f"select topic_id, timestamp, data from messages where topic_id in ({marks}) order by timestamp, id"
+        query = (
+            f"select topic_id, timestamp, data from messages where topic_id in ({marks}) and {_WHOLE} "
+            "order by timestamp, id"
+        )
         try:
             for identity, log_time, data in database.execute(query, list(names)):
                 yield log_time, names[identity], data if self._decompress is None else self._decompress(data)
@@ -147,8 +160,21 @@ class Db3Bag:
         self._copies.cleanup()
 
 
-def _connected(file: Path, *, immutable: bool) -> sqlite3.Connection:
-    how = "immutable=1" if immutable else "mode=ro"
+_WHOLE = "(typeof(timestamp) = 'integer' and typeof(data) = 'blob')"
+"""What a row has to hold; SQLite takes values of any type in any column."""
+_JOURNAL = bytes.fromhex("d9d505f920a163d7")
+
+
+def _half_written(file: Path) -> bool:
+    """Tells whether a rollback journal beside a database waits to be played back (SQLite file format 3)."""
+    journal = file.with_name(f"{file.name}-journal")
+    if not journal.is_file():
+        return False
+    with journal.open("rb") as opened:
+        return opened.read(len(_JOURNAL)) == _JOURNAL
+
+
+def _connected(file: Path, how: str) -> sqlite3.Connection:
     database = sqlite3.connect(f"{file.absolute().as_uri()}?{how}", uri=True, check_same_thread=False)
     try:
         database.execute("select count(*) from sqlite_master").fetchone()

@@ -12,6 +12,7 @@ from mcap.records import Channel
 
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
 from dataflow.interop.channels import join
+from dataflow.interop.zstd_frames import unpacked_message
 from dataflow.recording.layout import Kind
 from dataflow.recording.mcap.cache import ChunkCache
 from dataflow.recording.mcap.index import NO_END, McapFile
@@ -30,7 +31,7 @@ class McapBag:
         self.promised: Mapping[str, int] = {}
         self.files: list[McapFile] = []
         cache = ChunkCache()
-        self._decompress = zstandard.ZstdDecompressor().decompress if compressed else None
+        self._decompress = unpacked_message if compressed else None
         try:
             for file in files:
                 self.files.append(McapFile(file, cache=cache))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
-from dataflow.interop.bag import Bag, BagError, shortfalls
+from dataflow.interop.bag import Bag, BagError, shortfalls, surpluses
 from dataflow.interop.mcap_bag import McapBag
 from dataflow.interop.unpacking import Unpacked, unpack
 from dataflow.recording.layout import RECORDING
@@ -20,6 +21,10 @@ RERUN_MAGICS = (b"RRF2", b"RRIO")
 WRITER = b"robot-dataflow/"
 """Our library in the header of an MCAP; what others made of one of our files may name theirs."""
 HEAD_BYTES = 128
+_PART = re.compile(r"(.*?)_?(?:\d{4}(?:-\d\d){5})?_\d+\.bag")
+"""The name that `rosbag record --split` gives to a part: prefix, date and number."""
+ARCHIVES = ((b"\x1f\x8b", "gzip"), (b"PK\3\4", "zip"), (b"BZh", "bzip2"), (b"\xfd7zXZ", "xz"))
+DATASETS = "folders of datasets (TUM, EuRoC, KITTI) are read by sources of a graph: `dataflow operators` lists them"
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
@@ -42,7 +47,7 @@ def bag_at(path: Path) -> Bag:
     if head.startswith(MAGIC):
         return McapBag(path, [path])
     if head.startswith(ROS1_MAGIC):
-        return _ros_bag(_with_suffix(path, ".bag"))
+        return _ros_bag(path, [_with_suffix(path, ".bag")])
     if head.startswith(SQLITE_MAGIC):
         return _of_files(path, ".db3", [path])
     if head.startswith(RERUN_MAGICS):
@@ -52,6 +57,7 @@ def bag_at(path: Path) -> Bag:
     if head.startswith(ZSTD_MAGIC):
         return _of_files(path, Path(path.stem).suffix, [path])
     begins = f"it begins with {head[:8].hex(' ')}" if head else "it is empty"
+    begins = next((f"it is a {name} file, to be unpacked first" for m, name in ARCHIVES if head.startswith(m)), begins)
     raise BagError(
         f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag), "
         "ROS 2 bags (a folder with metadata.yaml, .db3 or .mcap) and Rerun files (.rrd)"
@@ -81,10 +87,13 @@ def is_ros_bag(path: Path) -> bool:
     return path.is_file() and _head(path).startswith((ROS1_MAGIC, SQLITE_MAGIC))
 
 
-def _ros_bag(path: Path) -> Bag:
+def _ros_bag(path: Path, files: list[Path]) -> Bag:
+    """Opens a ROS 1 bag; several files where their names say that they are parts of one (`rosbag record --split`)."""
     from dataflow.interop.ros_bags import RosBag  # rosbags takes long to import, and most files are no such bags
 
-    return RosBag(path)
+    if len({found[1] if (found := _PART.fullmatch(file.name)) else file.name for file in files}) > 1:
+        raise BagError(f"{path} holds {len(files)} .bag files, which are separate recordings; name one")
+    return RosBag(path, files)
 
 
 def _head(path: Path) -> bytes:
@@ -110,17 +119,19 @@ def _open_folder(path: Path) -> Bag:
     if kinds:
         bag = _of_files(path, kinds[0], files[kinds[0]], compressed=folder.message_compression)
         bag.promised = {**bag.promised, **folder.promised}
-        bag.notes = (*folder.notes, *bag.notes)
+        bag.notes = (*folder.notes, *bag.notes, *surpluses(bag))
         return bag
-    if len(files[".bag"]) == 1:
-        return _ros_bag(files[".bag"][0])
     if files[".bag"]:
-        raise BagError(f"{path} holds {len(files['.bag'])} .bag files, which are separate recordings; name one")
+        return _ros_bag(path, files[".bag"])
     if folder.named:
         raise BagError(
             f"{path}: {METADATA} names {', '.join(folder.named)}, and the folder holds no .mcap or .db3 file"
         )
-    raise BagError(f"{path} is a folder without a bag: it holds no metadata.yaml, .mcap, .db3 or .bag file")
+    inside = sorted(p.name for p in path.iterdir() if p.is_dir() and any(any(p.glob(f"*{s}")) for s in BAG_SUFFIXES))
+    raise BagError(
+        f"{path} is a folder without a bag: it holds no metadata.yaml, .mcap, .db3 or .bag file"
+        + (f"; its folders {', '.join(inside)} do: name one" if inside else f"; {DATASETS}")
+    )
 
 
 def _of_files(path: Path, suffix: str, files: list[Path], *, compressed: bool = False) -> Bag:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,12 +49,21 @@ def read_folder(path: Path) -> Folder:
     if mode.lower() in ("message", "file") and kind != "zstd":
         found.notes.append(f"{METADATA} names the compression {kind!r}; zstd is known")
     paths = facts.get("relative_file_paths")
-    found.named = tuple(Path(str(p)).name for p in paths) if isinstance(paths, list) else ()
+    found.named = tuple(dict.fromkeys(Path(str(p)).name for p in paths)) if isinstance(paths, list) else ()
     return found
 
 
 def _rows(value: Any) -> list[Mapping[str, Any]]:
     return [row for row in value if isinstance(row, Mapping)] if isinstance(value, list) else []
+
+
+def absent_parts(files: Sequence[Path]) -> list[str]:
+    """Notes the gaps in the numbers at the end of the names of files, parts of one recording in their order."""
+    numbers = [int(found[1]) for file in files if (found := re.search(r"_(\d+)\.[^_]*$", file.name))]
+    absent = sorted({*range(min(numbers, default=0), max(numbers, default=0))} - {*numbers})
+    if len(numbers) != len(files) or len(absent) >= len(numbers):
+        return []
+    return [f"the files are numbered, and {', '.join(map(str, absent))} is not there"] if absent else []
 
 
 def natural(path: Path) -> list[tuple[int, str]]:
@@ -82,6 +91,7 @@ def bag_files(path: Path, suffix: str, folder: Folder) -> list[Path]:
         if others:
             folder.notes.append(f"left out, since {METADATA} does not name them: {', '.join(others)}")
         return present
+    folder.notes += [] if missing else absent_parts(found)
     return found
 
 

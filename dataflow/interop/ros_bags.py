@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+import heapq
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -12,38 +14,40 @@ from rosbags.rosbag1 import Reader, ReaderError
 
 from dataflow.interop.bag import BagError, Stored, Topic, is_latched
 from dataflow.interop.channels import join
+from dataflow.interop.ros2_folder import absent_parts
 from dataflow.recording.streams.codecs import SchemaText
 
 
 class RosBag:
-    """Reads one ROS 1 bag file."""
+    """Reads ROS 1 bag files whose topics belong together: one, or those of a split recording."""
 
-    kind = "ROS 1 bag"
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._reader: Any = None
-        try:
-            reader: Any = Reader(path)
-            reader.open()
-            self._reader = reader
-        except (ReaderError, AssertionError, UnicodeDecodeError) as error:
-            raise BagError(f"{path}: {_reason(path, error)}") from error
-        except OSError:
-            raise
-        except Exception as error:  # the library raises whatever broken bytes make it raise
-            raise BagError(
-                f"{path} cannot be opened as a bag: {type(error).__name__}: {error}; {_saved(path)}"
-            ) from error
-        times = self._times()
-        joined = join((c.id, self._topic(c, times.get(c.id))) for c in reader.connections)
-        self.topics, self._owner = joined.topics, joined.owner
-        self.notes: tuple[str, ...] = joined.notes
+    def __init__(self, path: Path, files: Sequence[Path]) -> None:
+        self.path, self.kind = path, "ROS 1 bag" + (f", {len(files)} files" if len(files) > 1 else "")
+        self._readers: list[Any] = []
         self.promised: Mapping[str, int] = {}
+        try:
+            for file in files:
+                self._readers.append(_opened(file))
+            joined = join(
+                ((number, c.id), self._topic(c, reader.indexes.get(c.id)))
+                for number, reader in enumerate(self._readers)
+                for c in reader.connections
+            )
+        except BaseException:
+            self.close()
+            raise
+        self.topics, self._owner = joined.topics, joined.owner
+        self.notes: tuple[str, ...] = (*absent_parts(files), *joined.notes)
+        promised: Counter[str] = Counter()
+        for reader in self._readers:
+            names = {c.id: c.topic for c in reader.connections}
+            for chunk in reader.chunk_infos:
+                promised.update({names[number]: held for number, held in chunk.connection_counts.items()})
+        self.promised = promised
 
-    def _topic(self, connection: Connection, span: tuple[int, int] | None) -> Topic:
+    def _topic(self, connection: Connection, index: Sequence[Any] | None) -> Topic:
         assert isinstance(connection.ext, ConnectionExtRosbag1)
-        first, last = span or (None, None)
+        first, last = (index[0].time, index[-1].time) if index else (None, None)
         return Topic(
             connection.topic,
             "ros1",
@@ -56,28 +60,41 @@ class RosBag:
             {},
         )
 
-    def _times(self) -> dict[int, tuple[int, int]]:
-        """The first and last log time by connection of a ROS 1 bag, from its index."""
-        return {number: (rows[0].time, rows[-1].time) for number, rows in self._reader.indexes.items() if rows}
-
     def messages(self, topics: Collection[str]) -> Iterator[Stored]:
         """Every message of some topics, in the order of log times."""
-        chosen = [c for c in self._reader.connections if self._owner[c.id] in topics]
-        if not chosen:
-            return
         counters = {name: count() for name in topics}
+        merged = heapq.merge(*(self._one(number, topics) for number in range(len(self._readers))), key=lambda m: m[0])
+        for log_time, name, data in merged:
+            yield Stored(name, next(counters[name]), log_time, data)
+
+    def _one(self, number: int, topics: Collection[str]) -> Iterator[tuple[int, str, bytes]]:
+        reader = self._readers[number]
+        chosen = [c for c in reader.connections if self._owner[number, c.id] in topics]
         try:
-            for connection, log_time, data in self._reader.messages(connections=chosen):
-                name = self._owner[connection.id]
-                yield Stored(name, next(counters[name]), log_time, data)
+            for connection, log_time, data in reader.messages(connections=chosen) if chosen else ():
+                yield log_time, self._owner[number, connection.id], data
         except (ReaderError, AssertionError) as error:
-            raise BagError(f"{self.path}: {_reason(self.path, error)}") from error
+            raise BagError(f"{reader.path}: {_reason(reader.path, error)}") from error
 
     def close(self) -> None:
         """Closes the files. Idempotent."""
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
+        for reader in self._readers:
+            reader.close()
+        self._readers.clear()
+
+
+def _opened(file: Path) -> Reader:
+    """A bag file, opened; raises `BagError`, `OSError`."""
+    try:
+        reader = Reader(file)
+        reader.open()
+    except (ReaderError, AssertionError, UnicodeDecodeError) as error:
+        raise BagError(f"{file}: {_reason(file, error)}") from error
+    except OSError:
+        raise
+    except Exception as error:  # the library raises whatever broken bytes make it raise
+        raise BagError(f"{file} cannot be opened as a bag: {type(error).__name__}: {error}; {_saved(file)}") from error
+    return reader
 
 
 def _reason(path: Path, error: Exception) -> str:

@@ -15,7 +15,7 @@ from dataflow.lint.material import Material
 from dataflow.lint.motion import check_motion
 from dataflow.lint.publishers import check_publishers
 from dataflow.lint.quantities import check_quantities
-from dataflow.lint.timing import Timing, check_ends, check_gaps, check_order, timing_of
+from dataflow.lint.timing import Timing, check_ends, check_gaps, check_order, check_unit, timing_of
 from dataflow.lint.turning import READERS, Turning, turning_of
 
 SIGMAS = 3.0
@@ -78,6 +78,7 @@ def lint(material: Material, contract: Contract | None = None, *, clocks: bool =
             wanted = terms.terms_of(name, material.namespace)
             if facts.type != "Transforms":  # several may publish transforms on one topic, each by its own clock
                 report.findings += check_order(name, stamps)
+            report.findings += check_unit(name, timing)
             report.findings += check_gaps(name, stamps, timing, None if wanted is None else wanted.max_gap)
     report.findings += check_ends(report.timings)
     report.findings += check_quantities(material, report.timings)

@@ -16,6 +16,8 @@ STEADY = 0.35
 """The spread of the intervals, as a share of the period, up to which a stream has a rate."""
 FEWEST = 8
 """Messages from which on a stream can have a rate."""
+FASTEST = 10_000.0
+"""Hz; inertial sensors, the fastest, have up to 8,000."""
 APART = 1.0
 """Seconds by which a stream may begin later or end earlier than the others."""
 
@@ -66,6 +68,13 @@ def check_order(stream: str, stamps: Stamps) -> Iterator[Finding]:
         text = f"{back.size:,} timestamps go back, by up to {_seconds(largest)}"
         values = {"messages": int(back.size), "largest_s": largest}
         yield Finding("backward", stream, "error", text, int(stamps[back[0] + 1]), values)
+
+
+def check_unit(stream: str, timing: Timing) -> Iterator[Finding]:
+    """A rate that no sensor has, as of timestamps in micro- or milliseconds that are read as nanoseconds."""
+    if timing.steady and timing.rate > FASTEST:
+        text = f"{timing.rate:,.0f} messages a second: are its timestamps in micro- or milliseconds? ns is wanted"
+        yield Finding("unit", stream, "warning", text, timing.first, {"rate_hz": timing.rate})
 
 
 def check_gaps(stream: str, stamps: Stamps, timing: Timing, longest: float | None = None) -> Iterator[Finding]:

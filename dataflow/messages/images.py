@@ -77,7 +77,7 @@ class CompressedImage(Message):
 
     def validate(self) -> None:
         head = self.data[:12].tobytes()
-        found = _signature(head)
+        found = file_format(head)
         if found != self.format:
             raise MessageError(
                 f"CompressedImage.data must hold a {self.format} file, got {len(self.data)} bytes that begin with "
@@ -187,7 +187,7 @@ class CompressedDepth(Message):
         return "png", self.data.tobytes()
 
 
-def _signature(head: bytes) -> str | None:
+def file_format(head: bytes) -> str | None:
     """The format of an encoded image by its first 12 bytes."""
     if head.startswith(b"\xff\xd8\xff"):
         return "jpeg"

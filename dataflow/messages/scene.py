@@ -30,6 +30,13 @@ class SceneGraph(Message):
     subjects: I32 = array("int32", "M", "subject of each relation, an index into the nodes")
     objects: I32 = array("int32", "M", "object of each relation, an index into the nodes")
     relation_scores: F32 | None = array("float32", "M", "confidence in each relation, [0, 1]", default=None)
+    moving: F32 | None = array(
+        "float32",
+        "N",
+        "probability that each node moves, [0, 1]; NaN where its places alone tell",
+        default=None,
+        added=True,
+    )
     tracks: I64 | None = array(
         "int64", "T", "ids of tracks in images that are of nodes, by node, latest last", default=None, added=True
     )
@@ -49,6 +56,7 @@ class SceneGraph(Message):
         within_length(self, "track_nodes", nodes, f"index the {nodes} nodes")
         within(self, 0.0, float("inf"), "sizes")
         within(self, 0.0, 1.0, "scores", "relation_scores")
+        within(self, 0.0, 1.0, "moving", nan=True)
         unit_quaternions(self, "orientations")
 
     @property

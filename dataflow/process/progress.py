@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -89,10 +90,17 @@ class Progress:
         waits = {name: found for name, found in _waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
         fired: list[SourceRunner | Runner] = [*self._driver.sources, *changed]
-        self.found |= {each.node.name: each.operator.finding() for each in fired}
+        for each in fired:
+            self._find(each.node.name, each.operator.finding())
         self.behind = self._live.behind()
         news = {"done": done, "counts": counts, "drops": drops, "waits": waits, "behind": self.behind}
         self._channel.send("progress", **news, first=_first(self._driver))
+
+    def _find(self, operator: str, text: str) -> None:
+        """Keeps an operator's finding, and logs it where there was none: viewers show the log."""
+        if text and not self.found.get(operator):
+            logging.getLogger(__name__).warning(text, extra={"operator": operator})
+        self.found[operator] = text
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""

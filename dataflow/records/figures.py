@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -28,6 +29,14 @@ def figure(name: str, value: Any) -> tuple[str, str, str]:
         unit = ""
     text = f"{value:.4g}" if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)
     return name.replace("_", " "), text, _UNITS.get(unit, "")
+
+
+def words_of(name: str) -> set[str]:
+    """Returns the words of a figure's name, without those of its operator ("operator: name").
+
+    "trajectory_score: ate_rmse_m" → {"ate", "rmse", "m"}.
+    """
+    return set(re.findall("[a-z]+[0-9]*", name.partition(": ")[2] or name))
 
 
 def figures(summary: Mapping[str, Any]) -> dict[str, str]:

@@ -34,6 +34,8 @@ PARTS = 6
 """Files into which the time to keep is divided."""
 MOST_REASONS = 100
 """Triggers that one recording names."""
+RECORDS_WITHIN = 30.0
+"""Seconds after the end of a span for which it waits, at most, for the firing records of its messages."""
 SHORTEST = 1_000_000_000
 """Event time of a file, at least (ns)."""
 
@@ -68,6 +70,8 @@ class FlightSink:
         self._clock = 0
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
+        self._recorded: dict[str, int] = {}
+        """The last stamp of which each operator's firing records tell."""
         self._forgotten = False
         self._work = FlightFiles(graph, self._storage.mode)
         self._segments: deque[Segment] = deque()
@@ -102,6 +106,8 @@ class FlightSink:
             self._trigger(reason, message.stamp)
 
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
+        made = (message.stamp for record in records for message in record.outputs if message is not None)
+        self._recorded[operator] = max((records[-1].stamp, *made))
         if self._sink is None:
             self.lost.firings += sum(record.kind in CALLS for record in records)
         self._store(lambda sink: sink.firings(operator, records[-1].stamp, payload))
@@ -268,16 +274,24 @@ class FlightSink:
         if self._clock <= wanted.due:
             return False
         wanted.over = wanted.over or time.monotonic()
-        return bool(time.monotonic() - wanted.over >= self._options["settle"])
+        waited = time.monotonic() - wanted.over
+        behind = any(
+            self._recorded.get(self.graph.streams[stream].node, 0) < min(message.stamp, wanted.due)
+            for stream, (message, _, _) in self._newest.items()
+        )
+        return bool(waited >= (RECORDS_WITHIN if behind else self._options["settle"]))
 
     def _trigger(self, reason: dict[str, Any], stamp: int) -> None:
-        """Asks to keep what was before and will be after `stamp`; what is asked for meanwhile becomes one."""
+        """Asks to keep what was before now and will be after; what is asked for meanwhile becomes one.
+
+        Now is the newest stamp that came, not `stamp`: a run that is paused, or slower than the clock, is behind it.
+        """
         reason = {**reason, "stamp": stamp}
         if self._wanted is None and len(self._kept) >= self.flight.files:
             self._refused += 1
             return
         if self._wanted is None:
-            self._wanted = Wanted(max(stamp, self._clock) - self.flight.keep, self._clock + self.flight.after)
+            self._wanted = Wanted(self._clock - self.flight.keep, self._clock + self.flight.after)
         elif self._clock + self.flight.after - self._wanted.start <= 2 * (self.flight.keep + self.flight.after):
             self._wanted.due = max(self._wanted.due, self._clock + self.flight.after)
         if len(self._wanted.reasons) < MOST_REASONS:

@@ -164,6 +164,7 @@ class PartsSink:
 
     def close(self, outcome: str) -> Mapping[str, Any]:
         """Completes the last part."""
+        self._introduce_all()
         self._close_full()
         if (part := self._current) is not None:
             self._current = None
@@ -242,6 +243,7 @@ class PartsSink:
         return next(name for name in names if not name.exists())
 
     def _split(self, start: int) -> None:
+        self._introduce_all()
         self._close_full()
         self._full, self._current = self._current, None
         assert self._full is not None
@@ -307,13 +309,17 @@ class PartsSink:
             part.path.unlink(missing_ok=True)
 
     def _keep_to_limit(self) -> None:
-        """Deletes the oldest parts while all together take more of the disk than they may."""
+        """Deletes the oldest parts while all together take more of the disk than they may; the newest one stays."""
         most = self._storage.keep
-        while most is not None and (self._earlier or self._closed) and self.size > most:
+        while most is not None and self._has_older() and self.size > most:
             oldest = next(iter(self._earlier)) if self._earlier else self._closed.pop(0).path
             self._earlier.pop(oldest, None)
             oldest.unlink(missing_ok=True)
             self._deleted += 1
+
+    def _has_older(self) -> bool:
+        older = len(self._earlier) + len(self._closed)
+        return older > (0 if any(self._open_parts()) else 1)
 
     # Firing records
 
@@ -323,14 +329,24 @@ class PartsSink:
         if part is None:
             self.lost.firings += calls
         else:
-            if part is self._current and operator not in self._introduced:
-                self._introduced.add(operator)
-                for before in consecutive(holding(self._folded.get(operator, ()), self._held.get(operator, ()))):
-                    told = partial(part.sink.firings, operator, part.start or 0, encode_batch(before))
-                    self._store(part, told)
+            if part is self._current:
+                self._introduce(part, operator)
             self._store(part, lambda: part.sink.firings(operator, records[-1].stamp, payload, calls=calls))
         if self._continues:
             self._folded[operator] = folded([*self._folded.get(operator, ()), *records])
+
+    def _introduce(self, part: Part, operator: str) -> None:
+        """Puts what stands in for the operator's records before a part into it, once."""
+        if operator not in self._introduced:
+            self._introduced.add(operator)
+            for before in consecutive(holding(self._folded.get(operator, ()), self._held.get(operator, ()))):
+                self._store(part, partial(part.sink.firings, operator, part.start or 0, encode_batch(before)))
+
+    def _introduce_all(self) -> None:
+        """Does so for those that have not been called in the current part: their records may still come, or none."""
+        for operator in self._folded:
+            if self._current is not None:
+                self._introduce(self._current, operator)
 
     # Failures
 

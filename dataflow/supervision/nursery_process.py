@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import importlib
 import os
 import signal
 import socket
@@ -36,7 +37,7 @@ MOST_DESCRIPTORS = 253
 """As many as one message on a Unix socket carries."""
 MORE, SPAWN, ENVIRONMENT = b"+", b"s", b"e"
 """A request: descriptors, of which more follow; the last ones for a process that is to be started; a file with the
-environment of the processes to come."""
+environment of the processes to come and the libraries to load for them."""
 PRELOAD = (
     "dataflow.process.operator_process",
     "dataflow.process.log_pipe",
@@ -111,10 +112,17 @@ def serve(connection: socket.socket) -> None:
 
 
 def _take_environment(descriptor: int) -> None:
-    """Takes over the environment in a file, as if this process had been started with it: PYTHONPATH, too."""
+    """Takes over the environment in a file, as if this process had been started with it: PYTHONPATH, too. Then loads
+    libraries once for all processes to come; one that cannot be loaded is left to the operator that needs it."""
     with open(descriptor, "rb") as file:
         file.seek(0)
-        take_over(msgpack.unpackb(file.read(), raw=True))
+        environment, libraries = msgpack.unpackb(file.read(), raw=True)
+    take_over(environment)
+    for name in libraries:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name.decode())
+    gc.collect()
+    gc.freeze()
 
 
 def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: int) -> None:
@@ -201,8 +209,6 @@ def _outlive(children: dict[int, int]) -> None:
 def main(descriptor: int) -> None:
     """Runs the nursery process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    import importlib
-
     from dataflow.process import stacks
 
     stacks.ignore()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.records.figures import words_of
 from dataflow.sweep.plan import Task
 from dataflow.sweep.table import Store
 
@@ -17,8 +18,8 @@ DRAWS = 10_000
 """Samples of the recordings, with replacement, from which an interval is taken."""
 BLOCK = 1 << 20
 """Numbers drawn at a time."""
-LOWER_IS_BETTER = ("error", "rmse", "drift", "lost", "dropped")
-HIGHER_IS_BETTER = ("precision", "recall", "f1", "iou", "accuracy", "score")
+LOWER_IS_BETTER = frozenset({"error", "rmse", "ate", "rpe", "drift", "lost", "dropped", "unmatched"})
+HIGHER_IS_BETTER = frozenset({"precision", "recall", "f1", "ap50", "iou", "miou", "accuracy"})
 FloatArray = NDArray[np.float64]
 ALPHA = 0.05
 
@@ -88,8 +89,7 @@ def _paired(figure: str, given: Mapping[str, tuple[float, float]]) -> Paired:
     differences = values[:, 1] - values[:, 0]
     low, high = np.quantile(_means(differences), (0.025, 0.975))
     p = float(wilcoxon(differences).pvalue) if differences.any() else 1.0
-    words = figure.replace(":", " ").split()
-    lower, higher = any(w in LOWER_IS_BETTER for w in words), any(w in HIGHER_IS_BETTER for w in words)
+    lower, higher = bool(LOWER_IS_BETTER & words_of(figure)), bool(HIGHER_IS_BETTER & words_of(figure))
     named = list(zip(pairs, differences.tolist(), strict=True))
     named.sort(key=lambda pair: (-pair[1] if lower else pair[1] if higher else -abs(pair[1]), pair[0]))
     a, b = values.mean(axis=0).tolist()

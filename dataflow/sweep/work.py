@@ -163,15 +163,16 @@ def replayed(report: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
                 **{key: counts[key] for key in ("firings", "emitted", "dropped", "cpu_ms", "wall_ms")},
                 "restarts": report["restarts"].get(name, 0),
                 "digest": xxhash.xxh3_128_hexdigest("\n".join(own).encode()) if own else None,
-                "figures": _numbers(report["summaries"].get(name, {})),
+                "figures": numbers(report["summaries"].get(name, {})),
             }
         )
     more = {name for name in report["summaries"] if name not in report["operators"]}
-    rows += [{"operator": name, "figures": _numbers(report["summaries"][name])} for name in sorted(more)]
+    rows += [{"operator": name, "figures": numbers(report["summaries"][name])} for name in sorted(more)]
     return tuple(rows)
 
 
-def _numbers(summary: Mapping[str, Any]) -> dict[str, float]:
+def numbers(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Returns the figures of a summary that are numbers, also where JSON has words for them."""
     named = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
     values = {name: named.get(v, v) if isinstance(v, str) else v for name, v in summary.items()}
     return {name: float(v) for name, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)}

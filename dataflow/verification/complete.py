@@ -17,7 +17,7 @@ from typing import Any
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA
+from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA, logs_topic
 from dataflow.recording.streams.copying import Origin
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import decode_batch
@@ -184,7 +184,9 @@ class _Store:
                 self.sink.writer.add_attachment(origin.file.attachment(place))
         self._copied = 0
         self._taken = {stream: Places() for stream in self.streams}
-        for stream in sorted(recording.streams.keys() - graph.streams.keys()):
+        for said, line in recording.logs():
+            self.sink.writer.write_log(said, line)
+        for stream in sorted(recording.streams.keys() - {*graph.streams, logs_topic(graph.namespace)}):
             self._copy(recording, stream)
 
     def _copy(self, recording: Recording, stream: str) -> None:

@@ -372,6 +372,8 @@ def _span(recording: Recording, start: float | None) -> tuple[int, int]:
         first = first if part.start is None else part.start
         last = last if part.end is None else min(last, part.end)
     begin = first + round((start or 0.0) * 1e9)
+    if start is None and last < first:
+        raise ReplayError(f"{recording.path}: it has no message from the stamp {first} on: there is nothing to verify")
     if not first <= begin <= last:
         raise ReplayError(f"--start {start:g}: the recording is {(last - first) * 1e-9:.3g} s long")
     return begin, last

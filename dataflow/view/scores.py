@@ -8,6 +8,7 @@ from typing import Any
 import rerun as rr
 
 from dataflow.graph.model import Graph
+from dataflow.operator import FINDING
 from dataflow.records.figures import figures
 
 SCORES = "/viewer/scores"
@@ -18,9 +19,14 @@ Summaries = Mapping[str, Mapping[str, Any]]
 
 
 def scores_of(summaries: Summaries, graph: Graph | None) -> Summaries:
-    """Returns those of operators without outputs, which only judge; those of others are in the report of the run."""
+    """Returns those of operators without outputs, which only judge, after what any operator found wrong with its input.
+
+    Other figures of operators with outputs are in the report of the run.
+    """
     nodes = graph.nodes if graph is not None else {}
-    return {name: found for name, found in summaries.items() if found and not (name in nodes and nodes[name].outputs)}
+    wrong = {name: {FINDING: found[FINDING]} for name, found in summaries.items() if FINDING in found}
+    judged = {name: found for name, found in summaries.items() if found and not (name in nodes and nodes[name].outputs)}
+    return {**wrong, **judged}
 
 
 def document(summaries: Summaries) -> rr.TextDocument:

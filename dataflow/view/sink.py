@@ -156,7 +156,7 @@ class ViewerSink:
         return True
 
     def scores(self, summaries: Summaries) -> None:
-        """Shows what operators have summed up at the end of a run: those without outputs, with a graph."""
+        """Shows findings, and what operators without outputs have summed up at the end of a run, with a graph."""
         self._backlog.put_scores(scores_of(summaries, self._graph))
 
     def statistics(self) -> SinkStatistics:

@@ -331,7 +331,30 @@ def machines() -> str:
     return drawing.svg()
 
 
+def terminal(command: str, below: str) -> str:
+    """A terminal of the tutorial on a failure: a command of the page, and the output that the page shows below it."""
+    page = (HERE.parent / "yesterdays-drive.md").read_text(encoding="utf-8")
+    command = next(line for line in page.splitlines() if line.startswith(command))
+    output = page.split(f"{command}\n", 1)[1].split("```text\n", 1)[1].split("```", 1)[0]
+    lines = [f"$ {command}", *output.splitlines()]
+    width, height = 8 * max(map(len, lines)) + 32, 19 * len(lines) + 30
+    colors = {"$": "#8fd18f", "not as": "#ff8f7f", "differs": "#ff8f7f", below: "#ffd479"}
+    drawn = [
+        f'<text x="16" y="{30 + 19 * k}" xml:space="preserve" '
+        f'fill="{next((c for part, c in colors.items() if part in line), "#d8dde6")}">{escape(line)}</text>'
+        for k, line in enumerate(lines)
+    ]
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        'font-family="Menlo, Consolas, DejaVu Sans Mono, monospace" font-size="13">\n'
+        f'<rect width="{width}" height="{height}" rx="8" fill="#181b21"/>\n'
+    )
+    return head + "\n".join(drawn) + "\n</svg>\n"
+
+
 PICTURES = {
+    "terminal_call.svg": lambda: terminal('dataflow debug drive.mcap brake --do "until', "before"),
+    "terminal_proof.svg": lambda: terminal("dataflow debug drive.mcap brake --do diff", "no call"),
     "time.svg": time,
     "arrival.svg": arrival,
     "firing.svg": firing,

@@ -10,11 +10,14 @@ import numpy as np
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
-from operators.depth.stereo_matching import MatchingConfig, StereoMatcher
+from operators.depth.stereo_matching import MatchingConfig, StereoMatcher, row_offset
 from operators.geometry.calibration import check_calibration
 from operators.geometry.stereo import rectified_pair
 from operators.image.preparation import grey_of
 from operators.status import counted_status
+
+ROWS = 1.0
+"""Pixels by which corresponding rows may differ: at two, a third of the disparities is off."""
 
 
 class StereoDepth(Operator):
@@ -34,7 +37,7 @@ class StereoDepth(Operator):
     right_info: Sampled[CameraInfo] = Sampled(doc="calibration of the right camera; P holds the baseline")
     depth: Out[DepthImage] = Out(doc="depth at the left image's pixels, metres; 0 for no return")
     status: Out[Diagnostics] = Out(
-        doc="pixels measured, unmatched, inconsistent, out of range; a warning where few are measured"
+        doc="pixels measured, unmatched, inconsistent, out of range; a warning where few are, or rows differ"
     )
 
     disparities: int = Param(
@@ -87,7 +90,8 @@ class StereoDepth(Operator):
         if self._calibration != (left_info, right_info):
             K, baseline = rectified_pair(left_info, right_info)
             self._pixel_metres, self._calibration = float(K[0, 0]) * baseline, (left_info, right_info)
-        matched = self._matcher.match(grey_of(left.data), grey_of(right.data))
+        grays = grey_of(left.data), grey_of(right.data)
+        matched = self._matcher.match(*grays)
         disparity = matched.disparity - np.float32(self.offset)
         seen = disparity > 0  # false where it is NaN
         z = np.where(seen, np.float32(self._pixel_metres) / np.where(seen, disparity, 1), 0).astype(np.float32)
@@ -104,7 +108,7 @@ class StereoDepth(Operator):
         data = np.where(kept, z, 0).astype(np.float32)
         return {
             "depth": DepthImage(data=data),
-            "status": _status(left, right, counts, blind),
+            "status": _status(left, right, counts, blind, row_offset(*grays, matched.disparity)),
         }
 
     def _check_range(self) -> None:
@@ -112,9 +116,14 @@ class StereoDepth(Operator):
             raise ValueError(f"min_range {self.min_range} m must be below max_range {self.max_range} m")
 
 
-def _status(left: Image, right: Image, counts: Mapping[str, int], blind: bool) -> Diagnostics:
+def _status(left: Image, right: Image, counts: Mapping[str, int], blind: bool, rows: float) -> Diagnostics:
     text = f"{counts['measured']} of {counts['pixels']} pixels measured"
+    crooked = not blind and abs(rows) >= ROWS
     if blind:
         plain = [name for name, image in (("left", left), ("right", right)) if np.ptp(image.data) < 8]
         text += f"; no structure in the {' and the '.join(plain)} image" if plain else "; the pair hardly matches"
-    return counted_status("stereo_depth", left.stamp, text, Level.WARN if blind else Level.OK, counts)
+    elif crooked:
+        text += (
+            f"; the right image lies {abs(rows):.1f} px {'lower' if rows > 0 else 'higher'}: the pair is not rectified"
+        )
+    return counted_status("stereo_depth", left.stamp, text, Level.WARN if blind or crooked else Level.OK, counts)

@@ -18,6 +18,7 @@ Disparities = NDArray[np.float32]
 
 _UNITS = 16  # of OpenCV's disparities in a pixel
 _PULL = 2.0  # of whole pixels on a parabola's minimum; measured on simulated pairs with known depth
+_CORNERS, _FEWEST, _APART = 200, 20, 8.0  # that show how rows correspond: most, fewest, pixels between two
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,26 @@ class StereoMatcher:
         wide = [cv2.copyMakeBorder(image, 0, 0, margin, 0, cv2.BORDER_REPLICATE) for image in (reference, other)]
         found = self._matcher.compute(*wide)[:, margin:].astype(np.float32) / _UNITS
         return unlocked(np.where(found > 0, found, np.nan).astype(np.float32))
+
+
+def row_offset(left: Gray, right: Gray, disparity: Disparities) -> float:
+    """Returns by how many pixels the right image shows things lower than the left one, 0 in a rectified pair.
+
+    It is the median over corners of the left image (H, W) with a disparity, followed by Lucas and Kanade's method from
+    where that puts them; 0 where there are fewer than 20.
+    """
+    known = np.isfinite(disparity)
+    corners = cv2.goodFeaturesToTrack(left, _CORNERS, 0.01, _APART, mask=known.astype(np.uint8))
+    if corners is None:
+        return 0.0
+    start = corners[:, 0]
+    x, y = start.astype(np.int64).T
+    guess = start - np.column_stack([disparity[y, x], np.zeros(len(start), np.float32)])
+    ends, found, _ = cv2.calcOpticalFlowPyrLK(
+        left, right, start, guess.astype(np.float32), winSize=(15, 15), maxLevel=1, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    off = (ends - start)[found.ravel() > 0, 1]
+    return float(np.median(off)) if len(off) >= _FEWEST else 0.0
 
 
 def unlocked(disparity: Disparities) -> Disparities:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Boxes = NDArray[np.float32]
 """(N, 4) corners x1, y1, x2, y2."""
 _CELLS = 4096  # overlaps that are taken at once
+_ONE = 0.6  # overlap of merged boxes above which they are of one thing
 _NONE = np.zeros(0, np.int64)
 
 
@@ -38,7 +39,8 @@ def merging_nms(
 
     A box is moved to the mean of itself and the boxes that it suppresses, weighted by their scores and the fourth power
     of their overlaps with it, since neighbouring cells err independently of each other (Solovyev et al. 2021 take the
-    scores alone).
+    scores alone). Boxes of one thing, kept apart by the threshold, may move onto each other: of those of a class that
+    then overlap by more than `_ONE` (or the threshold, if that is more) the best stays.
     """
     kept, merged = [], []
     for best, dropped, overlaps in islice(_rounds(boxes, scores, classes, iou_threshold), most):
@@ -49,7 +51,9 @@ def merging_nms(
             total = (weights[:, None] * boxes[dropped]).sum(axis=0) + scores[best] * mean
             mean = total / (weights.sum() + scores[best])
         merged.append(mean)
-    return np.array(kept, np.int64), np.array(merged, np.float32).reshape(-1, 4)
+    rows, moved = np.array(kept, np.int64), np.array(merged, np.float32).reshape(-1, 4)
+    stays = np.sort(class_wise_nms(moved, scores[rows], classes[rows], max(iou_threshold, _ONE)))
+    return rows[stays], moved[stays]
 
 
 def _rounds(

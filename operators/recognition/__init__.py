@@ -6,6 +6,7 @@ from operators.recognition.feature_memory import FeatureMemory
 from operators.recognition.image_classifier import ImageClassifier
 from operators.recognition.objects.learned_detector import LearnedDetector
 from operators.recognition.posture.recognizer import PostureRecognizer
+from operators.recognition.posture.skeleton_posture import SkeletonPosture
 
 __all__ = [
     "ActivityRecognizer",
@@ -14,4 +15,5 @@ __all__ = [
     "ImageClassifier",
     "LearnedDetector",
     "PostureRecognizer",
+    "SkeletonPosture",
 ]

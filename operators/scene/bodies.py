@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +20,10 @@ _STILL.flags.writeable = False
 
 @dataclass(frozen=True)
 class Body:
-    """A node: centre (3,), full size (3,) and heading of its upright box, velocity (3,), m/s, roles of its class."""
+    """A node: centre (3,), full size (3,) and heading of its upright box, velocity (3,), m/s, roles of its class.
+
+    `moving` is the probability that it moves, NaN where that is to be found from its places.
+    """
 
     id: int
     label: str
@@ -28,6 +32,7 @@ class Body:
     yaw: float
     velocity: Array
     roles: frozenset[str] = frozenset()
+    moving: float = math.nan
 
     @property
     def agent(self) -> bool:

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from operators.sources.image_folder import GrowingImageFolder, ImageFolder
     from operators.sources.kitti_odometry import KittiOdometry
     from operators.sources.kitti_raw import KittiRaw
+    from operators.sources.realsense import RealSense
     from operators.sources.recorded import (
         RecordedCamera,
         RecordedImu,
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
         RecordedTransforms,
     )
     from operators.sources.rgbd_folder import RgbdFolder
+    from operators.sources.static_transforms import StaticTransforms
     from operators.sources.synthetic_rgbd import SyntheticRgbd
+    from operators.sources.vectornav import VectorNavImu
+    from operators.sources.velodyne import VelodyneFile, VelodyneLidar
     from operators.sources.victoria_park import VictoriaPark
     from operators.sources.video import VideoFile, Webcam
 else:  # most need a separate library, which a graph without them need not load
@@ -34,6 +38,7 @@ else:  # most need a separate library, which a graph without them need not load
             "image_folder": ("GrowingImageFolder", "ImageFolder"),
             "kitti_odometry": ("KittiOdometry",),
             "kitti_raw": ("KittiRaw",),
+            "realsense": ("RealSense",),
             "recorded": (
                 "RecordedCamera",
                 "RecordedImu",
@@ -44,7 +49,10 @@ else:  # most need a separate library, which a graph without them need not load
                 "RecordedTransforms",
             ),
             "rgbd_folder": ("RgbdFolder",),
+            "static_transforms": ("StaticTransforms",),
             "synthetic_rgbd": ("SyntheticRgbd",),
+            "vectornav": ("VectorNavImu",),
+            "velodyne": ("VelodyneFile", "VelodyneLidar"),
             "victoria_park": ("VictoriaPark",),
             "video": ("VideoFile", "Webcam"),
         },
@@ -59,6 +67,7 @@ __all__ = [
     "KittiRaw",
     "NmeaFile",
     "NmeaGnss",
+    "RealSense",
     "RecordedCamera",
     "RecordedImu",
     "RecordedLidar",
@@ -67,7 +76,11 @@ __all__ = [
     "RecordedStereoCamera",
     "RecordedTransforms",
     "RgbdFolder",
+    "StaticTransforms",
     "SyntheticRgbd",
+    "VectorNavImu",
+    "VelodyneFile",
+    "VelodyneLidar",
     "VictoriaPark",
     "VideoFile",
     "Webcam",

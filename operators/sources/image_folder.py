@@ -58,7 +58,7 @@ class ImageFolder(CalibratedImages):
             raise SourceError(f"{self._folder} has no image whose name is {self.pattern!r}")
         if self._files[0].stamp < 0:
             raise SourceError(f"{self._folder / self._files[0].name} has no number: `stamps: file_time` needs none")
-        self._size = _size(self._read(self._files[0]))
+        self._calibrate(self._read(self._files[0]))
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         last = -1
@@ -145,7 +145,8 @@ class GrowingImageFolder(ImageFolder):
         first = next((found for found in itertools.islice(self._new, looks) if found is not None), None)
         if first is None:
             raise SourceError(f"{self._folder}: no image whose name is {self.pattern!r} came within `first_within`")
-        self._first, self._size = first, _size(first[2])
+        self._first = first
+        self._calibrate(first[2])
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         for found in itertools.chain([self._first], self._new):

@@ -122,7 +122,7 @@ class Receiver:
             case "RMC" if fields[1] == "A" and fields[8]:
                 self._utc = _midnight(fields[8]) + _time(fields[0])
             case "GST":
-                north, east, up = (_number(text) for text in fields[5:8])
+                north, east, up = (number(text) for text in fields[5:8])
                 self._errors = (_time(fields[0]), (east, north, up)) if min(east, north, up) > 0 else None
             case "GGA":
                 return self._position(sentence)
@@ -134,9 +134,9 @@ class Receiver:
         fixed = status != "no_fix"
         latitude = _place(lat, north, "NS", 90) if fixed else math.nan
         longitude = _place(lon, east, "EW", 180) if fixed else math.nan
-        altitude = _number(height) + _number(geoid) if fixed and height and geoid else math.nan
-        errors = self._error(status, _time(time), _number(dilution) if dilution else 0.0) if fixed else None
-        seen = int(_number(satellites)) if satellites else None
+        altitude = number(height) + number(geoid) if fixed and height and geoid else math.nan
+        errors = self._error(status, _time(time), number(dilution) if dilution else 0.0) if fixed else None
+        seen = int(number(satellites)) if satellites else None
         stamp = self._stamp(sentence.arrival, time)
         if stamp is None:
             return None
@@ -188,7 +188,8 @@ def _sentence(body: str, arrival: int) -> Sentence:
     return Sentence(arrival, named[1] if named else "", tuple(fields))
 
 
-def _number(text: str) -> float:
+def number(text: str) -> float:
+    """Returns the value of plain digits with an optional point and minus. Raises ValueError."""
     if not _NUMBER.fullmatch(text):
         raise ValueError(f"{text!r} is no number")
     return float(text)

@@ -24,6 +24,8 @@ LayoutName = Literal["7scenes", "tum"]
 Place = tuple[float, float, float, float, float, float, float]
 
 _TUM_GAP = 20_000_000  # ns: images farther apart than this are no pair, as in the dataset's own associate.py
+LATEST = 2**63
+_SMALLER = (("milliseconds", 10**3), ("microseconds", 10**6), ("nanoseconds", 10**9))
 _FRAME = re.compile(r"frame-(\d+)\.(?:color\.(?:jpg|png)|depth\.png|pose\.txt)")
 
 
@@ -190,6 +192,10 @@ def _tum_list(file: Path, values: int) -> list[tuple[int, list[str]]]:
             stamp = int(Fraction(words[0]) * 10**9)
         except (ValueError, ZeroDivisionError):
             raise SourceError(f"{file}:{number}: {words[0]!r} is no time in seconds") from None
+        if not 0 <= stamp < LATEST:
+            units = next((name for name, scale in _SMALLER if 0 <= stamp // scale < LATEST), "")
+            hint = f": is it in {units}?" if units else ""
+            raise SourceError(f"{file}:{number}: {words[0]} s is no time from 1970 to 2262{hint}")
         if len(words) != values + 1:
             raise SourceError(f"{file}:{number}: expected a time and {values} values, found {line!r}")
         rows.append((stamp, words[1:]))

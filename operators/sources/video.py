@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, Image, Message
 from dataflow.operator import Duration, Out, Param, Source, SourceError
+from operators.geometry.calibration_files import CalibrationFileError, read_camera
 from operators.sources.pacing import frame_stamp
 
 Pixels = NDArray[np.uint8]
@@ -27,21 +28,43 @@ class CalibratedImages(Source, abstract=True):
     """Holds what a file and a camera have in common: images, and a calibration by the field of view."""
 
     image: Out[Image] = Out(doc="RGB images")
-    image_info: Out[CameraInfo] = Out(static=True, doc="calibration: a pinhole of the given field of view")
+    image_info: Out[CameraInfo] = Out(static=True, doc="calibration, or a pinhole of the given field of view")
 
     frame: str = Param("camera_optical", min_length=1, doc="optical frame of the camera")
     fov: float = Param(
         math.radians(60), gt=0, lt=math.pi, unit="rad", doc="horizontal field of view, if not calibrated"
     )
     focal: float | None = Param(None, gt=0, unit="px", doc="focal length from a calibration; none takes `fov`")
+    calibration: str | None = Param(
+        None, min_length=1, doc="file of `dataflow calibrate` or ROS's camera_calibration; none takes `focal` or `fov`"
+    )
 
     _size: tuple[int, int] = (0, 0)
+    _calibrated: CameraInfo | None = None
+
+    def _calibrate(self, bgr: Pixels) -> None:
+        """Takes the size of the images, and the calibration from its file. Raises SourceError, FileNotFoundError."""
+        self._size = (bgr.shape[1], bgr.shape[0])
+        if self.calibration is None:
+            return
+        try:
+            found = read_camera(self.use_file(self.calibration), self.frame)
+        except CalibrationFileError as error:
+            raise SourceError(str(error)) from error
+        if (found.width, found.height) != self._size:
+            raise SourceError(
+                f"{self.calibration} calibrates images of {found.width}x{found.height} pixels; these have "
+                f"{self._size[0]}x{self._size[1]}"
+            )
+        self._calibrated = found
 
     @abstractmethod
     def _first_stamp(self) -> int:
         """The stamp of what holds from the beginning."""
 
     def static_outputs(self) -> Mapping[str, Message]:
+        if self._calibrated is not None:
+            return {"image_info": self._calibrated.replace(stamp=self._first_stamp())}
         width, height = self._size
         focal = self.focal or width / 2 / math.tan(self.fov / 2)
         info = CameraInfo.from_intrinsics(
@@ -88,7 +111,7 @@ class VideoFile(CalibratedImages):
                 f"{path} holds no frame that can be decoded; its codec is {codec or 'unknown'}. OpenCV's wheels decode "
                 "H.264 and H.265, and no AV1: encode it anew"
             )
-        self._size = (first.shape[1], first.shape[0])
+        self._calibrate(np.asarray(first, np.uint8))
         self._rate = self.rate or self._video.get(cv2.CAP_PROP_FPS) or 25.0
         self._video.set(cv2.CAP_PROP_POS_FRAMES, 0)
 
@@ -122,18 +145,23 @@ allow."""
 class Webcam(CalibratedImages):
     """Reads a camera: of this machine by its number or device file, of the network by its address (RTSP, HTTP).
 
-    An image is stamped when it has arrived. A camera that is unplugged, or gives nothing any more, is looked for again
-    every `retry` until it is back; meanwhile there are no images, and what takes them finds them stale. One that comes
-    back with images of another size ends the source with an error, as their calibration would be wrong: a `restart`
-    policy begins anew.
+    An image is stamped when it has arrived, less `latency`. A camera that is unplugged, or gives nothing any more, is
+    looked for again every `retry` until it is back; meanwhile there are no images, and what takes them finds them
+    stale. One that comes back with images of another size ends the source with an error, as their calibration would be
+    wrong: a `restart` policy begins anew.
     """
 
     real_time = True
+
+    _unplugged = 0
 
     input: str = Param("0", min_length=1, doc="number, device file or address of the camera")
     width: int | None = Param(None, ge=1, unit="px", doc="width to ask for; the camera may give another")
     height: int | None = Param(None, ge=1, unit="px", doc="height to ask for")
     rate: float | None = Param(None, gt=0, unit="Hz", doc="images a second to ask for")
+    latency: Duration = Param(
+        "0s", ge=0, doc="time from the exposure to the arrival, as `dataflow calibrate camera-imu` finds"
+    )
     retry: Duration = Param("1s", ge=10_000_000, doc="pause between two looks for a camera that is gone")
 
     def setup(self) -> None:
@@ -145,13 +173,13 @@ class Webcam(CalibratedImages):
         bgr = self._read()
         if bgr is None:
             raise SourceError(f"camera {self.input!r} gives no image: another program may be using it")
-        self._size = (bgr.shape[1], bgr.shape[0])
+        self._calibrate(bgr)
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         last = 0
         while not self._stopped.is_set():
             bgr = self._read()
-            stamp = time.time_ns()
+            stamp = time.time_ns() - self.latency
             if bgr is None:
                 self._look_for_it()
             elif stamp > last or last - stamp > SET_BACK:  # of less the next image is ahead again: this one is left out
@@ -160,6 +188,9 @@ class Webcam(CalibratedImages):
 
     def stop_reading(self) -> None:
         self._stopped.set()
+
+    def summary(self) -> Mapping[str, int | str]:
+        return {"clock": "machine", "unplugged": self._unplugged}
 
     def close(self) -> None:
         camera: cv2.VideoCapture | None = getattr(self, "_camera", None)
@@ -198,6 +229,7 @@ class Webcam(CalibratedImages):
         """Waits until the camera is back, or the run ends. Raises SourceError for images of another size."""
         if self._stopped.is_set():
             return
+        self._unplugged += 1
         self.log.warning("camera %s gives no image any more: looking for it every %g s", self.input, self.retry * 1e-9)
         self.close()
         self._camera = None

@@ -322,6 +322,10 @@ def test_two_settings_are_compared_pair_by_pair(dataflow, folder: Path, tmp_path
     assert dict(figure["recordings"]) == {"first.mcap": 66.0, "deep/second.mcap": 66.0}
     assert told["operators"] == [{"operator": "scaled", "recordings": 2, "first": 2}]
 
+    words = ("--set", "b:scaled.by=3", "--explain", "total error")  # the operator that judges is the one that changed
+    refused = dataflow("compare", folder / "graph.yaml", *given, *words, "--rerun", tmp_path / "b.rrd", code=2)
+    assert "scaled: total error: no operator in front of scaled has other outputs" in refused.stderr
+
     words = ("--set", "b:scaled.by=3", "--set", "a:scaled.fail_at=5")
     failed = json.loads(dataflow("compare", folder / "graph.yaml", *given, *words, code=1).stdout)
     assert failed["failed"] == [{"settings": {"scaled.fail_at": "5"}, "outcomes": {"failed": 2}}]

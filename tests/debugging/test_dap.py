@@ -95,10 +95,10 @@ class Client:
         self._stream.flush()
         return self._answer()
 
-    def at_once(self, *commands: str) -> tuple[str, int]:
-        """The stop that comes of requests which are all there before the first one is answered."""
-        for command in commands:
-            self._send(command, {})
+    def at_once(self, *commands: str, **arguments: Any) -> tuple[str, int]:
+        """The stop that comes of requests which are all there before the first one is answered, which has arguments."""
+        for k, command in enumerate(commands):
+            self._send(command, {} if k else arguments)
         self._stream.flush()
         self._seq -= len(commands)
         for _ in commands:
@@ -447,6 +447,15 @@ def test_a_pause_is_noticed_between_calls_of_few_lines_forwards_and_back(recorde
         client.ask("configurationDone")
         client.stopped()
         assert client.at_once("reverseContinue", "pause")[0] == "pause"
+
+
+def test_a_pause_ends_a_way_to_a_call_far_away(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        goto = {"expression": "goto 11", "context": "repl", "frameId": 1}
+        assert client.at_once("evaluate", "pause", **goto)[0] == "pause"
+        assert client.call() < 11
 
 
 def test_calls_are_made_once_on_the_way_and_twice_back_to_the_beginning(

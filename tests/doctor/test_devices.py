@@ -52,6 +52,17 @@ def test_cameras_and_serial_devices_are_found_by_their_names(tmp_path: Path) -> 
     assert [d.note for d in found[:3]] == ["", "further node of its device: may carry no images", ""]
 
 
+def test_sources_that_fit_a_device_better_or_as_well_are_noted(tmp_path: Path) -> None:
+    machine(tmp_path)
+    (tmp_path / "sys/class/video4linux/video0/name").write_text("Intel(R) RealSense(TM) Depth Camera 435i\n")
+    notes = [device.note for device in find_devices(tmp_path)]
+
+    assert notes[0] == "with its depth: use: operators.sources:RealSense"
+    assert "use: operators.sources:VectorNavImu, baud: 115200" in notes[4]
+    for name in ("RealSense", "VectorNavImu"):
+        assert hasattr(operators.sources, name)
+
+
 def test_the_lines_of_a_device_are_those_of_a_source(tmp_path: Path) -> None:
     machine(tmp_path)
     for device in find_devices(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from held_runs import MS, STAMP
 
 from dataflow.drops import player as player_module
-from dataflow.drops.losses import Loss
+from dataflow.drops.losses import Loss, bursts_of
 from dataflow.drops.player import Given, PlayedCalls, Player
 from dataflow.drops.search import Cost, Drops, DropsError, Worse
 from dataflow.graph import load_text
@@ -53,6 +53,24 @@ def test_the_drop_and_the_late_message_that_cost_the_estimate_are_named(run: Pat
     assert found.best["score: end_error_m"] == 0.0
 
 
+def test_losses_without_a_message_between_them_are_one_burst_and_tried_together(run: Path) -> None:
+    sent = {name: [((0, k), 10 * k) for k in range(20)] for name in ("a", "b")}
+
+    def lost(operator: str, stream: str, *numbers: int) -> list[Loss]:
+        return [Loss(10 * k, operator, "in", stream, "overflow") for k in numbers]
+
+    stop = sorted(lost("o", "a", 3, 4, 5, 6) + lost("o", "b", 5, 6, 7))
+    others = lost("o", "a", 9), lost("o", "a", 11), lost("p", "a", 4)
+    found = bursts_of(sorted(sum(others, stop)), sent)
+    assert sorted(map(sorted, found)) == sorted([stop, *others])
+    assert found[0][0].stamp == 30
+
+    held = cost(run, "end_error_m > 5", budget=0.0)  # nothing but the replays before and behind
+    assert not held.minimal
+    assert held.replays == 4
+
+
+@pytest.mark.long
 def test_only_the_operators_between_the_losses_and_the_figure_are_replayed(run: Path) -> None:
     assert cost(run, "end_error_m > 5").operators == ("odometry", "smooth", "score")
     assert cost(run, "beats < 38").operators == ("beat",)
@@ -117,6 +135,7 @@ def test_a_figure_that_changes_by_itself_is_refused(run: Path) -> None:
         Drops(recording, "end_error_m > 5", chancy).find()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("score", ["Undecided", "Silent"])
 def test_a_figure_that_is_missing_or_nan_heals_nothing(run: Path, score: str) -> None:
     with Recording(run) as recording:

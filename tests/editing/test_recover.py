@@ -41,11 +41,16 @@ def chunks(data: bytes) -> list[tuple[int, int]]:
     return found
 
 
-def test_a_damaged_chunk_is_left_out_and_its_messages_are_counted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fault", ["damage", "an unknown compression"])
+def test_a_damaged_chunk_is_left_out_and_its_messages_are_counted(tmp_path: Path, fault: str) -> None:
     path = written(tmp_path / "a.mcap")
     data = bytearray(path.read_bytes())
-    _, end = chunks(bytes(data))[3]
-    data[end - 5] ^= 0xFF
+    begin, end = chunks(bytes(data))[3]
+    if fault == "damage":
+        data[end - 5] ^= 0xFF
+    else:
+        name = data.index(b"zstd", begin)
+        data[name : name + 4] = b"brot"
     path.write_bytes(data)
 
     done = recover(path, tmp_path / "saved.mcap")

@@ -100,6 +100,7 @@ def test_every_message_is_in_the_part_of_its_time(recorded: Path, tmp_path: Path
     assert (spans[0][0], spans[-1][1]) == (first, last)  # type: ignore[index]
 
 
+@pytest.mark.long
 def test_parts_with_a_gap_between_stay_a_part_and_verify_around_it(stateful: Path, tmp_path: Path) -> None:
     parts = [cut(stateful, tmp_path / "a.mcap", None, 0.3), cut(stateful, tmp_path / "b.mcap", 0.6, None)]
 

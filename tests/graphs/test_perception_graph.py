@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -29,17 +30,37 @@ def run(*words: object) -> str:
     return done.stdout
 
 
+def keypoint_model(file: Path) -> str:
+    """A network of RTMPose's signature that finds all joints in the middle of a person's box."""
+    onnx = pytest.importorskip("onnx")
+    make, real = onnx.helper, onnx.TensorProto.FLOAT
+    middle = {
+        name: np.eye(1, side, side // 2, np.float32).repeat(17, 0)[None] for name, side in (("x", 384), ("y", 512))
+    }
+    nodes = [make.make_node("Identity", [name], [f"simcc_{name}"]) for name in middle]
+    given = [make.make_tensor_value_info("input", real, [1, 3, 256, 192])]
+    made = [make.make_tensor_value_info(f"simcc_{name}", real, list(each.shape)) for name, each in middle.items()]
+    kept = [onnx.numpy_helper.from_array(each, name) for name, each in middle.items()]
+    graph = make.make_graph(nodes, "joints", given, made, kept)
+    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
+    return str(file)
+
+
 @pytest.mark.long
 @needs_weights
 def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path: Path) -> None:
     file, graph = tmp_path / "room.mcap", REPOSITORY / "graphs" / "perception.yaml"
     demo = REPOSITORY / "recordings" / "demo.mcap"
-    found = ("--set", "perception.mount=true", "--set", "perception.calibrate=true")
+    keypoints = json.dumps({"model": keypoint_model(tmp_path / "joints.onnx"), "decoder": "simcc"})
+    values = ("mount=true", "calibrate=true", "skeletons=true", f"keypoints_params={keypoints}")
+    found = [word for value in values for word in ("--set", f"perception.{value}")]
     run("replay", demo, "--graph", graph, "--end", 1.2, *found, "--one-process", "--record", file, "--json", "-q")
 
     recorded = dataflow.open(file)
     corrected, mounted = (recorded[f"robot1/perception/{each}"] for each in ("calibration/corrected", "mount/status"))
     assert len(corrected) == len(mounted) == 1
+    joints, postures = (recorded[f"robot1/perception/{each}"] for each in ("keypoints/keypoints", "skeletons/postures"))
+    assert len(joints) == len(postures) > 5
     assert json.loads(run("verify", file, "--one-process", "--json", "-q"))["identical"] is True
     shown = json.loads(CliRunner().invoke(scene, [str(file), "--json"]).stdout)
     assert {n["name"] for n in shown["nodes"]} >= {"room", "self", "floor"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -107,3 +108,22 @@ def test_repaired_stamps_strictly_increase_and_nothing_else_is_lost(rows: list[t
     kept = {(int(stamps[i]), int(digests[i])) for i in found.order}
     assert kept == {(s, d) for s, d in rows if s >= 0}
     assert len(found.order) + found.repeated + found.before_epoch == len(rows)
+
+
+@pytest.mark.parametrize(
+    ("each", "words"), [(S // 10_000, "1,000 times as slowly as"), (100_000 * S, "1,000,000 times")]
+)
+def test_headers_of_another_unit_are_noted(each: int, words: str) -> None:
+    log = LOG[0] + np.arange(20) * S // 10
+
+    (note,) = choose_clock([times(LOG[0] + np.arange(20) * each, log=log)]).notes
+
+    assert words in note
+    assert "in another unit? --clock log" in note
+
+
+@pytest.mark.parametrize("pace", [0.01, 1.0, 20.0])
+def test_a_simulation_that_is_slow_or_fast_is_not_noted(pace: float) -> None:
+    log = LOG[0] + np.arange(20) * S // 10
+
+    assert not choose_clock([times(7 * S + (np.arange(20) * S // 10 * pace).astype(np.int64), log=log)]).notes

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import gzip
 import shutil
 import sqlite3
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zstandard
 from made_bags import ROS1, ROS2, SECOND, imus, ros, transform, write_ros2
+from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from dataflow.interop.bag import BagError, shortfalls
+from dataflow.interop.export.foxglove import export_foxglove
+from dataflow.interop.export.material import Material
+from dataflow.interop.export.own import export_own
+from dataflow.interop.export.report import Exported
+from dataflow.interop.export.ros2 import export_ros2
 from dataflow.interop.opening import open_bag
 
 STAMPS = [1_700_000_000 * SECOND + i * SECOND // 100 for i in range(20)]
@@ -28,6 +36,21 @@ def counted(path: Path) -> dict[str, int]:
     assert found == {name: topic.count for name, topic in bag.topics.items()}
     bag.close()
     return found
+
+
+def write_mcap(path: Path, rows: list[tuple[str, int, Any]]) -> None:
+    """An MCAP of ROS 2 messages, whatever their topics are called."""
+    with path.open("wb") as opened:
+        writer = Writer(opened)
+        writer.start("ros2", "other")
+        channels: dict[str, int] = {}
+        for topic, time, message in rows:
+            kind = message.__msgtype__
+            if topic not in channels:
+                text = ROS2.generate_msgdef(kind, ros_version=2)[0].encode()
+                channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+            writer.add_message(channels[topic], time, bytes(ROS2.serialize_cdr(message, kind)), time)
+        writer.finish()
 
 
 def changed(folder: Path, statement: str, *values: object) -> None:
@@ -167,3 +190,177 @@ def test_transforms_of_one_publisher_come_with_the_others(tmp_path: Path) -> Non
     rows = [("/tf", s, ros("tf2_msgs/TFMessage", transforms=[transform(s, "map", "base")])) for s in STAMPS]
 
     assert counted(write_ros2(tmp_path / "bag", rows, "sqlite3")) == {"/tf": 20}
+
+
+def test_a_file_that_metadata_name_twice_is_read_once(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "bag", imus(STAMPS))
+    text = (folder / "metadata.yaml").read_text()
+    (folder / "metadata.yaml").write_text(text.replace("  - bag.mcap\n", "  - bag.mcap\n  - bag.mcap\n", 1))
+
+    assert counted(folder) == {"/imu": 20}
+
+
+def test_more_messages_than_metadata_promise_are_told_and_are_no_shortfall(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "bag", imus(STAMPS))
+    text = (folder / "metadata.yaml").read_text()
+    (folder / "metadata.yaml").write_text(text.replace("message_count: 20", "message_count: 4"))
+
+    bag = open_bag(folder)
+
+    assert bag.notes == ("topic /imu: 4 messages are promised, 20 are there",)
+    assert not shortfalls(bag)
+    bag.close()
+
+
+def test_a_part_that_is_missing_between_numbered_files_is_told(tmp_path: Path) -> None:
+    for number in (0, 1, 3):
+        part = write_ros2(tmp_path / f"drive_{number}", imus(STAMPS[number : number + 1]))
+        (tmp_path / f"drive_{number}.mcap").write_bytes((part / f"drive_{number}.mcap").read_bytes())
+
+    bag = open_bag(tmp_path)
+
+    assert bag.notes == ("the files are numbered, and 2 is not there",)
+    bag.close()
+
+
+def test_what_a_killed_recorder_had_half_written_is_taken_back(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
+    before = (folder / "bag.db3").read_bytes()
+    database = sqlite3.connect(folder / "bag.db3", isolation_level=None)
+    database.execute("pragma cache_size = 2")  # pages go to the file before the end of the transaction
+    database.execute("begin")
+    database.execute("update messages set data = zeroblob(9000)")
+    for name in ("bag.db3", "bag.db3-journal"):
+        shutil.copyfile(folder / name, tmp_path / name)
+    database.close()
+    assert (tmp_path / "bag.db3").read_bytes() != before
+
+    bag = open_bag(tmp_path / "bag.db3")
+
+    assert [len(stored.data) for stored in bag.messages(["/imu"])] == [len(ROS2.serialize_cdr(m, m.__msgtype__))
+                                                                       for _, _, m in imus(STAMPS)]  # fmt: skip
+    assert bag.notes == ("bag.db3 was not closed by its recorder: what it wrote last is taken back",)
+    bag.close()
+
+
+@pytest.mark.parametrize("column", ["timestamp", "data"])
+def test_rows_that_are_no_messages_are_counted(tmp_path: Path, column: str) -> None:
+    folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
+    changed(folder, f"update messages set {column} = ? where id = 3", "text")
+
+    assert counted(folder) == {"/imu": 19}
+    bag = open_bag(folder)
+    assert bag.notes == ("bag.db3: rows without a whole time or bytes, which are no messages: 1",)
+    assert shortfalls(bag)
+    bag.close()
+
+
+def test_messages_that_are_zstd_frames_without_their_size_are_read(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
+    packer = zstandard.ZstdCompressor(write_content_size=False)
+    with sqlite3.connect(folder / "bag.db3") as database:
+        for number, data in database.execute("select id, data from messages").fetchall():
+            database.execute("update messages set data = ? where id = ?", (packer.compress(data), number))
+    database.close()
+    text = (folder / "metadata.yaml").read_text().replace("compression_mode: ''", "compression_mode: MESSAGE")
+    (folder / "metadata.yaml").write_text(text.replace("compression_format: ''", "compression_format: zstd"))
+
+    bag = open_bag(folder)
+
+    message = imus(STAMPS)[0][2]
+    assert next(iter(bag.messages(["/imu"]))).data == ROS2.serialize_cdr(message, message.__msgtype__)
+    bag.close()
+
+
+def numbers(file: Path, values: range) -> None:
+    with Writer1(file) as writer:
+        kind = "std_msgs/msg/Float64"
+        connection = writer.add_connection("/n", kind, typestore=ROS1)
+        for value in values:
+            message = ros("std_msgs/Float64", ROS1, data=float(value))
+            writer.write(connection, STAMPS[value], ROS1.serialize_ros1(message, kind))
+
+
+def test_the_parts_of_a_split_ros_1_recording_are_one_bag(tmp_path: Path) -> None:
+    numbers(tmp_path / "drive_2023-01-01-10-00-30_1.bag", range(4, 9))
+    numbers(tmp_path / "drive_2023-01-01-10-00-00_0.bag", range(4))
+
+    bag = open_bag(tmp_path)
+
+    assert [(s.number, s.log_time) for s in bag.messages(["/n"])] == list(enumerate(STAMPS[:9]))
+    assert bag.kind == "ROS 1 bag, 2 files"
+    bag.close()
+
+
+def test_ros_1_bags_of_other_names_are_separate_recordings(tmp_path: Path) -> None:
+    numbers(tmp_path / "drive_0.bag", range(2))
+    numbers(tmp_path / "office_1.bag", range(2))
+
+    with pytest.raises(BagError, match="files, which are separate recordings"):
+        open_bag(tmp_path)
+
+
+def test_messages_that_a_ros_1_chunk_counts_and_the_index_lacks_are_told(tmp_path: Path) -> None:
+    numbers(tmp_path / "x.bag", range(5))
+    data = bytearray((tmp_path / "x.bag").read_bytes())
+    info = data.rfind(b"op=\x06")
+    counted_at = data.find((0).to_bytes(4, "little") + (5).to_bytes(4, "little"), info) + 4
+    data[counted_at : counted_at + 4] = (9).to_bytes(4, "little")
+    (tmp_path / "x.bag").write_bytes(data)
+
+    bag = open_bag(tmp_path / "x.bag")
+
+    assert shortfalls(bag) == ["topic /n: 9 messages are promised, 5 are there"]
+    bag.close()
+
+
+def test_a_topic_of_two_definitions_goes_to_ros_2_as_both(tmp_path: Path) -> None:
+    with Writer1(tmp_path / "x.bag") as writer:
+        for count_, digest in ((1, "1" * 32), (2, "2" * 32)):
+            text = "".join(f"float64 v{i}\n" for i in range(count_))
+            connection = writer.add_connection("/n", "my/msg/T", msgdef=text, md5sum=digest)
+            for stamp in STAMPS[:count_]:
+                writer.write(connection, stamp, bytes(8 * count_))
+
+    with Material(tmp_path / "x.bag") as material:
+        export_ros2(material, tmp_path / "out", Exported())
+
+    bag = open_bag(tmp_path / "out")
+    assert {name: topic.count for name, topic in bag.topics.items()} == {"/n": 2, "/n (my/msg/T)": 1}
+    assert [len(stored.data) for stored in bag.messages(["/n"])] == [4 + 16] * 2
+    bag.close()
+
+
+@pytest.mark.parametrize("form", ["own", "ros2", "foxglove"])
+def test_topics_whose_names_differ_by_a_slash_stay_apart(tmp_path: Path, form: str) -> None:
+    topics = ("/a/b", "a/b", "/a/b/", "/c: #d")
+    rows = [(name, stamp, ros("std_msgs/String", data=name)) for name in topics for stamp in STAMPS[:3]]
+    write_mcap(tmp_path / "x.mcap", rows)
+    out = tmp_path / ("out" if form == "ros2" else "out.mcap")
+
+    with Material(tmp_path / "x.mcap") as material:
+        {"own": export_own, "ros2": export_ros2, "foxglove": export_foxglove}[form](material, out, Exported())
+
+    found = counted(out)
+    assert sorted(found.values()) == [3, 3, 3, 3]
+    if form == "own":
+        assert material.account.notes == [
+            "topic /a/b is the stream a/b_2, since a/b is taken",
+            "topic /a/b/ is the stream a/b_3, since a/b is taken",
+        ]
+    bag = open_bag(out)
+    assert not bag.notes
+    bag.close()
+
+
+def test_a_folder_of_bags_names_them_and_an_archive_is_to_be_unpacked(tmp_path: Path) -> None:
+    write_ros2(tmp_path / "one", imus(STAMPS[:1]))
+    (tmp_path / "bag.mcap.gz").write_bytes(gzip.compress((tmp_path / "one" / "one.mcap").read_bytes()))
+    (tmp_path / "samples").mkdir()
+
+    with pytest.raises(BagError, match="its folders one do: name one"):
+        open_bag(tmp_path)
+    with pytest.raises(BagError, match="are read by sources of a graph"):
+        open_bag(tmp_path / "samples")
+    with pytest.raises(BagError, match="it is a gzip file, to be unpacked first"):
+        open_bag(tmp_path / "bag.mcap.gz")

@@ -31,6 +31,11 @@ def test_a_gap_is_named_with_its_length_place_and_what_is_missing() -> None:
     assert "the longest 2.1 s; about 20 messages are missing" in found.text
 
 
+@pytest.mark.parametrize(("period", "found"), [(5e-6, [("unit", "imu")]), (0.00025, [])])
+def test_a_rate_that_no_sensor_has_is_a_unit_that_is_read_wrongly(period: float, found: list[tuple[str, str]]) -> None:
+    assert findings({"imu": [BEGIN + round(i * period * SECOND) for i in range(100)]}) == found
+
+
 def test_events_without_a_rate_have_no_gaps() -> None:
     times = np.cumsum(np.random.default_rng(1).exponential(1.0, 200))
     assert findings({"doors": [BEGIN + int(t * SECOND) for t in times]}) == []

@@ -164,6 +164,7 @@ def test_a_machine_that_does_not_join_is_named_with_the_command_that_joins_it(tm
         run(load_text(GRAPH.replace("SIZE", "1").replace(", MORE", "")), machines=meeting, start_timeout=0.2)
 
 
+@pytest.mark.long
 def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:
     graph = load_text(GRAPH.replace("SIZE", "1").replace(", MORE", ""))
     with pytest.raises(RunFailed, match=r"machine robot: say where machines join .* or run all of it here"):

@@ -65,9 +65,12 @@ def flown(
     when: tuple[Trigger, ...] = (),
     asks: Any = (),
     each: Any = lambda stamp: None,
+    ahead: int = 0,
+    late: int = 0,
     **more: Any,
 ) -> Any:
-    """Gives a flight recorder what a recorder was given; `asks`: stamps (s) at which somebody triggers it."""
+    """Gives a flight recorder what a recorder was given; `asks`: stamps (s) at which it is triggered, by a
+    clock that is `ahead` (ns); `late`: by how much firing records are (ns)."""
     flight = replace(graph.record.flight, when=when, **more)  # type: ignore[type-var]
     made = replace(graph, record=replace(graph.record, flight=flight))
     history: list[tuple[int, int]] = []
@@ -80,7 +83,7 @@ def flown(
         records = _records(recording)
         at = next(records, None)
         for found in recording.messages():
-            while at is not None and at.stamp < found.stamp:
+            while at is not None and at.stamp < found.stamp - late:
                 sink.firings(at.operator, [at], encode_batch([at]))
                 at = next(records, None)
             each(found.stamp / SECOND)
@@ -91,7 +94,7 @@ def flown(
             history.append((sink.ring_bytes, len(list((folder / ".ring").iterdir()))))
             if asks and found.stamp >= asks[0] * SECOND and found.stamp < 10**14:
                 asks = asks[1:]
-                sink.event("trigger", found.stamp, {"text": "a test"})
+                sink.event("trigger", found.stamp + ahead, {"text": "a test"})
         while at is not None:
             sink.firings(at.operator, [at], encode_batch([at]))
             at = next(records, None)
@@ -135,6 +138,28 @@ def test_what_is_kept_replays_with_the_states_of_then(recorded: Path, graph: Gra
         was = {m.stamp: m.message.digest() for m in whole.messages(["test/second/y"])}
     assert len(made) > 80
     assert made.items() <= was.items()
+
+
+def test_a_trigger_of_a_run_that_is_behind_the_clock_keeps_what_it_had_come_to(
+    recorded: Path, graph: Graph, tmp_path: Path
+) -> None:
+    """As of one that is paused, or slower than the clock."""
+    sink, _ = flown(recorded, graph, tmp_path, asks=[20.0], ahead=300 * SECOND)
+    (one,) = sink.close("complete")["kept"]
+
+    with Recording(one["path"]) as kept:
+        stamps = [m.stamp for m in kept.messages(["test/left/fast"])]
+    assert min(stamps) <= 16 * SECOND
+    assert max(stamps) >= 22 * SECOND - 60_000_000
+
+
+def test_firing_records_that_are_late_are_waited_for(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    """As of a recorder that is behind, since its disk is slow."""
+    sink, _ = flown(recorded, graph, tmp_path, asks=[10.0], late=6 * SECOND)
+    (one,) = sink.close("complete")["kept"]
+
+    with Recording(one["path"]) as kept:
+        assert max(m.stamp for m in kept.messages(["test/left/fast"])) >= 12 * SECOND - 60_000_000
 
 
 @pytest.mark.long

@@ -131,6 +131,32 @@ def test_parts_are_verified_each_and_join_into_the_whole(
         assert set(verdicts(part).values()) <= {"identical", "unverifiable"}, part
 
 
+def test_the_newest_part_stays_however_large_it_is(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    facts = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(every=6 * SECOND), keep=1000)).all()
+
+    assert facts["deleted"] == 1
+    assert facts["parts"] == [str(part) for part in parts_of(tmp_path / "run.mcap")] == [str(tmp_path / "run_001.mcap")]
+
+
+def test_a_part_without_calls_of_an_operator_is_verified(
+    recorded: Path, graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of an operator that fires rarely: what stands in for its calls before is in each part."""
+    given = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(every=2 * SECOND)))
+    take = given.sink.firings
+
+    def without(operator: str, records: Any, payload: bytes) -> None:
+        if operator != "second" or records[0].stamp < 4 * SECOND:
+            take(operator, records, payload)
+
+    monkeypatch.setattr(given.sink, "firings", without)
+    given.all()
+
+    parts = parts_of(tmp_path / "run.mcap")
+    assert len(parts) == 5
+    assert [sorted(verdicts(part)) for part in parts] == [["first", "second"]] * 5
+
+
 def test_the_oldest_parts_are_deleted_and_the_rest_verifies(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     (tmp_path / "other_000.mcap").write_bytes(b"of another recording")
     storage = Storage(Splitting(size=10_000), keep=40_000)

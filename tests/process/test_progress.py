@@ -40,6 +40,17 @@ class Reporting:
         return [fields["done"].get("last", 0) for fields in self.channel.of("progress")]
 
 
+def test_a_finding_is_logged_once_while_it_lasts(caplog: pytest.LogCaptureFixture) -> None:
+    one = Reporting()
+    for _ in range(3):
+        one.now += 1
+        one.fires(idle=False)
+    (line,) = caplog.records
+    assert line.getMessage() == "10 things lie askew"
+    assert vars(line)["operator"] == "last"
+    assert one.progress.found == {"last": "30 things lie askew"}
+
+
 def test_a_busy_process_reports_now_and_then() -> None:
     one = Reporting()
     for _ in range(8):

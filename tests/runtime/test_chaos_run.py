@@ -83,6 +83,7 @@ def test_a_process_that_is_started_again_after_its_sources_have_ended_ends_in_or
     assert verify(path, jobs=1).identical
 
 
+@pytest.mark.long
 def test_a_parameter_that_is_changed_changes_what_comes_after_and_is_repeated(tmp_path: Path) -> None:
     path = tmp_path / "tuned.mcap"
     graph = load_graph(HERE / "chaos.yaml", settings=["count=60"], live=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dataflow.graph import Graph, load_graph
-from dataflow.recording import Recording, RecordingWriter
+from dataflow.recording import LogLine, Recording, RecordingWriter
 from dataflow.recording.layout import RESERVED_METADATA
 from dataflow.recording.streams.diff import diff
 from dataflow.records.firing import decode_batch
@@ -22,8 +22,11 @@ HERE = Path(__file__).resolve().parent
 SENSORS = tuple(f"test/{source}/{port}" for source in ("left", "right") for port in ("fast", "slow", "constant"))
 
 
-def thin(full: Path, out: Path, *, streams: tuple[str, ...] = SENSORS, keep: float = 1.0) -> Path:
-    """Only those streams of a recording, its firing records and metadata. `keep`: how much of each stream."""
+def thin(
+    full: Path, out: Path, *, streams: tuple[str, ...] = SENSORS, keep: float = 1.0, logs: tuple[LogLine, ...] = ()
+) -> Path:
+    """Only those streams of a recording, its firing records and metadata. `keep`: how much of each stream; `logs`:
+    lines at its first stamp."""
     with Recording(full) as recording:
         metadata = {n: dict(v) for n, v in recording.metadata.items() if n not in RESERVED_METADATA}
         with RecordingWriter(out, metadata=metadata, namespace="test") as writer:
@@ -37,6 +40,9 @@ def thin(full: Path, out: Path, *, streams: tuple[str, ...] = SENSORS, keep: flo
                     writer.write(stream, m.message, seq=m.seq, incarnation=m.incarnation)
             for operator, payload in recording.firings():
                 writer.write_firings(operator, decode_batch(payload).records[-1].stamp, payload)
+            first = min(s.first for s in recording.streams.values() if s.first)
+            for line in logs:
+                writer.write_log(first, line)
     return out
 
 
@@ -105,6 +111,17 @@ def test_code_that_changed_since_completes_nothing_and_says_where(live: Path, tm
     assert culprit.first is not None
     assert culprit.first.port == "mean"
     assert list(tmp_path.iterdir()) == [tmp_path / "thin.mcap"]
+
+
+def test_lines_of_the_log_that_came_in_one_call_are_taken_over(live: Path, tmp_path: Path) -> None:
+    lines = (LogLine("info", "one", operator="smooth"), LogLine("warning", "two", operator="smooth"))
+
+    made = complete(thin(live, tmp_path / "thin.mcap", logs=lines), tmp_path / "out.mcap")
+
+    assert made.whole
+    with Recording(tmp_path / "thin.mcap") as a, Recording(tmp_path / "out.mcap") as b:
+        assert [line.text for _, line in b.logs()] == ["one", "two"]
+        assert list(a.logs()) == list(b.logs())
 
 
 def test_what_is_not_to_be_had_is_not_made_up(live: Path, tmp_path: Path) -> None:

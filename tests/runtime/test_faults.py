@@ -240,6 +240,7 @@ def test_a_process_that_leaks_past_its_limit_is_started_again(path: Path) -> Non
     assert ran.is_repeated()
 
 
+@pytest.mark.long
 def test_without_a_policy_a_leak_ends_the_run_before_the_machine_does(path: Path) -> None:
     with pytest.raises(RunFailed, match=r"process 'smooth' took \d+ MB of memory \(limit \d+ MB\)"):
         Ran(leaky("restart: {max: 0}"), path, LEAK)

@@ -34,7 +34,6 @@ PLAIN = Scenario(
     policy="",
     placement="process_each",
     window=256,
-    snapshots=False,
     machine=Machine(1),
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from pathlib import Path
@@ -25,11 +26,14 @@ operators:
 
 OWN = """\
 import os
+import sys
 from runtime_operators import Sum
+
+LOADED = "scipy.spatial" in sys.modules
 
 class OwnSum(Sum):
     def summary(self):
-        return {"word": os.environ["A_WORD"], "parent": os.getppid()}
+        return {"word": os.environ["A_WORD"], "parent": os.getppid(), "loaded": LOADED}
 """
 
 
@@ -42,17 +46,18 @@ def runs(pid: int) -> bool:
     return Path(f"/proc/{pid}").exists()
 
 
-def test_processes_of_an_early_nursery_find_modules_and_variables_that_came_after_it(
+def test_processes_of_an_early_nursery_find_modules_variables_and_libraries_that_came_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "own_sum.py").write_text(OWN)
+    importlib.import_module("scipy.spatial")  # as operators of the graph do
     with early_nursery() as early:
         pid = nursery_of(early)
         monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
         monkeypatch.setenv("A_WORD", "said later")
         report = run(load_text(GRAPH), early=early)
 
-    assert report.summaries["sum"] == {"word": "said later", "parent": pid}
+    assert report.summaries["sum"] == {"word": "said later", "parent": pid, "loaded": True}
     assert not runs(pid)
 
 

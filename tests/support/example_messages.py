@@ -301,6 +301,8 @@ def _scene_graph(values: Values, rng: Rng) -> None:
         values[name] = rng.integers(0, max(nodes, 1), relations, dtype=np.int32)
     if values["relation_scores"] is not None:
         values["relation_scores"] = rng.random(relations).astype(np.float32)
+    if values["moving"] is not None:
+        values["moving"] = rng.random(nodes).astype(np.float32)
     if values["tracks"] is not None:
         count = len(values["tracks"]) if nodes else 0
         values["tracks"] = values["tracks"][:count]

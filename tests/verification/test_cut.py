@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from mcap.opcode import Opcode
 
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.recording.layout import RESERVED_METADATA
+from dataflow.recording.layout import CUT, RESERVED_METADATA
+from dataflow.recording.streams.cutting import Cut
 from dataflow.records.firing import encode_batch
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
-from dataflow.verification.verify import verify
+from dataflow.verification.verify import _span, verify
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
@@ -78,3 +80,10 @@ def test_a_recording_torn_at_any_chunk_is_cut_and_else_as_it_was(kept: Path, tmp
 
     assert said[0]
     assert [cut for cut, _ in itertools.groupby(said)] in ([True], [True, False])  # whole up to its index at the last
+
+
+def test_a_part_that_has_no_message_has_nothing_to_verify() -> None:
+    part = SimpleNamespace(path=Path("kept.mcap"), streams={}, metadata={CUT: Cut("run", 5, None).metadata()})
+
+    with pytest.raises(ReplayError, match=r"kept\.mcap: it has no message from the stamp 5 on"):
+        _span(part, None)  # type: ignore[arg-type]

@@ -77,6 +77,7 @@ def test_a_worker_without_progress_is_ended_and_its_last_words_are_shown() -> No
     assert "thinking" in raised.value.details
 
 
+@pytest.mark.long
 def test_what_an_operator_has_started_ends_with_its_worker(tmp_path: Path) -> None:
     note = tmp_path / "pid"
 

@@ -46,6 +46,7 @@ if TYPE_CHECKING:  # imported before the first of these tests runs (tests/confte
     )
     from dataflow.view.backlog import Bounds
     from dataflow.view.blueprint import blueprint
+    from dataflow.view.scores import scores_of
 
 STAMP = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -349,6 +350,19 @@ def test_scores_of_operators_without_outputs_have_a_panel(tmp_path: Path) -> Non
     assert "| matched | 1,210 |" in text
     assert "frames" not in text
     assert "Scores" in [row.values[0] for row in blueprint_rows(path) if row.component.endswith("display_name")]
+
+
+def test_what_an_operator_found_wrong_stands_before_the_scores() -> None:
+    maker, judge = (
+        Node(name, "nowhere:Nothing", {}, {}, outputs, Live("newest", 1, {}))
+        for name, outputs in (("calibration", {"status": "r/calibration/status"}), ("score", {}))
+    )
+    made = Graph("g", "r", {n.name: n for n in (judge, maker)}, {}, Record(()), Bundle("g.yaml", {"g.yaml": ""}))
+    told = {"score": {"ate_rmse_m": 0.1}, "calibration": {"pairs": 3, "finding": "colour lies beside depth"}}
+    assert list(scores_of(told, made).items()) == [
+        ("calibration", {"finding": "colour lies beside depth"}),
+        ("score", {"ate_rmse_m": 0.1}),
+    ]
 
 
 def test_targets_are_named_in_words() -> None:

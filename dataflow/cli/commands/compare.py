@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,16 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.commands.sweep import Again, Folder, Jobs, Patience, Ray, Recordings, work
-from dataflow.cli.support.arguments import Json, Map, ModuleFolders, find_modules_in, graph_file
+from dataflow.cli.support.again import take_environment
+from dataflow.cli.support.arguments import (
+    Json,
+    Map,
+    ModuleFolders,
+    Overwrite,
+    find_modules_in,
+    graph_file,
+    output_file,
+)
 from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
 from dataflow.cli.support.report import is_score
 from dataflow.cli.support.run_options import Quiet, Verbose
@@ -20,24 +30,45 @@ if TYPE_CHECKING:
     from dataflow.sweep.paired import Difference, Paired
     from dataflow.sweep.plan import Choice
     from dataflow.sweep.run import Sweep
+    from dataflow.sweep.swap import Both, Share
 
 MOST_NAMED = 5
 """Recordings listed."""
 LEAST = 6
 """Pairs that Wilcoxon's test needs for a p below 5 %."""
+EXPLAINED = 3
+"""Recordings whose change is explained, those that change the most."""
+WHOLE = 0.9
+"""Share of a change from which an operator is said to bring it."""
+
+
+Chosen = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="[a:|b:]NAME=VALUE",
+        help="A graph parameter, or OPERATOR.PARAM: of A, of B, or of both. May be repeated.",
+    ),
+]
+Explain = Annotated[
+    str | None,
+    typer.Option(
+        "--explain",
+        metavar="FIGURE",
+        help=f"Which operator brings the change of this figure? Replays the {EXPLAINED} recordings where B is worst by "
+        "A, with the outputs of one operator after the other as B made them.",
+    ),
+]
+Rerun = Annotated[
+    Path | None,
+    typer.Option("--rerun", metavar="FILE.rrd", help="Draw the recording where B is worst: A and B as layers."),
+]
 
 
 def compare(
     graph: Annotated[Path, typer.Argument(metavar="GRAPH", help="The graph.")],
     recordings: Recordings = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="[a:|b:]NAME=VALUE",
-            help="A graph parameter, or OPERATOR.PARAM: of A, of B, or of both. May be repeated.",
-        ),
-    ] = None,
+    settings: Chosen = None,
     maps: Map = None,
     path: ModuleFolders = None,
     folder: Folder = Path("out/sweep"),
@@ -45,6 +76,9 @@ def compare(
     ray: Ray = None,
     timeout: Patience = 3600.0,
     again: Again = False,
+    explain: Explain = None,
+    rerun: Rerun = None,
+    overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     json: Json = False,
@@ -66,11 +100,12 @@ def compare(
 
       dataflow compare perception --recordings runs --set b:detector=yolox_nano
       dataflow compare cloud --recordings runs --set b:cloud.stride=8 --json
+      dataflow compare perception --recordings runs --set b:detector=yolox_nano --explain recall --rerun worst.rrd
     """
     choices = _choices(settings or ())
     with friendly_errors():
         find_modules_in(path)
-        from dataflow.sweep.paired import compared, differing, figures_of
+        _prepare(graph, choices[0], explain, rerun, overwrite=overwrite)
         from dataflow.sweep.plan import SweepError
         from dataflow.sweep.run import Sweep
 
@@ -79,13 +114,38 @@ def compare(
             given = (choices, maps or (), path or ())
             plan = Sweep(recordings or (), "replay", file, *given, folder, jobs, ray, timeout, again, "compare")
             work(plan, quiet=quiet)
+            _look(plan, explain, rerun, json=json, verbose=verbose)
         except SweepError as error:
             raise fail(str(error)) from None
-        first, second = ([task for task in plan.tasks if task.settings == choice] for choice in choices)
-        figures = compared(figures_of(first, second, plan.store))
-        loaded = plan.graphs[choices[0]]
-        different = differing(first, second, plan.store, tuple(loaded.nodes) if loaded is not None else ())
-    _report(plan, figures, different, json=json, verbose=verbose)
+
+
+def _prepare(graph: Path, first: Choice, explain: str | None, rerun: Path | None, *, overwrite: bool) -> None:
+    """Checks the file, and takes the environment of operators where some are to run in this process."""
+    if rerun is not None:
+        output_file(rerun, ".rrd", overwrite=overwrite, option="--rerun")
+    if explain is not None or rerun is not None:
+        from dataflow.graph import load_graph
+
+        take_environment(load_graph(graph_file(graph), settings=[f"{n}={v}" for n, v in first]).threads)
+
+
+def _look(plan: Sweep, explain: str | None, rerun: Path | None, *, json: bool, verbose: bool) -> None:
+    """Compares what is kept, and reports it."""
+    from dataflow.sweep.paired import compared, differing, figures_of
+
+    first, second = ([task for task in plan.tasks if task.settings == choice] for choice in plan.choices)
+    figures = compared(figures_of(first, second, plan.store))
+    loaded = plan.graphs[plan.choices[0]]
+    different = differing(first, second, plan.store, tuple(loaded.nodes) if loaded is not None else ())
+    scores = [one for one in figures if is_score(one.figure)]
+    shown = list(figures) if verbose or not scores else scores
+    shares = None if explain is None else _explained(plan, _named(explain, figures), different)
+    drawn = None if rerun is None or not figures else _drawn(plan, _named(explain, figures), rerun)
+    code = _report(plan, figures, shown, different, shares, json=json)
+    if drawn is not None and not json:
+        out.print(Text(f"wrote {rerun}: A and B of {drawn} as layers"), soft_wrap=True)
+    if code:
+        raise typer.Exit(code)
 
 
 def _choices(words: Sequence[str]) -> tuple[Choice, Choice]:
@@ -103,9 +163,64 @@ def _choices(words: Sequence[str]) -> tuple[Choice, Choice]:
     return tuple(sides["a"]), tuple(sides["b"])
 
 
+def _named(name: str | None, figures: Sequence[Paired]) -> Paired:
+    """The figure of that name, without its operator's where one alone has it; without a name the first listed."""
+    if name is None:
+        return next((one for one in figures if is_score(one.figure)), figures[0])
+    found = [one for one in figures if one.figure == name]
+    found = found or [one for one in figures if one.figure.partition(": ")[2] == name]
+    if len(found) != 1:
+        from dataflow.graph.problems import did_you_mean
+
+        there = found or [one for one in figures if is_score(one.figure)] or figures
+        raise fail(f"--explain {name!r}: {did_you_mean(name, (one.figure for one in there), 'there are')}")
+    return found[0]
+
+
+def _both(plan: Sweep, name: str, folder: str) -> Both:
+    """A recording by A and by B, with every stream."""
+    from dataflow.sweep.plan import SweepError
+    from dataflow.sweep.swap import both
+
+    a, b = (plan.graphs[choice] for choice in plan.choices)
+    where = next(task.source.where for task in plan.tasks if task.source.name == name)
+    if "://" in where:
+        raise SweepError(f"{where}: --explain and --rerun need the recording on this machine")
+    assert a is not None
+    assert b is not None
+    return both(Path(where), (a, b), plan.maps, Path(folder))
+
+
+def _explained(plan: Sweep, figure: Paired, different: Sequence[Difference]) -> list[Share]:
+    from dataflow.sweep.swap import between, parts, shares
+
+    made = []
+    for name, _ in figure.recordings[:EXPLAINED]:
+        with tempfile.TemporaryDirectory(prefix="dataflow_compare_") as folder:
+            one = _both(plan, name, folder)
+            names = between(one.graphs, [d.operator for d in different], figure.figure)
+            made.append(parts(one, names, figure.figure))
+    return shares(made)
+
+
+def _drawn(plan: Sweep, figure: Paired, file: Path) -> str:
+    from dataflow.sweep.layers import draw
+
+    name = figure.recordings[0][0]
+    with tempfile.TemporaryDirectory(prefix="dataflow_compare_") as folder:
+        draw(_both(plan, name, folder), file)
+    return name
+
+
 def _report(
-    plan: Sweep, figures: Sequence[Paired], different: Sequence[Difference], *, json: bool, verbose: bool
-) -> None:
+    plan: Sweep,
+    figures: Sequence[Paired],
+    shown: Sequence[Paired],
+    different: Sequence[Difference],
+    shares: Sequence[Share] | None,
+    *,
+    json: bool,
+) -> int:
     failed = [s for s in plan.summary() if set(s["outcomes"]) - {"done"}]
     if json:
         print_json(
@@ -114,20 +229,20 @@ def _report(
                 "b": dict(plan.choices[1]),
                 "figures": [asdict(one) | {"differs": one.differs} for one in figures],
                 "operators": [asdict(one) for one in different],
+                **({} if shares is None else {"explained": [asdict(one) for one in shares]}),
                 "failed": [{"settings": s["settings"], "outcomes": s["outcomes"]} for s in failed],
             }
         )
     else:
-        _print(figures, different, verbose=verbose)
+        _print(shown, different)
+        if shares is not None:
+            _print_shares(shares)
         for summary in failed:
             out.print(Text(f"failed: {summary['settings'] or 'as the graph is'}: {summary['outcomes']}", style="red"))
-    if failed:
-        raise typer.Exit(1)
+    return 1 if failed else 0
 
 
-def _print(figures: Sequence[Paired], different: Sequence[Difference], *, verbose: bool) -> None:
-    scores = [one for one in figures if is_score(one.figure)]
-    shown = list(figures) if verbose or not scores else scores
+def _print(shown: Sequence[Paired], different: Sequence[Difference]) -> None:
     columns = ("A", "B", "B - A", "95 % interval", "p", "recordings")
     made = table("figure", *columns, right=columns)
     for one in shown:
@@ -157,3 +272,15 @@ def _print(figures: Sequence[Paired], different: Sequence[Difference], *, verbos
             f"{d.operator} in {d.recordings}" + (f" (first in {d.first})" if d.first else "") for d in different
         )
         out.print(Text(f"outputs differ of: {listed}"), soft_wrap=True)
+
+
+def _print_shares(shares: Sequence[Share]) -> None:
+    made = table("its outputs as in B, all else A", "change", "of B - A", right=("change", "of B - A"))
+    for one in shares:
+        made.add_row(Text(one.operator), f"{one.change:+.3g}", f"{one.share:.0%}")
+    out.print(made)
+    bringing = next((one for one in shares if one.share >= WHOLE), None)
+    if bringing is None:
+        out.print("no operator's outputs alone bring the change")
+    else:
+        out.print(Text(f"the outputs of {bringing.operator} alone bring it; those behind it in the graph follow"))

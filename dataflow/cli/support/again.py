@@ -25,23 +25,24 @@ def begin_again(
     if graph is None and settings:
         raise fail("--set changes a graph file: name it with --graph")
     find_modules_in(folders)
-    _take_environment(recording)
+    from dataflow.recording import Recording
+    from dataflow.reexecution.recorded_run import resolved_graph
+
+    with Recording(recording) as opened:
+        recorded = resolved_graph(opened)
+    take_environment(1 if recorded is None else recorded.threads)
     from dataflow.graph import load_graph
 
     return None if graph is None else load_graph(graph_file(graph), settings=settings or ())
 
 
-def _take_environment(recording: Path) -> None:
+def take_environment(threads: int) -> None:
     """Begins anew with the environment of operators where this process has another one: libraries read the number of
     their threads, and Python the salt of hashes, when they begin."""
     from dataflow.cli import start
     from dataflow.execution.threads import environment
-    from dataflow.recording import Recording
-    from dataflow.reexecution.recorded_run import resolved_graph
 
-    with Recording(recording) as opened:
-        graph = resolved_graph(opened)
-    wanted = environment(1 if graph is None else graph.threads)
+    wanted = environment(threads)
     if start.words is not None and any(
         os.environ.get(name) != value for name, value in wanted.items() if name != "PYTHONPATH"
     ):

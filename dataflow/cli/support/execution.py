@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -146,7 +147,8 @@ def _named_by(failure: RunFailed, graph: Graph) -> str | None:
     """The parameter, such as `camera.path`, whose value stands in a failure; the one with the longest value."""
     node = graph.nodes.get(failure.operator or "")
     texts = {name: value for name, value in (node.params if node else {}).items() if isinstance(value, str) and value}
-    named = [name for name, value in texts.items() if str(Path(value)) in str(failure)]
+    ends = r"(?![\w.-])"  # `imu` does not name the file imu.csv
+    named = [name for name, value in texts.items() if re.search(re.escape(str(Path(value))) + ends, str(failure))]
     return f"{failure.operator}.{max(named, key=lambda name: len(texts[name]))}" if named else None
 
 

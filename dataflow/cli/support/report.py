@@ -15,7 +15,7 @@ from rich.text import Text
 
 from dataflow.cli.support.output import called, count, plural, seconds, size, table
 from dataflow.operator import FINDING
-from dataflow.records.figures import figures
+from dataflow.records.figures import figures, words_of
 from dataflow.supervision.core.report import RunReport
 from dataflow.sync import MISSES, TICK
 from dataflow.sync.stamps import format_stamp
@@ -24,8 +24,8 @@ _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""
 
 
-SCORES = ("rmse", "precision", "recall", "f1", "iou", "accuracy", "error")
-"""Parts of the names of figures that say how good something is."""
+SCORES = frozenset({"rmse", "precision", "recall", "f1", "ap50", "iou", "miou", "accuracy", "error"})
+"""Words in the names of figures that say how good something is."""
 MOST_SCORES, MOST_LOSSES, MOST_KEPT = 3, 4, 5
 SCORES_IN_ALL = 6
 """Of all operators, at least one of each."""
@@ -71,7 +71,7 @@ def _print_tables(console: Console, report: RunReport) -> None:
 
 def is_score(name: str) -> bool:
     """Returns whether a figure, alone or after its operator ("operator: name"), measures how good something is."""
-    return any(part in name.replace(":", " ").split() for part in SCORES)
+    return bool(SCORES & words_of(name))
 
 
 def _scores(report: RunReport) -> Text | None:

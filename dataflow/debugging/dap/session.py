@@ -75,6 +75,7 @@ class Session:
         self._variables, self._frames = Variables(), list[FrameType]()
         self._homes = homes_of(debugger.node.operator.__module__)
         self._lines = Lines(self._at_line, self._homes)
+        debugger.between = self._look_on_the_way
         self._touched = False
         """True where what was evaluated in the call may have changed something."""
         self._away: Callable[[], Going] | None = None
@@ -114,7 +115,11 @@ class Session:
 
     def _go(self) -> None:
         """Makes one call under watch, and finds what is next."""
-        fired = self._debugger.goto(self._going.call, self._watched(self._at_line), lambda: self._touched)
+        try:
+            fired = self._debugger.goto(self._going.call, self._watched(self._at_line), lambda: self._touched)
+        except Abandoned:  # on the way there
+            self._going = self._reached()
+            return
         if self._away is not None:
             self._going = self._led()
             return
@@ -135,9 +140,21 @@ class Session:
         here, away, self._away = self._going.call, self._away, None
         try:
             return away()
+        except Abandoned:
+            return self._reached()
         except (ReplayError, OperatorFailure) as error:
             self._say(str(error), "stderr")
             return Going(here, self._first_line)
+
+    def _reached(self) -> Going:
+        """The call at which a way to another was broken off."""
+        return Going(max(self._debugger.reached, 0), self._first_line)
+
+    def _look_on_the_way(self) -> None:
+        """Answers requests between two calls on the way to another, which a pause breaks off."""
+        self._look()
+        if self._pauses:
+            raise Abandoned
 
     def _watched(self, at_line: Callable[[FrameType, int], None]) -> Through:
         """Makes calls under watch; answers requests that are there when one begins, and on its way."""

@@ -72,23 +72,31 @@ def export_7scenes(material: Material, folder: Path, done: Exported) -> None:
     images = {m.stamp: m for m in messages_as(material, material.only("7-Scenes", *IMAGES), Image, done)}
     poses = {m.stamp: m for m in messages_as(material, optional(material, *POSES), Pose, done)}
     count = 0
+    taken: set[int] = set()
+    placed: set[int] = set()
     depths = material.only("7-Scenes", *DEPTHS)
     for depth in messages_as(material, depths, DepthImage, done):
         image = nearest(images, depth.stamp)
         if image is None:
             done.lose(material.names[depths], "depth without an image within 20 ms, left out")
             continue
+        taken.add(image.stamp)
         stem = f"frame-{count:06d}"
         write_png(folder / f"{stem}.color.png", image)
         write_depth(folder / f"{stem}.depth.png", depth, SCENES_UNITS, material.names[depths], done)
         pose = nearest(poses, depth.stamp)
         if pose is not None:
             assert isinstance(pose, Pose)
+            placed.add(pose.stamp)
             rows = transform_matrix(pose.position, pose.orientation)
             write_text(folder / f"{stem}.pose.txt", _matrix_text(rows), None)
         count += 1
     if not count:
         raise RecordingError(f"{material.path}: no image lies within 20 ms of a depth image")
+    for what, messages, used in (("image", images, taken), ("pose", poses, placed)):
+        if left := len(messages) - len(used):
+            stream = material.only("7-Scenes", *IMAGES) if what == "image" else optional(material, *POSES)
+            done.lose(material.names[stream or ""], f"{what} without a depth image within 20 ms, left out", left)
     done.files.append(str(folder))
     _intrinsics(material, folder, done)
 

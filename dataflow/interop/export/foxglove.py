@@ -8,7 +8,7 @@ from mcap.writer import CompressionType, Writer
 
 from dataflow.foxglove.drawing import data_of, drawing_of, schema_of
 from dataflow.interop.export.extras import carry
-from dataflow.interop.export.material import Material
+from dataflow.interop.export.material import Material, distinct
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Message
 from dataflow.recording.streams.foxglove import FOXGLOVE_SCHEMAS
@@ -23,6 +23,7 @@ def export_foxglove(material: Material, file: Path, done: Exported) -> None:
         writer = Writer(opened, compression=CompressionType.ZSTD)
         writer.start(profile="", library="dataflow convert")
         channels: dict[tuple[str, str], int] = {}
+        called = distinct(material.names.values(), _topic, [t.name for t in material.untouched])
         kept: dict[str, int] = {}
         for topic in material.untouched:
             schema = writer.register_schema(topic.schema.name, topic.schema.encoding, topic.schema.data)
@@ -31,7 +32,7 @@ def export_foxglove(material: Material, file: Path, done: Exported) -> None:
             stamp, message = max(recorded.stamp, 0), recorded.message
             place = (recorded.stream, schema_of(message)[0].name)
             if place not in channels:
-                channels[place] = _open(writer, f"/{material.names[recorded.stream].lstrip('/')}", message)
+                channels[place] = _open(writer, called[material.names[recorded.stream]], message)
             known = FOXGLOVE_SCHEMAS.get(type(message))
             for field in () if known is None else known.encode(message)[1]:
                 if field == "precise":
@@ -51,6 +52,10 @@ def export_foxglove(material: Material, file: Path, done: Exported) -> None:
         carry(material, writer, done)
         writer.finish()  # type: ignore[no-untyped-call]
     done.files.append(str(file))
+
+
+def _topic(name: str) -> str:
+    return f"/{name.lstrip('/')}"
 
 
 def _open(writer: Writer, topic: str, message: Message) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -16,6 +16,21 @@ from dataflow.interop.streams import BagStreams
 from dataflow.messages import Message
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
 from dataflow.recording.layout import BAG, RECORDING
+
+
+def distinct(names: Iterable[str], called: Callable[[str], str], taken: Iterable[str] = ()) -> dict[str, str]:
+    """What each of some names is called in an output: `called(name)`, `_2` or more behind one that is taken.
+
+    Names that are called as they are keep their name.
+    """
+    found: dict[str, str] = {}
+    used = set(taken)
+    for name in sorted(set(names), key=lambda name: (called(name) != name, name)):
+        wanted = called(name)
+        options = (wanted, *(f"{wanted}_{number}" for number in range(2, len(used) + 3)))
+        found[name] = next(option for option in options if option not in used)
+        used.add(found[name])
+    return found
 
 
 class Material:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dataflow.interop.export.extras import Extras, tell_runs
-from dataflow.interop.export.material import Material
+from dataflow.interop.export.material import Material, distinct
 from dataflow.interop.export.report import Exported
 from dataflow.recording import RecordingWriter
 from dataflow.recording.layout import BAG
@@ -18,7 +18,12 @@ def export_own(material: Material, file: Path, done: Exported, *, overwrite: boo
     Static messages of a bag, which may be stamped by another clock, get the stamp of the first other message.
     """
     with RecordingWriter(file, metadata={}, overwrite=overwrite) as writer:
-        names = {name: name.strip("/") or name for name in material.streams}
+        names = distinct(material.streams, _plain, [t.name for t in material.untouched])
+        material.account.notes += [
+            f"topic {name} is the stream {called}, since {_plain(name)} is taken"
+            for name, called in names.items()
+            if called != _plain(name)
+        ]
         for name, info in material.streams.items():
             assert info.message_type is not None
             writer.add_stream(
@@ -42,6 +47,10 @@ def export_own(material: Material, file: Path, done: Exported, *, overwrite: boo
             writer.add_metadata(BAG, material.facts())
         _carry(material, writer, done)
     done.files.append(str(file))
+
+
+def _plain(topic: str) -> str:
+    return topic.strip("/") or topic
 
 
 def _carry(material: Material, writer: RecordingWriter, done: Exported) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from dataflow.interop.bag import Topic
 from dataflow.interop.export.extras import ROSBAG2, carry
-from dataflow.interop.export.material import Material
+from dataflow.interop.export.material import Material, distinct
 from dataflow.interop.export.report import Exported
 from dataflow.interop.ros.made import typestore
 from dataflow.interop.ros.outward import OUTWARD
@@ -72,19 +74,19 @@ class Ros2Writer:
         self.mcap = Writer(self._stream, compression=CompressionType.ZSTD)
         self.mcap.start(profile="ros2", library="dataflow convert")
         self._schemas: dict[SchemaText, int] = {}
-        self._channels: dict[tuple[str, str], _Channel] = {}
+        self._channels: dict[tuple[str, SchemaText], _Channel] = {}
         self._first: int | None = None
         self._last = 0
 
     def write(
         self, topic: str, schema: SchemaText, data: bytes, stamp: int, *, latched: bool = False, unit: str = ""
     ) -> None:
-        """Adds a message; a topic of two types has two channels. `unit`: of its numbers, for the channel's metadata,
-        since ROS has no place for it."""
+        """Adds a message; a topic of two types or definitions has two channels. `unit`: of its numbers, for the
+        channel's metadata, since ROS has no place for it."""
         topic = topic.removesuffix(f" ({schema.name})")  # as the rarer type of a topic is called here
-        channel = self._channels.get((topic, schema.name))
+        channel = self._channels.get((topic, schema))
         if channel is None:
-            channel = self._channels[topic, schema.name] = self._open(topic, schema, latched, unit)
+            channel = self._channels[topic, schema] = self._open(topic, schema, latched, unit)
         self.mcap.add_message(channel.id, log_time=stamp, publish_time=stamp, data=data, sequence=channel.count)
         channel.count += 1
         self._first = stamp if self._first is None else min(self._first, stamp)
@@ -122,7 +124,7 @@ class Ros2Writer:
         for (topic, _), channel in self._channels.items():
             lines += [
                 "    - topic_metadata:",
-                f"        name: {topic}",
+                f"        name: {json.dumps(topic)}",
                 f"        type: {channel.type}",
                 "        serialization_format: cdr",
                 "        offered_qos_profiles: |-",
@@ -133,9 +135,9 @@ class Ros2Writer:
             '  compression_format: ""',
             '  compression_mode: ""',
             "  relative_file_paths:",
-            f"    - {self.file.name}",
+            f"    - {json.dumps(self.file.name)}",
             "  files:",
-            f"    - path: {self.file.name}",
+            f"    - path: {json.dumps(self.file.name)}",
             "      starting_time:",
             f"        nanoseconds_since_epoch: {first}",
             "      duration:",
@@ -159,16 +161,19 @@ def export_ros2(material: Material, folder: Path, done: Exported) -> None:
         if topic not in ros:
             done.left_out[topic.name] = f"{topic.encoding} messages of {topic.schema.name or 'no schema'}"
     writer = Ros2Writer(folder)
+    called = distinct([*(t.name for t in ros), *material.topics.values(), *material.names.values()], _ros_name)
     try:
-        _copy(material, ros, writer, done)
-        _convert(material, others, writer, done)
+        _copy(material, ros, called, writer, done)
+        _convert(material, others, called, writer, done)
         carry(material, writer.mcap, done, without=(ROSBAG2,))
     finally:
         writer.close()
     done.files.append(str(folder))
 
 
-def _copy(material: Material, topics: list[Topic], writer: Ros2Writer, done: Exported) -> None:
+def _copy(
+    material: Material, topics: list[Topic], called: Mapping[str, str], writer: Ros2Writer, done: Exported
+) -> None:
     kinds: dict[str, RosType] = {}
     schemas: dict[str, SchemaText] = {}
     latched = {t.name: t.latched for t in topics}
@@ -188,13 +193,15 @@ def _copy(material: Material, topics: list[Topic], writer: Ros2Writer, done: Exp
     for stored in material.stored(list(schemas)):
         kind_of = kinds.get(stored.topic)
         data = bytes(stored.data) if kind_of is None else kind_of.to_cdr(stored.data)
-        name = _ros_name(stored.topic)
+        name = called[stored.topic]
         log_time = stored.log_time - shift  # as it was: it all is of the recorder's clock
         writer.write(name, schemas[stored.topic], data, log_time, latched=latched[stored.topic])
         done.count(name)
 
 
-def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exported) -> None:
+def _convert(
+    material: Material, names: list[str], called: Mapping[str, str], writer: Ros2Writer, done: Exported
+) -> None:
     store = typestore()
     schemas: dict[str, SchemaText] = {}
     mapped = []
@@ -209,7 +216,7 @@ def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exp
     for recorded in material.messages(mapped) if mapped else ():
         name = recorded.stream
         static = material.streams[name].static
-        topic = _topic_of(material, name)
+        topic = _topic_of(material, name, called)
         try:
             message = _made(material.streams[name].metadata.get("type", ""), recorded.message)
         except RecordingError as error:
@@ -230,12 +237,12 @@ def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exp
         done.count(topic)
 
 
-def _topic_of(material: Material, name: str) -> str:
+def _topic_of(material: Material, name: str, called: Mapping[str, str]) -> str:
     if name in material.topics:
-        return _ros_name(material.topics[name])
+        return called[material.topics[name]]
     if material.streams[name].message_type is Transforms:
         return "/tf_static" if material.streams[name].static else "/tf"
-    return _ros_name(material.names[name])
+    return called[material.names[name]]
 
 
 def _made(recorded_as: str, message: Message) -> Any:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from dataflow.interop.seen import lose
 from dataflow.messages import PointCloud
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.streams.pixels import rows_without_padding
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Of sensor_msgs/PointField."""
@@ -31,14 +32,15 @@ def point_cloud(message: Any, stamp: int, period: float = TYPICAL_PERIOD) -> Poi
     points = _points(message)
     for name in left_out(message):
         lose(message, f"the field {name} of the points")
-    names_ = points.dtype.names or ()
-    if (rgb := _found(names_, _COLOR)) is not None and points[rgb].dtype.itemsize != 4:
+    names = points.dtype.names or ()
+    if (rgb := _found(names, _COLOR)) is not None and points[rgb].dtype.itemsize != 4:
         lose(message, f"the field {rgb} of the points, which is no packed colour")
-    if points.dtype.names is None or not {"x", "y", "z"} <= set(points.dtype.names):
+    if not set("xyz") <= set(names):
+        raise RecordingError(f"a cloud without x, y and z; its fields are {', '.join(names) or 'none'}")
+    if many := [axis for axis in "xyz" if points[axis].ndim > 1]:
         raise RecordingError(
-            f"a cloud without x, y and z; its fields are {', '.join(points.dtype.names or ()) or 'none'}"
+            f"a cloud whose field {many[0]} has {points[many[0]].shape[1]} values a point, 1 is wanted"
         )
-    names = points.dtype.names
     times = _found(names, _TIMES)
     offsets, odd = None, ""
     if times is not None and points[times].ndim == 1:
@@ -77,11 +79,11 @@ def left_out(message: Any) -> tuple[str, ...]:
 def _points(message: Any) -> npt.NDArray[Any]:
     order = ">" if message.is_bigendian else "<"
     names, formats, offsets = [], [], []
-    for f in message.fields:
+    for number, f in enumerate(message.fields):
         if f.datatype not in _TYPES:
             raise RecordingError(f"a cloud whose field {f.name!r} has the unknown type {f.datatype}")
         kind = order + _TYPES[f.datatype]
-        names.append(f.name)
+        names.append(f.name if f.name and f.name not in names else f"{f.name} ({number})")  # padding shares a name
         formats.append(kind if f.count <= 1 else (kind, (f.count,)))
         offsets.append(f.offset)
     layout: Mapping[str, Any] = {"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step}
@@ -94,16 +96,16 @@ def _points(message: Any) -> npt.NDArray[Any]:
     if not dtype.itemsize:
         raise RecordingError(f"a cloud whose points have {len(names)} fields and no bytes")
     used = message.width * message.point_step
+    step = max(used, int(message.row_step)) if message.height > 1 else used
     data = np.asarray(message.data, np.uint8)
-    if message.height > 1 and message.row_step > used:
-        data = np.ascontiguousarray(data[: message.height * message.row_step].reshape(message.height, -1)[:, :used])
-    data = data.reshape(-1)
-    wanted = used * message.height
-    if len(data) < wanted:
+    wanted = step * message.height
+    if len(data) < wanted - (step - used):
         raise RecordingError(
             f"a cloud of {message.width}x{message.height} points needs {wanted} bytes, got {len(data)}"
         )
-    return data[:wanted].view(dtype)
+    if len(data) > wanted:
+        lose(message, f"{len(data) - wanted:,} bytes behind the last of {message.width}x{message.height} points")
+    return rows_without_padding(data, message.height, step, used).view(dtype)
 
 
 def _found(names: Any, wanted: tuple[str, ...]) -> str | None:
@@ -160,6 +162,8 @@ def point_times(
     low, high = float(finite.min()), float(finite.max())
     since = next((unit for unit, least in _EPOCH.items() if low > least and not (whole and unit == "s")), None)
     if since is not None:
+        if not whole and (step := float(np.spacing(finite.max())) * _UNITS[since]) > SHORTEST * period:
+            return None, f"{8 * values.dtype.itemsize} bits hold times of the epoch in steps of {step:g} s"
         offsets = _since_epoch(values, since, stamp)
         if np.nanmax(np.abs(offsets)) <= LONGEST:
             return offsets.astype(np.float32), ""

@@ -7,20 +7,30 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.interop.conversions import decoded, rgb
 from dataflow.interop.ros.values import first, known, optional
 from dataflow.interop.seen import lose
 from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, CompressedVideo, DepthImage, Image, Image16
-from dataflow.messages.images import PNG_SIGNATURE, START_CODES
+from dataflow.messages.camera import COEFFICIENTS
+from dataflow.messages.images import PNG_SIGNATURE, START_CODES, file_format
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.foxglove.images import video_format
-from dataflow.recording.streams.pixels import as_depth, as_image, as_image16, is_16_bit, is_depth, stored_rows
+from dataflow.recording.streams.pixels import (
+    as_depth,
+    as_image,
+    as_image16,
+    is_16_bit,
+    is_depth,
+    row_bytes,
+    stored_rows,
+)
 
 _DEPTH_HEADER = struct.Struct("<iff")
 """The header that compressed_depth_image_transport puts before the PNG: format, quantisation parameters A and B."""
 _DEPTH_UNIT = 0.001
-_JPEG = b"\xff\xd8\xff"
 
 
+Raw = Image | Image16 | DepthImage
 _CONVERTED = {
     "rgba8": "the alpha channel",
     "bgra8": "the alpha channel",
@@ -30,18 +40,23 @@ _CONVERTED = {
 """By encoding, what an `Image` does not hold of it."""
 
 
-def image(message: Any, stamp: int) -> Image | Image16 | DepthImage:
+def image(message: Any, stamp: int) -> Raw:
     """sensor_msgs/Image: depth for a depth encoding, and all 16 bits of greys and colours that have them."""
+    step, height = int(message.step), int(message.height)
+    used = row_bytes(message.encoding, message.width)
+    if 0 < step < used and len(message.data) == used * height:
+        lose(message, f"a step of {step:,}, where rows have {used:,} bytes")
+        step = 0
     rows = stored_rows(
         message.encoding,
         message.width,
         message.height,
-        message.step,
+        step,
         message.data,
         big_endian=bool(message.is_bigendian),
     )
     frame = message.header.frame_id
-    rest = len(message.data) - message.height * (int(message.step) or rows[0].nbytes)
+    rest = len(message.data) - message.height * (step or rows[0].nbytes)
     if rest > 0:
         lose(message, f"{rest:,} bytes behind the last of {message.height} rows (is step right?)")
     if is_depth(message.encoding):
@@ -55,8 +70,9 @@ def image(message: Any, stamp: int) -> Image | Image16 | DepthImage:
     return Image(stamp=stamp, frame=frame, data=as_image(message.encoding, rows))
 
 
-def compressed_image(message: Any, stamp: int) -> CompressedImage | CompressedDepth | CompressedVideo:
-    """sensor_msgs/CompressedImage, those of compressed_depth_image_transport and packets of video too."""
+def compressed_image(message: Any, stamp: int) -> CompressedImage | CompressedDepth | CompressedVideo | Raw:
+    """sensor_msgs/CompressedImage, those of compressed_depth_image_transport and packets of video too; formats that a
+    `CompressedImage` does not have (TIFF, BMP) are decoded."""
     data = np.asarray(message.data, np.uint8)
     if data[:4].tobytes().startswith(START_CODES):
         format_ = video_format(message.format)
@@ -64,7 +80,7 @@ def compressed_image(message: Any, stamp: int) -> CompressedImage | CompressedDe
     return compressed(message.format, data, message.header.frame_id, stamp)
 
 
-def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedImage | CompressedDepth:
+def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedImage | CompressedDepth | Raw:
     """An encoded image or depth image, told apart by the text of its format (`16UC1; compressedDepth png`).
 
     A 16-bit grey PNG whose format does not name its pixels (`png`) is depth in millimetres, as devices send it.
@@ -78,8 +94,17 @@ def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedIma
     named = pixels if is_16_bit(pixels) or is_depth(pixels) or pixels in ("mono8", "rgb8", "bgr8") else ""
     if head.startswith(PNG_SIGNATURE) and head[24:26] == b"\x10\x00" and (not named or is_depth(named)):
         return CompressedDepth(stamp=stamp, frame=frame, scale=_DEPTH_UNIT, data=data)
-    kind = "jpeg" if head.startswith(_JPEG) else "png" if head.startswith(PNG_SIGNATURE) else "webp"
-    return CompressedImage(stamp=stamp, frame=frame, format=kind, data=data)
+    if kind := file_format(head):
+        return CompressedImage(stamp=stamp, frame=frame, format=kind, data=data)
+    if any(part in format_.lower() for part in ("264", "265", "hevc")):
+        raise RecordingError(f"a packet of {format_!r} without a start code (as in MP4 files); Annex B form is wanted")
+    found = rgb(decoded(data, repr(format_)))
+    if found.dtype == np.uint16 and not is_depth(named):
+        return Image16(stamp=stamp, frame=frame, data=found)
+    if found.dtype == np.uint8:
+        return Image(stamp=stamp, frame=frame, data=found)
+    encoding = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}.get(found.dtype.name, "")
+    return DepthImage(stamp=stamp, frame=frame, data=as_depth(encoding, found))
 
 
 def compressed_video(message: Any, stamp: int) -> CompressedVideo:
@@ -96,6 +121,8 @@ def ffmpeg_packet(message: Any, stamp: int) -> CompressedVideo:
 
 
 def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> CompressedDepth:
+    if data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE and format_.startswith("16UC1"):
+        return CompressedDepth(stamp=stamp, frame=frame, scale=_DEPTH_UNIT, data=data)  # its header was left out
     head = data[: _DEPTH_HEADER.size].tobytes()
     png = data[_DEPTH_HEADER.size :]
     if len(head) < _DEPTH_HEADER.size or not png[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE:
@@ -115,9 +142,14 @@ def camera_info(message: Any, stamp: int) -> CameraInfo:
     of zeros)."""
     K, D = first(message, "k", "K"), first(message, "d", "D")
     R, P = first(message, "r", "R"), first(message, "p", "P")
-    made = calibration(
-        stamp, message.header.frame_id, message.width, message.height, message.distortion_model, K, D, R, P
-    )
+    model = str(message.distortion_model)
+    if model == "plumb_bob" and len(D) in COEFFICIENTS["rational_polynomial"]:
+        lose(message, f"the model plumb_bob, which has no {len(D)} coefficients (rational_polynomial has)")
+        model = "rational_polynomial"
+    elif len(D) and len(D) not in COEFFICIENTS.get(model, (len(D),)):
+        lose(message, f"a distortion of {len(D)} coefficients, which {model} does not have")
+        model, D = "none", ()
+    made = calibration(stamp, message.header.frame_id, message.width, message.height, model, K, D, R, P)
     roi, binning = message.roi, (int(message.binning_x) or 1, int(message.binning_y) or 1)
     if max(binning) > 1 and made.cx > 0.8 * made.width:
         # some drivers give the size of the image beside the K of the sensor

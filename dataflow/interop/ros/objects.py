@@ -67,7 +67,9 @@ def detections_3d(message: Any, stamp: int) -> Boxes3D:
 
 
 def marker(message: Any, stamp: int) -> Boxes3D | Path:
-    """visualization_msgs/Marker: a cube or cubes as boxes, a line strip as a path."""
+    """visualization_msgs/Marker: a cube or cubes as boxes, a line strip as a path; others raise `RecordingError`."""
+    if message.action in DELETE:
+        raise RecordingError("a marker that deletes others has no counterpart")
     if message.type == LINE_STRIP:
         return Path(
             stamp=stamp,

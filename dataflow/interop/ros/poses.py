@@ -21,10 +21,10 @@ def odometry(message: Any, stamp: int) -> Odometry:
         child_frame=_bare(message.child_frame_id),
         position=vector(pose.pose.position),
         orientation=orientation(pose.pose.orientation),
-        pose_covariance=covariance(pose.covariance, 6),
+        pose_covariance=covariance(pose, "covariance", 6),
         linear=vector(twist.twist.linear),
         angular=vector(twist.twist.angular),
-        twist_covariance=covariance(twist.covariance, 6),
+        twist_covariance=covariance(twist, "covariance", 6),
     )
 
 
@@ -35,31 +35,31 @@ def point(message: Any, stamp: int) -> Point:
 
 def pose(message: Any, stamp: int) -> Pose:
     """geometry_msgs/Pose, PoseStamped, PoseWithCovariance and PoseWithCovarianceStamped."""
-    placed, known = message, None
+    placed, owner = message, None
     while hasattr(placed, "pose"):
         placed = placed.pose
-        known = getattr(placed, "covariance", known)
+        owner = placed if hasattr(placed, "covariance") else owner
     return Pose(
         stamp=stamp,
         frame=_frame(message),
         position=vector(placed.position),
         orientation=orientation(placed.orientation),
-        covariance=None if known is None else covariance(known, 6),
+        covariance=None if owner is None else covariance(owner, "covariance", 6),
     )
 
 
 def twist(message: Any, stamp: int) -> Twist:
     """geometry_msgs/Twist, TwistStamped and TwistWithCovarianceStamped."""
-    moved, known = message, None
+    moved, owner = message, None
     while hasattr(moved, "twist"):
         moved = moved.twist
-        known = getattr(moved, "covariance", known)
+        owner = moved if hasattr(moved, "covariance") else owner
     return Twist(
         stamp=stamp,
         frame=_frame(message),
         linear=vector(moved.linear),
         angular=vector(moved.angular),
-        covariance=None if known is None else covariance(known, 6),
+        covariance=None if owner is None else covariance(owner, "covariance", 6),
     )
 
 
@@ -67,6 +67,8 @@ def path(message: Any, stamp: int) -> Path:
     """nav_msgs/Path; timed where the stamps of its poses strictly increase."""
     stamps = np.array([time_ns(p.header.stamp) for p in message.poses], np.int64)
     timed = len(stamps) > 0 and stamps[0] > 0 and bool((np.diff(stamps) > 0).all())
+    if not timed and len(set(stamps.tolist())) > 1:
+        lose(message, "the times of its poses, which do not increase")
     return Path(
         stamp=stamp,
         frame=_frame(message),
@@ -96,17 +98,20 @@ def transforms(rows: Sequence[Any], stamp: int) -> Transforms:
     """Some geometry_msgs/TransformStamped as one set; of those that place one frame the last counts.
 
     Frames that begin with a slash, as in early ROS, are named without it. Left out, and lost: a transform of a frame to
-    itself, and one whose rotation is NaN.
+    itself, one without a frame, and one that is not finite.
     """
     placed = []
     for row in rows:
-        if _bare(row.child_frame_id) == _bare(row.header.frame_id):
-            lose(row, f"a transform of {_bare(row.child_frame_id)} to itself")
-            continue
-        if np.isfinite(orientation(row.transform.rotation)).all():
-            placed.append(row)
+        child, parent = _bare(row.child_frame_id), _bare(row.header.frame_id)
+        numbers = (vector(row.transform.translation), orientation(row.transform.rotation))
+        if child == parent:
+            lose(row, f"a transform of {child} to itself")
+        elif not child or not parent:
+            lose(row, f"a transform from {parent or 'no frame'} to {child or 'no frame'}")
+        elif not all(np.isfinite(values).all() for values in numbers):
+            lose(row, f"a transform to {child} that is not finite")
         else:
-            lose(row, f"a transform to {_bare(row.child_frame_id)} whose rotation is NaN")
+            placed.append(row)
     kept = list({_bare(row.child_frame_id): row for row in placed}.items())
     return Transforms(
         stamp=stamp,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import dataflow.messages as messages
-from dataflow.interop.ros.values import covariance, optional, orientation, vector
+from dataflow.interop.ros.values import covariance, optional, orientation, variance, vector
 from dataflow.interop.seen import lose
 from dataflow.messages.poses import COVARIANCE_TYPES
 from dataflow.recording.errors import RecordingError
@@ -32,14 +32,10 @@ def imu(message: Any, stamp: int) -> messages.Imu:
         angular_velocity=vector(message.angular_velocity),
         linear_acceleration=vector(message.linear_acceleration),
         orientation=orientation(turned) if known else None,
-        angular_velocity_covariance=_known(message.angular_velocity_covariance),
-        linear_acceleration_covariance=_known(message.linear_acceleration_covariance),
-        orientation_covariance=_known(message.orientation_covariance) if known else None,
+        angular_velocity_covariance=covariance(message, "angular_velocity_covariance", 3),
+        linear_acceleration_covariance=covariance(message, "linear_acceleration_covariance", 3),
+        orientation_covariance=covariance(message, "orientation_covariance", 3) if known else None,
     )
-
-
-def _known(values: Any) -> Any:
-    return None if values[0] == _ABSENT else covariance(values, 3)
 
 
 def magnetic_field(message: Any, stamp: int) -> messages.MagneticField:
@@ -48,7 +44,7 @@ def magnetic_field(message: Any, stamp: int) -> messages.MagneticField:
         stamp=stamp,
         frame=message.header.frame_id,
         field=vector(message.magnetic_field),
-        covariance=_known(message.magnetic_field_covariance),
+        covariance=covariance(message, "magnetic_field_covariance", 3),
     )
 
 
@@ -57,6 +53,9 @@ def laser_scan(message: Any, stamp: int) -> messages.LaserScan:
     beams have times."""
     count = len(message.ranges)
     intensities = optional(message.intensities, "<f4")
+    if intensities is not None and len(intensities) != count:
+        lose(message, f"intensities, {len(intensities):,} for {count:,} ranges")
+        intensities = None
     step = float(message.time_increment)
     return messages.LaserScan(
         stamp=stamp,
@@ -66,7 +65,7 @@ def laser_scan(message: Any, stamp: int) -> messages.LaserScan:
         range_min=float(message.range_min),
         range_max=float(message.range_max),
         ranges=np.asarray(message.ranges, np.float32),
-        intensities=intensities if intensities is not None and len(intensities) == count else None,
+        intensities=intensities,
         time_offsets=(np.arange(count) * step).astype(np.float32) if step else None,
     )
 
@@ -79,15 +78,19 @@ def nav_sat_fix(message: Any, stamp: int) -> messages.NavSatFix:
         raise RecordingError(
             f"a latitude of {message.latitude:g} and a longitude of {message.longitude:g} degrees: are they swapped?"
         )
+    longitude = float(message.longitude)
+    if 180 < longitude <= 360:
+        longitude -= 360
+        lose(message, "a longitude of 180 to 360 degrees (it is -180 to 0 here)")
     if not placed and int(message.status.status) >= 0:
         lose(message, "a status of a fix without a position")
-    errors = covariance(message.position_covariance, 3) if kind else None
+    errors = covariance(message, "position_covariance", 3) if kind else None
     return messages.NavSatFix(
         stamp=stamp,
         frame=message.header.frame_id,
         status=_FIX.get(int(message.status.status), "no_fix") if placed else "no_fix",
         latitude=float(message.latitude),
-        longitude=float(message.longitude),
+        longitude=longitude,
         altitude=float(message.altitude),
         covariance_type=COVARIANCE_TYPES[kind] if errors is not None and kind < len(COVARIANCE_TYPES) else "unknown",
         covariance=errors,
@@ -169,19 +172,17 @@ UNITS = {"temperature": "°C", "fluid_pressure": "Pa", "illuminance": "lx", "rel
 def measurement(message: Any, stamp: int) -> messages.Measurement:
     """sensor_msgs/Temperature, FluidPressure, Illuminance and RelativeHumidity."""
     name = next(name for name in UNITS if hasattr(message, name))
-    variance = float(message.variance)
     return messages.Measurement(
         stamp=stamp,
         frame=message.header.frame_id,
         value=float(getattr(message, name)),
         unit=UNITS[name],
-        variance=variance or None,
+        variance=variance(message),
     )
 
 
 def range_reading(message: Any, stamp: int) -> messages.RangeReading:
     """sensor_msgs/Range, with the variance that it has since Jazzy."""
-    variance = float(getattr(message, "variance", 0.0))
     return messages.RangeReading(
         stamp=stamp,
         frame=message.header.frame_id,
@@ -190,7 +191,7 @@ def range_reading(message: Any, stamp: int) -> messages.RangeReading:
         range_max=float(message.max_range),
         field_of_view=float(message.field_of_view),
         radiation="infrared" if int(message.radiation_type) == 1 else "ultrasound",
-        variance=variance or None,
+        variance=variance(message),
     )
 
 

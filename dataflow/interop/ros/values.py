@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.interop.seen import lose
 from dataflow.messages.checks import QUATERNION_TOLERANCE
 
 F64 = npt.NDArray[np.float64]
@@ -35,10 +36,22 @@ def unit(quaternion: F64) -> F64:
     return quaternion if abs(norm - 1.0) <= 0.5 * QUATERNION_TOLERANCE else quaternion / norm
 
 
-def covariance(values: Any, size: int) -> F64 | None:
-    """(size, size); None where it is all zeros, which in ROS means unknown."""
-    data = np.asarray(values, np.float64)
-    return data.reshape(size, size) if data.any() else None
+def covariance(message: Any, name: str, size: int) -> F64 | None:
+    """(size, size) of a field; None where it is not known: all zeros, -1 first (REP 145), or not finite, which is
+    lost."""
+    data = np.asarray(getattr(message, name), np.float64)
+    if not data.any() or data[0] == -1:
+        return None
+    if not np.isfinite(data).all():
+        lose(message, f"{name} that is not finite")
+        return None
+    return data.reshape(size, size)
+
+
+def variance(message: Any) -> float | None:
+    """The variance of a reading; None where it is not known: no field, 0, below or not finite."""
+    value = float(getattr(message, "variance", 0.0))
+    return value if 0 < value < np.inf else None
 
 
 def known(values: Any) -> F64 | None:

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import zstandard
 
-from dataflow.recording.errors import RecordingError
 from dataflow.recording.limits import MAX_CHUNK_BYTES, MAX_RATIO, UNINDEXED_BYTES
 from dataflow.recording.mcap.cache import ChunkCache
 from dataflow.recording.mcap.rawfile import RECORD, RawFile
@@ -163,7 +162,7 @@ class Chunks:
                     return reader.read(size + 1)
             case "lz4":
                 return _unpack_lz4(packed, size + 1) if size else b""
-        raise RecordingError(f"{self._file.path}: chunks are compressed with {compression!r}; known: zstd, lz4, none")
+        raise self._file.damaged(f"{where} is compressed with {compression!r}; known: zstd, lz4, none")
 
 
 def _unpack_lz4(packed: memoryview, most: int) -> bytes:

@@ -117,17 +117,30 @@ def stored_rows(encoding: str, width: int, height: int, step: int, data: Pixels,
         raise RecordingError(f"image encoding {encoding!r} is not known; those known are {', '.join(_LAYOUTS)}")
     element, channels = _LAYOUTS[encoding]
     dtype = np.dtype(element).newbyteorder(">" if big_endian else "<")
-    used = width * channels * dtype.itemsize
+    used = row_bytes(encoding, width)
     step = step or used
-    if step < used or len(data) < step * height or not height * width:
+    if step < used or len(data) < step * (height - 1) + used or not height * width:
         raise RecordingError(
             f"an image of {width}x{height} {encoding} needs rows of {used} bytes, got step {step} and {len(data)} bytes"
         )
-    flat = np.asarray(data, np.uint8)[: step * height]
-    if step != used:
-        flat = np.ascontiguousarray(flat.reshape(height, step)[:, :used]).reshape(-1)
+    flat = rows_without_padding(np.asarray(data, np.uint8), height, step, used)
     pixels = flat.view(dtype).reshape((height, width) if channels == 1 else (height, width, channels))
     return pixels.astype(dtype.newbyteorder("=")) if big_endian else pixels
+
+
+def row_bytes(encoding: str, width: int) -> int:
+    """Bytes that the pixels of a row take; 0 for an encoding that is not known."""
+    element, channels = _LAYOUTS.get(encoding, ("u1", 0))
+    return width * channels * np.dtype(element).itemsize
+
+
+def rows_without_padding(data: Pixels, height: int, step: int, used: int) -> Pixels:
+    """The first `used` of each `step` bytes, flat, for `height` rows; the last row may lack its padding."""
+    if step == used:
+        return data[: step * height]
+    if len(data) < step * height:
+        data = np.concatenate([data, np.zeros(step * height - len(data), np.uint8)])
+    return np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :used]).reshape(-1)
 
 
 def _plain(rows: Pixels) -> Pixels:

@@ -32,6 +32,7 @@ from operators.odometry.rgbd.uniqueness import unique
 PAIRS = 60  # features of one keyframe that are paired
 FEWEST = 8  # different features of a view that must agree on its pose for a look at what else supports it
 APART = 0.5  # metres between two places
+RIVALS = 2  # poses among keyframes that were not chosen that are looked at before a place is believed
 SHARED = 0.15  # of a view that the map must have seen to contradict it
 CONTRADICTED = 0.4  # of what a view and the map both see: less of it agrees only at a wrong place, or after a change
 VIEWS = 2  # keyframes that a recognised view is compared with
@@ -68,7 +69,10 @@ class Landmarks:
 def recognised(
     frame: Frame, chosen: Sequence[Keyframe], fitter: Fitter, motion: Motion, T_predicted: Matrix, known: LocalMap
 ) -> Iterator[tuple[Fit, Keyframe]]:
-    """Yields a frame's poses among chosen keyframes, refined and certain, each with the keyframe that shows most."""
+    """Yields a frame's poses among chosen keyframes, refined and certain, each with the keyframe that shows most.
+
+    A pose that fits the other keyframes of a segment at another place as well is none.
+    """
     if frame.depth_flaw is not None:
         yield from _by_pixels(frame, chosen, fitter, motion, T_predicted, known)
         return
@@ -85,7 +89,12 @@ def recognised(
                 first = None
                 break
             first = first or found
-        if first is not None:
+        if first is None:
+            continue
+        others = [k for k in there if not any(k is one for one in keyframes)]
+        sightings = common(seen, others, fitter.camera)[:RIVALS]
+        rivals = [_refined(frame, sighting, fitter, motion, T_predicted, there) for sighting in sightings]
+        if not any(rival is not None and _apart(rival[0], first[0]) for rival in rivals):
             yield first
 
 

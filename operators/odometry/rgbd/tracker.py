@@ -249,7 +249,8 @@ class RgbdOdometry:
         """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest."""
         newest, surface = self.state.map.newest, fit.movers.left_out_of(frame.surface)
         baseline = view_distance(newest.T_world_camera, fit.T_world_camera, surface.typical_depth)
-        moved = baseline > self.config.keyframe_distance or (fit.compared > 0 and fit.compared < 0.5 * fit.offered)
+        expected = newest.surface.coverage * fit.offered  # what meets a hole of the keyframe has not left its view
+        moved = baseline > self.config.keyframe_distance or (fit.compared > 0 and fit.compared < 0.5 * expected)
         starved = fit.inliers < max(0.4 * len(newest.points), 3 * self.config.min_inliers) or fit.recognised
         better = frame.depth_flaw is None and newest.surface.coverage < 0.5 * surface.coverage
         worse = frame.depth_flaw is None and surface.coverage < 0.5 * newest.surface.coverage

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ ACTIVITIES = (
 )
 _WINDOW = 1.0  # seconds of the past that tell how an agent moves
 _WALKING, _ROLLING, _DRIVING = 0.25, 0.12, 0.07  # m/s
+_KNOWN = 0.6  # probability from which an agent is said to move, or not
 _RISING = 0.15  # m/s, of the head
 
 
@@ -66,12 +68,18 @@ class Motion:
         return np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), np.array([r[2] for r in rows])
 
 
-def activity_of(body: Body, motion: Motion, relations: Mapping[Relation, float]) -> tuple[str, float, int]:
+def activity_of(
+    body: Body, motion: Motion, relations: Mapping[Relation, float], posture: tuple[str, float] | None = None
+) -> tuple[str, float, int]:
     """Returns what an agent does, how sure that is, and the id of what it does it to, -1 for nothing.
 
-    `body` has the velocity of its motion.
+    `body` has the velocity of its motion. `posture` is what a person's joints show, `unknown` where they were looked
+    for in vain, with its probability.
     """
     speed = float(np.hypot(*body.velocity[:2]))
+    if not math.isnan(body.moving) and not body.person:
+        sure = max(body.moving, 1 - body.moving)
+        return (UNKNOWN, 0.3, -1) if sure < _KNOWN else ("driving" if body.moving > 0.5 else "resting", sure, -1)
     if len(motion.past) < 3:
         return UNKNOWN, 0.3, -1
     if "rolls" in body.roles:
@@ -92,8 +100,12 @@ def activity_of(body: Body, motion: Motion, relations: Mapping[Relation, float])
         return "reaching", of["reaching_for"][0], of["reaching_for"][1]
     if speed > _WALKING:
         return "walking", _sure(speed, _WALKING), -1
-    if "sitting_on" in of:
+    if posture is not None and posture[0] == "sitting":
+        return "sitting", posture[1], of.get("sitting_on", (0, -1))[1]
+    if "sitting_on" in of and (posture is None or posture[0] == UNKNOWN):
         return "sitting", of["sitting_on"][0], of["sitting_on"][1]
+    if posture is not None:
+        return *posture, -1
     return "standing", _sure(_WALKING, speed), -1
 
 

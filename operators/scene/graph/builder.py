@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Activity, Diagnostics, Odometry, Pose, SceneGraph, Transforms
+from dataflow.messages import Activity, Classification, Diagnostics, Odometry, Pose, SceneGraph, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
@@ -59,6 +59,11 @@ class SceneGraphBuilder(Operator):
         required=False,
         doc="activities of agents by ActivityRecognizer; fresh ones replace our own, `unknown` of those in sight, too",
     )
+    postures: Sampled[Classification] = Sampled(
+        required=False,
+        doc="whether people stand or sit, by SkeletonPosture; with it, what one in sight does who does neither by it, "
+        "nor anything else, is unknown",
+    )
     graph: Out[SceneGraph] = Out(doc="all nodes and the relations that hold, with their scores")
     activities: Out[Activity] = Out(doc="what agents do, to what, since when, and their likeliest goal")
     changes: Out[Diagnostics] = Out(
@@ -101,6 +106,7 @@ class SceneGraphBuilder(Operator):
         robot: Pose | Odometry | None = None,
         extrinsics: Transforms | None = None,
         recognized: Activity | None = None,
+        postures: Classification | None = None,
     ) -> dict[str, Any]:
         """Raises ValueError where the robot is in another frame than the map, or no transform relates its frames."""
         T = None
@@ -115,7 +121,9 @@ class SceneGraphBuilder(Operator):
             self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, things)
         usable = _usable(nodes)
         bodies, unusable = self._bodies_of(nodes, usable), nodes.count - len(usable)
-        now = self.state.graph.update(nodes.stamp, bodies, T)
+        fresh = postures is not None and nodes.stamp - postures.stamp <= self.fresh * 1e9
+        shown = _postures_of(nodes, postures) if postures is not None and fresh else {}
+        now = self.state.graph.update(nodes.stamp, bodies, T, shown)
         self.state.names |= {b.id: _name(b) for b in now.bodies}
         self.state.counts.update({"graphs": 1, "unusable nodes": unusable, "relations begun": len(now.began)})
         self.state.counts["nodes"], self.state.counts["relations"] = len(now.bodies), len(now.relations)
@@ -132,9 +140,13 @@ class SceneGraphBuilder(Operator):
         names, class_ids = nodes.class_names, nodes.class_ids[rows].tolist()
         labels = [names[c] if names else str(c) for c in class_ids]
         yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
-        return self._bodies.update(
+        bodies = self._bodies.update(
             nodes.ids[rows].tolist(), labels, nodes.positions[rows], nodes.sizes[rows], yaws[rows]
         )
+        if nodes.moving is None:
+            return bodies
+        moving = nodes.moving[rows].tolist()
+        return [replace(b, moving=p) if p == p else b for b, p in zip(bodies, moving, strict=True)]
 
     def _message(self, nodes: SceneGraph, now: Snapshot) -> SceneGraph:
         classes = (*nodes.class_names, *(n for n in EXTRA.values() if n not in nodes.class_names))
@@ -164,6 +176,7 @@ class SceneGraphBuilder(Operator):
             subjects=np.array([at[s] for (s, _, _), _ in held], np.int32),
             objects=np.array([at[o] for (_, _, o), _ in held], np.int32),
             relation_scores=np.array([min(score, 1.0) for _, score in held], np.float32),
+            moving=None if nodes.moving is None else np.array(given(nodes.moving, np.nan), np.float32),
             tracks=None if nodes.tracks is None else np.array([track for track, _ in tracks], np.int64),
             track_nodes=None if nodes.tracks is None else np.array([node for _, node in tracks], np.int32),
         )
@@ -201,6 +214,14 @@ class SceneGraphBuilder(Operator):
             messages=tuple(text for _, text, _ in rows),
             levels=np.array([level for _, _, level in rows], np.uint8),
         )
+
+
+def _postures_of(nodes: SceneGraph, postures: Classification) -> dict[int, tuple[str, float]]:
+    """Returns what the joints of people show, and `unknown` for the nodes in sight of which none do."""
+    seen = np.full(nodes.count, nodes.stamp) if nodes.last_seen is None else nodes.last_seen
+    shown = dict.fromkeys(nodes.ids[nodes.stamp - seen <= _IN_SIGHT].tolist(), (UNKNOWN, 0.3))
+    ids = [] if postures.ids is None else postures.ids.tolist()
+    return shown | dict(zip(ids, zip(postures.labels(), postures.scores.tolist(), strict=True), strict=True))
 
 
 def _recognized(act: Act, recognized: Activity, *, in_sight: bool) -> Act:

@@ -84,15 +84,24 @@ class LayeredGraph(Remembered):
         s = self._settings
         return GoalInference(s.trust, s.memory, s.elsewhere)
 
-    def update(self, stamp: int, things: Sequence[Body], T_world_robot: Array | None) -> Snapshot:
-        """Takes the objects of one time, which may have surfaces among them, and the robot's pose."""
+    def update(
+        self,
+        stamp: int,
+        things: Sequence[Body],
+        T_world_robot: Array | None,
+        postures: Mapping[int, tuple[str, float]] | None = None,
+    ) -> Snapshot:
+        """Takes the objects of one time, which may have surfaces among them, and the robot's pose.
+
+        `postures` has, by id, what the joints of people show, with its probability.
+        """
         s, time = self._settings, stamp * 1e-9
         bodies = list(things)
         for k, body in enumerate(bodies):
             if body.agent:
                 motion = self._motions.setdefault(body.id, Motion())
                 motion.add(time, body)
-                bodies[k] = replace(body, velocity=motion.velocity())
+                bodies[k] = replace(body, velocity=np.zeros(3) if body.moving <= 0.5 else motion.velocity())
         bodies = _with_room(bodies, T_world_robot)
         ids = {b.id for b in bodies}
         vanished = self._known - ids
@@ -105,7 +114,8 @@ class LayeredGraph(Remembered):
         for agent, likely in goals.items():
             sure = {i: p for i, p in likely.items() if i >= 0 and p >= s.least_goal}
             held |= {(agent, "heads_for", i): p for i, p in sure.items()}
-        acts = tuple(self._act(stamp, b, held, goals.get(b.id, {})) for b in bodies if b.agent)
+        shown = postures or {}
+        acts = tuple(self._act(stamp, b, held, goals.get(b.id, {}), shown.get(b.id)) for b in bodies if b.agent)
         appeared = tuple(sorted(ids - self._known))
         self._known = ids
         return Snapshot(tuple(bodies), held, acts, tuple(began), tuple(ended), appeared, tuple(sorted(vanished)))
@@ -116,8 +126,15 @@ class LayeredGraph(Remembered):
         free = [b for b in wanted if (agent.id, "sitting_on", b.id) not in now]
         return self._goals.setdefault(agent.id, self.new_part(GoalInference)).update(time, agent, free)
 
-    def _act(self, stamp: int, agent: Body, held: Mapping[Relation, float], goals: Mapping[int, float]) -> Act:
-        activity, score, object = activity_of(agent, self._motions[agent.id], held)
+    def _act(
+        self,
+        stamp: int,
+        agent: Body,
+        held: Mapping[Relation, float],
+        goals: Mapping[int, float],
+        posture: tuple[str, float] | None,
+    ) -> Act:
+        activity, score, object = activity_of(agent, self._motions[agent.id], held, posture)
         before, since = self._acts.get(agent.id, ("", stamp))
         if before != activity:
             since = stamp

@@ -80,7 +80,7 @@ class SavedMap:
             if not classes or "agent" not in labels.roles(classes[int(votes.argmax())]):
                 objects.append({**_before(each, stamp), "votes": votes, "velocity": np.zeros(3), "tracks": []})
         surfaces = [_before(each, stamp) for each in self.surfaces["surfaces"]]
-        kept = {**self.objects, "objects": objects, "gone": [], "stamp": None}
+        kept = {**self.objects, "objects": objects, "gone": [], "recent": [], "stamp": None}
         return kept, {**self.surfaces, "surfaces": surfaces}
 
     @classmethod

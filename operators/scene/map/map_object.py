@@ -45,7 +45,8 @@ class MapObject:
     the views that its box is fitted to, `form` which of the ways in which its class stands, -1 while that is open,
     `fresh` how many of them are new since the last fit; `held` whether it was last seen in a hand. `beside` counts by
     id the views in which another object was seen too, in a separate place in the image. `tracks` are the ids of the
-    last tracks in images that were of it, the latest last.
+    last tracks in images that were of it, the latest last. `moving` is the probability that it moves, NaN where its
+    place alone tells.
     """
 
     id: int
@@ -69,6 +70,7 @@ class MapObject:
     held: bool = False
     fresh: int = 0
     tracks: list[int] = field(default_factory=list)
+    moving: float = math.nan
 
     def __post_init__(self) -> None:
         self.class_id = int(self.votes.argmax())
@@ -192,7 +194,11 @@ class MapObject:
         beside = sorted(self.beside.items())
         rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
         points = [np.concatenate([v.points for v in rows]), np.array([len(v.points) for v in rows])] if rows else []
-        return plain | rest | {"held": self.held, "fresh": self.fresh, "points": points, "tracks": self.tracks}
+        return (
+            plain
+            | rest
+            | {"held": self.held, "fresh": self.fresh, "points": points, "tracks": self.tracks, "moving": self.moving}
+        )
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:
@@ -210,6 +216,7 @@ class MapObject:
             parts = np.split(np.array(state["points"][0]), np.cumsum(state["points"][1])[:-1])
             made.images = [replace(v, points=own) for v, own in zip(made.images, parts, strict=True)]
         made.fresh = int(state.get("fresh", 0))
+        made.moving = float(state.get("moving", math.nan))
         made.tracks = [int(track) for track in state.get("tracks", ())]
         return made
 

@@ -66,6 +66,7 @@ def nodes_of(
     boxes = [each.box for each in entries]
     class_ids = [o.class_id for o in objects] + [names.index(s.label) for s in surfaces]
     ids = [o.id for o in objects] + [surface_id(s) for s in surfaces]
+    moving = np.array([*(o.moving for o in objects), *(np.nan for _ in surfaces)], np.float32)
     return SceneGraph(
         stamp=stamp,
         frame=frame,
@@ -79,6 +80,7 @@ def nodes_of(
         last_seen=np.array([each.seen for each in entries], np.int64),
         subjects=np.zeros(0, np.int32),
         objects=np.zeros(0, np.int32),
+        moving=None if np.isnan(moving).all() else moving,
         tracks=np.array([track for o in objects for track in o.tracks], np.int64),
         track_nodes=np.array([k for k, o in enumerate(objects) for _ in o.tracks], np.int32),
     )

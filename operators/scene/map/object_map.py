@@ -26,6 +26,7 @@ from operators.scene.map.matching import (
     outside,
 )
 from operators.scene.map.merging import are_one, may_be_one, merge, smaller_in_place
+from operators.scene.map.moving import RecentPlaces
 from operators.scene.map.presence import has_left, look_at
 from operators.scene.map.range_view import RangeView
 from operators.tracking.assignment import assign
@@ -58,6 +59,7 @@ class ObjectMap:
         self._next = 1
         self._stamp: int | None = None
         self._room, self._updates = RoomHeading(), 0
+        self._recent = RecentPlaces(settings.voxel, settings.margin)
         self._heading: float | None = None
         self.floor: float | None = None
         """Height of the floor, where it is known: what stands on it reaches down to it."""
@@ -67,7 +69,7 @@ class ObjectMap:
 
         An object that was found to be a double of another, or one that is known, keeps its id no longer.
         """
-        s = self._settings
+        s, before = self._settings, {*self.objects, *self.gone}
         seconds = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
         self._stamp = stamp
         if self._updates % _AGAIN == 0:
@@ -89,11 +91,14 @@ class ObjectMap:
                 ids[k] = self._begin(each, cells[k], stamp, view.origin)
             if each.track >= 0:
                 self.objects[joined[k] if k in joined else ids[k]].follow([each.track])
+        movers = [o for o in self.objects.values() if o.seen == stamp and self._kinds.is_mover(o)]
+        self._recent.judge(stamp, [o for o in movers if self._kinds.is_large(o)], view)
         shown = {i: cells[k] for k, i in joined.items()}
         self._note_beside(seen, [joined.get(k) for k in range(len(seen))])
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
+        self._forget(before - self.objects.keys() - self.gone.keys())
         return [joined[k] if k in joined else ids[k] for k in range(len(seen))]
 
     @property
@@ -292,6 +297,12 @@ class ObjectMap:
                 self.objects[i] = chosen
                 self.moved += 1
 
+    def _forget(self, lost: set[int]) -> None:
+        """Forgets what was seen beside objects that are no more: their ids do not come back."""
+        for object in self.objects.values() if lost else ():
+            for i in lost & object.beside.keys():
+                del object.beside[i]
+
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
 
     def snapshot(self) -> Mapping[str, Any]:
@@ -303,12 +314,14 @@ class ObjectMap:
             "room": [self._room.scores, self._room.views],
             "objects": [o.snapshot() for o in self.objects.values()],
             "gone": [[stamp, o.snapshot()] for stamp, o in self.gone.values()],
+            "recent": self._recent.snapshot(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         side = self._settings.voxel
         self._updates, (scores, self._room.views) = int(state["updates"]), state["room"]
         self._room.scores = np.array(scores, np.float64)
+        self._recent.restore(state.get("recent", ()))
         self._next, self._stamp, self.moved = int(state["next"]), state["stamp"], int(state["moved"])
         objects = [MapObject.restored(row, side) for row in state["objects"]]
         self.objects = {o.id: o for o in objects}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,20 @@ class RangeView:
             np.minimum.at(self._nearest, bins, ranges)
             np.maximum.at(self._farthest, bins, ranges)
         self.reach = float(ranges.max(initial=0.0))
+
+    def snapshot(self) -> dict[str, Any]:
+        """Returns the view as plain values, without its points."""
+        facts = {"T": self._T_world_sensor, "angle": self._angle, "first": self._first, "shape": list(self._shape)}
+        return facts | {"nearest": self._nearest, "farthest": self._farthest, "reach": self.reach}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, Any]) -> RangeView:
+        """Returns a view of a snapshot, which has no points."""
+        made = cls(np.zeros((0, 3)), np.array(state["T"], np.float64), float(state["angle"]))
+        made._first, made._shape = np.array(state["first"]), tuple(map(int, state["shape"]))
+        made._nearest, made._farthest = np.array(state["nearest"]), np.array(state["farthest"])
+        made.reach = float(state["reach"])
+        return made
 
     @property
     def points(self) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 
 from dataflow.messages.geometry import invert
 from operators.geometry.se3 import Matrix
+from operators.odometry.lidar.search import apart
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import SAVED, KeyframeGraph, Node
 from operators.slam.lidar.scan_context import likeness
@@ -18,6 +19,8 @@ from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting, al
 
 DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # errors of odometry beyond its covariance, over a metre
 STEP = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # and at each keyframe
+PART, PARTS = 2.5, 12  # metres between views, and views, that are looked at before a map counts as found
+AMBIGUOUS = "ambiguous: another place explains the scan as well"
 LEAST = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # of a sight: noise and calibration err alike in all
 
 
@@ -96,13 +99,36 @@ class LidarGraph(PlaceGraph[LidarView]):
     def _recognised(
         self, number: int, candidates: Sequence[int], eyes: Eyes[LidarView], added: Added
     ) -> list[tuple[int, Sighting]]:
-        """Returns the loop to the view that looks most alike, if all that are believed say the same."""
+        """Returns the loop to the view that looks most alike, if all that are believed say the same.
+
+        A map is not found where another part of it explains the scan as well.
+        """
         sights = self._sights(number, candidates, eyes, False, added)
         poses = [self.nodes[k].T @ seen.T_known_seen for k, seen in sights]
         if not all(alike(poses[0], T) for T in poses[1:]):
-            added.refused.append("ambiguous: another place explains the scan as well")
+            added.refused.append(AMBIGUOUS)
             return []
-        return self._weighed(number, sights[:1])
+        loops = self._weighed(number, sights[:1])
+        if loops and not self.located and self._elsewhere(number, poses[0], eyes):
+            added.refused.append(AMBIGUOUS)
+            return []
+        return loops
+
+    def _elsewhere(self, number: int, T: Matrix, eyes: Eyes[LidarView]) -> bool:
+        """Returns whether a scan may have been taken elsewhere as well, by one view of each other part of the map.
+
+        The views that look most alike may all be at one of two places that are alike.
+        """
+        view = self.nodes[number].view
+        assert view is not None
+        likeness, places, chosen = self._index.likeness(view), [T[:3, 3]], list[int]()
+        for k in sorted(self._old(number), key=lambda k: -likeness[k]):
+            at = self.nodes[k].T[:3, 3]
+            if all(np.linalg.norm(at - other) > PART for other in places):
+                places.append(at)
+                chosen.append(k)
+        sights = self._sights(number, chosen[:PARTS], eyes, False, Added())
+        return any(apart(T, self.nodes[k].T @ seen.T_known_seen) for k, seen in sights)
 
 
 def between(node: Node[LidarView], T_odom: Matrix, covariance_odom: Matrix) -> Matrix:

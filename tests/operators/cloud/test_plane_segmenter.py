@@ -216,6 +216,7 @@ def test_a_pose_of_another_frame_without_extrinsics_is_named() -> None:
         PlaneSegmenter(up=(0.0, 0.0, 0.0)).setup()
 
 
+@pytest.mark.long
 def test_two_plays_are_equal_and_a_restored_operator_goes_on_alike() -> None:
     T = optical()
     streams: dict[str, Any] = {"cloud": [cloud(room(seed=k), T, k + 1) for k in range(2)], "pose": [pose(T)]}

@@ -164,6 +164,16 @@ def test_images_that_show_different_things_hardly_match() -> None:
     assert level == 1
 
 
+@pytest.mark.parametrize(("by", "text"), [(2, "2.0 px lower"), (-3, "3.0 px higher")])
+def test_a_pair_whose_rows_differ_is_named(by: int, text: str) -> None:
+    left, right, *_ = step_pair()
+    played = measured(left, np.roll(right, by, axis=0))
+    found, level, counts = status_of(played)
+    assert found.endswith(f"; the right image lies {text}: the pair is not rectified")
+    assert level == 1
+    assert counts["measured"] > 0.05 * counts["pixels"]
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

@@ -76,11 +76,17 @@ def test_boxes_without_area_overlap_nothing() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, COUNTS, THRESHOLDS, st.integers(1, 30))
-def test_merging_keeps_the_same_boxes_in_any_order(seed: int, count: int, threshold: float, most: int) -> None:
+def test_merging_keeps_the_same_boxes_in_any_order_but_those_that_it_moves_onto_better_ones(
+    seed: int, count: int, threshold: float, most: int
+) -> None:
     boxes, scores, classes = random_boxes(seed, count)
     shuffle = np.random.default_rng(seed + 1).permutation(count)
     kept, merged = merging_nms(boxes, scores, classes, threshold, most)
-    assert kept.tolist() == class_wise_nms(boxes, scores, classes, threshold)[:most].tolist()
+    plain = class_wise_nms(boxes, scores, classes, threshold)[:most].tolist()
+    assert kept.tolist() == [k for k in plain if k in kept]
+    for i in range(len(kept)):
+        better = np.flatnonzero(classes[kept[:i]] == classes[kept[i]])
+        assert not (intersection_over_union(merged[i], merged[better]) > max(threshold, 0.6)).any()
     _, again = merging_nms(boxes[shuffle], scores[shuffle], classes[shuffle], threshold, most)
     np.testing.assert_array_equal(merged, again)
 
@@ -93,6 +99,19 @@ def test_a_merged_box_lies_among_those_that_were_one_and_nearer_to_the_likelier(
     assert 10 < merged[0, 0] < 11
     np.testing.assert_allclose(merged[0], [merged[0, 0], 10, merged[0, 0] + 20, 30], atol=1e-4)
     np.testing.assert_allclose(merged[1:], boxes[[3, 2]], atol=1e-4)  # another class, and one that stands alone
+
+
+def test_two_boxes_that_merging_moves_onto_each_other_are_one() -> None:
+    between = [[0, 20, 40, 120]] * 12  # suppressed by the first, towards the second
+    boxes = np.array([[0, 0, 40, 100], [0, 40, 40, 140], [0, 35, 40, 135], *between], np.float32)
+    scores = np.array([0.7, 0.6, 0.5, *[0.69] * 12], np.float32)
+    classes = np.zeros(len(boxes), np.int32)
+    assert class_wise_nms(boxes, scores, classes, 0.5).tolist() == [0, 1]
+    kept, merged = merging_nms(boxes, scores, classes, 0.5, 10)
+    assert kept.tolist() == [0]
+    assert merged.shape == (1, 4)
+    classes[1:3] = 1  # of another class
+    assert merging_nms(boxes, scores, classes, 0.5, 10)[0].tolist() == [0, 1]
 
 
 def test_merging_takes_away_errors_that_are_independent() -> None:

@@ -151,6 +151,7 @@ def test_covariances_are_positive_definite_far_from_the_origin(off: Any, start: 
     assert run.within(3.0, 5.0) > 0.95
 
 
+@pytest.mark.long
 def test_a_first_place_far_from_the_origin_waits_for_a_second_that_agrees() -> None:
     off = (512345.6, 5412345.7, 560.0)
     drive = Drive(4.0)
@@ -246,6 +247,7 @@ def test_late_stamps_of_positions_beside_wheels_are_named_with_their_offset(late
     assert "robot/wheels" not in run.alarms
 
 
+@pytest.mark.long
 def test_wheels_of_a_wrong_scale_are_named_with_it() -> None:
     drive = Drive(12.0)
     run = Run(drive, drive.fixes(), drive.wheels(1.05, 0.0, 12.0))

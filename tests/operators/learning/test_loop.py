@@ -87,7 +87,9 @@ def weights(file: Path) -> dict[str, Tensor]:
     return {f"{part}.{name}": value for part in ("network", "ema") for name, value in state[part].items()}
 
 
-@pytest.mark.parametrize(("epoch", "step"), [(1, 1), (3, 3), (5, 2)])
+@pytest.mark.parametrize(
+    ("epoch", "step"), [pytest.param(1, 1, marks=pytest.mark.long), (3, 3), pytest.param(5, 2, marks=pytest.mark.long)]
+)
 def test_a_run_that_was_interrupted_ends_with_the_same_bits(tmp_path: Path, epoch: int, step: int) -> None:
     train(Line(), settings(), tmp_path / "whole.onnx")
     with pytest.raises(Stop):

@@ -72,6 +72,7 @@ def test_normalisation_while_training_agrees_with_what_was_measured(trained: Pat
         assert float((one - other).abs().mean()) < 0.05 * float(one.std()) + 0.01
 
 
+@pytest.mark.long
 def test_the_shipped_networks_in_8_bits_can_be_trained_on(worlds: Path) -> None:
     backbone, images = SmallResNet(), sample_images(pair(worlds, (384, 288)))
     grid = nn.Sequential(backbone, GridHead(len(THINGS), backbone.channels, 64, FINE_STRIDES)).eval()

@@ -173,6 +173,7 @@ def test_a_gyroscope_makes_up_for_wheels_that_slip() -> None:
         assert (disagreements > 0) is ("imu" in turns)
 
 
+@pytest.mark.long
 def test_two_plays_give_the_same_digests_and_so_does_one_that_was_interrupted() -> None:
     drive = Drive(3.0)
     sensors = {"scan": drive.scans(), "seen": drive.sightings()}

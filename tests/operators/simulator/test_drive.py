@@ -20,6 +20,7 @@ from operators.simulator.trajectory import Trajectory
 OVAL = np.stack([2 * np.cos(np.arange(12) * math.pi / 6), np.sin(np.arange(12) * math.pi / 6)], axis=1)
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(st.floats(0, 40), st.sampled_from([0.0, 1.0]), st.integers(0, 50))
 def test_velocities_and_accelerations_are_derivatives_of_the_pose(t: float, hold: float, seed: int) -> None:

@@ -169,6 +169,7 @@ def test_lamps_that_are_switched_off_darken_the_room_in_their_span(healthy: dict
             assert a == b
 
 
+@pytest.mark.long
 def test_a_kidnapped_robot_leaps_and_its_sensors_do_not_notice() -> None:
     given: dict[str, Any] = {
         "duration": "8s", "wheels": {"rate": 20}, "inertial": {"rate": 50, "accel_noise": 0, "gyro_noise": 0},

@@ -67,6 +67,7 @@ def test_it_stands_still_on_its_round() -> None:
     assert all(not np.any(p.linear) and not np.any(p.angular) for p in poses if isinstance(p, Odometry))
 
 
+@pytest.mark.long
 def test_the_heading_is_that_of_the_camera_whatever_its_mount() -> None:
     world = make_world("office", 801, speed=0.5, hold=0.0, movers=True, people=3)
     ahead = watching(world, ColorCamera(mount=(0, 0, 1, 0, 0.1, 0))).path.at([0.0])
@@ -82,6 +83,7 @@ def test_where_nobody_chooses_it_says_what_to_ask_for() -> None:
         robot("office", 801, people=2)
 
 
+@pytest.mark.long
 def test_a_robot_that_stands_cannot_be_carried_along_its_path() -> None:
     with pytest.raises(ValueError, match="no path to be carried along"):
         robot("office", 801, kidnaps=[{"at": 3, "ahead": 0.2}])

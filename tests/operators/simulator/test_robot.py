@@ -91,6 +91,7 @@ def test_fresh_processes_make_the_same_bytes_with_one_thread_and_with_two(
     assert answers == [digest(everything)] * 2
 
 
+@pytest.mark.long
 def test_a_robot_set_up_twice_makes_the_same_bytes_again() -> None:
     robot = SimulatedRobot(**{**EVERYTHING, "duration": "200ms"})
     digests = []
@@ -146,6 +147,7 @@ def test_a_sensor_that_is_off_has_no_messages_and_no_frame() -> None:
     assert set(streams["extrinsics"][0].child_frames) == {"camera_depth_optical", "camera_color_optical"}  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_stamps_lie_on_each_sensors_grid_and_strictly_increase() -> None:
     robot = SimulatedRobot(
         duration="1s",

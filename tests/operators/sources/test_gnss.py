@@ -323,7 +323,7 @@ def test_datagrams_are_stamped_by_the_machine(monkeypatch: pytest.MonkeyPatch) -
     source = NmeaGnss(input=f"udp://127.0.0.1:{port}")
     source.setup()
     times = iter((100, 200, 300))
-    monkeypatch.setattr("operators.sources.gnss.time.time_ns", lambda: next(times))
+    monkeypatch.setattr("operators.sources.ports.time.time_ns", lambda: next(times))
     fixes = source.stream()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for datagram in (b"", gga("120000"), b"garbage" + gga("120001")):
@@ -341,7 +341,7 @@ def test_datagrams_are_stamped_by_the_machine(monkeypatch: pytest.MonkeyPatch) -
     ("settings_", "wrong"),
     [
         ({"input": "none"}, "no receiver at 'none': No such file"),
-        ({"input": "log.nmea"}, "is a file: operators.sources:NmeaFile reads it"),
+        ({"input": "log.nmea"}, "is a file, no serial device: operators.sources:NmeaFile reads"),
         ({"input": "/dev/null"}, "no receiver at '/dev/null': no serial device"),
         ({"input": "/dev/null", "baud": 9601}, "no rate of 9601 baud: 50, .* 9600,"),
         ({"input": "udp://10110"}, "no address: udp://ADDRESS:PORT"),

@@ -175,6 +175,24 @@ def test_spoiled_tum_lists_are_named_with_their_line(tmp_path: Path) -> None:
         read(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("stamp", "words"),
+    [
+        ("1700000000033000000", "is it in nanoseconds?"),
+        ("1700000000033000", "is it in microseconds?"),
+        ("1700000000033", "is it in milliseconds?"),
+        ("-4.5", "from 1970 to 2262"),
+    ],
+)
+def test_times_of_another_unit_are_named_with_it(tmp_path: Path, stamp: str, words: str) -> None:
+    write_tum(tmp_path)
+    (tmp_path / "depth.txt").write_text(f"{stamp} depth/0.png\n")
+
+    with pytest.raises(SourceError, match=r"depth\.txt:1: .* is no time from 1970 to 2262") as refused:
+        read(tmp_path)
+    assert str(refused.value).endswith(words)
+
+
 def test_folders_and_slices_without_frames_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="holds neither the 7-Scenes layout"):
         read(tmp_path)

@@ -57,6 +57,9 @@ TRIED: tuple[str, ...] = (
 """Commands as they are typed, in an order in which later ones use the files of earlier ones."""
 
 ELSEWHERE: dict[str, tuple[str, str]] = {
+    "calibrate camera": ("*", "test_calibrate_commands.py has boards"),
+    "calibrate stereo": ("*", "the same"),
+    "calibrate camera-imu": ("*", "the same"),
     "train activity": ("*", "test_people_training.py has episodes"),
     "train posture": ("*", "test_people_training.py has silhouettes"),
     "train torchvision": ("*", "test_torchvision_training.py: another library"),

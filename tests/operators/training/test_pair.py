@@ -62,6 +62,7 @@ def test_boxes_and_masks_of_a_batch_are_of_the_same_view(worlds: Path) -> None:
     assert VOID in masks
 
 
+@pytest.mark.long
 def test_training_writes_two_networks_that_the_operators_take(worlds: Path, tmp_path: Path) -> None:
     task = pair(worlds)
     outcome = train(task, Settings(epochs=1, batch=4, threads=1), tmp_path / "pair.onnx")

@@ -51,6 +51,7 @@ def test_a_segmenter_in_8_bits_ends_with_its_scores_and_answers_as_before(
     assert np.abs(found[0].confidence - found[1].confidence).mean() < 0.05
 
 
+@pytest.mark.long
 def test_the_answers_differ_little_and_keep_their_precision(trained: Path, worlds: Path, tmp_path: Path) -> None:
     kind = "detector"
     file, out = trained / f"{kind}.onnx", tmp_path / "small.onnx"

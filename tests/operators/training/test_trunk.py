@@ -65,6 +65,7 @@ def test_both_have_the_trunk_of_the_first_which_answers_as_before(
         assert facts == read_facts(apart / name)
 
 
+@pytest.mark.long
 def test_a_head_behind_another_range_computes_what_it_did(apart: Path, tmp_path: Path) -> None:
     """The biases of all layers, in float, are those of before but for rounding, also where their steps are others."""
     onnx = pytest.importorskip("onnx")

@@ -95,6 +95,7 @@ def test_an_empty_image_has_no_objects() -> None:
     assert ready(CustomDetector(score_threshold=0.5)).process(grey).count == 0
 
 
+@pytest.mark.long
 def test_two_processes_without_torch_answer_with_the_same_bits(views: list[WorldImage], tmp_path: Path) -> None:
     np.save(tmp_path / "image.npy", views[0].image.data)
     arguments = [sys.executable, "-c", DIGESTS, str(tmp_path / "image.npy")]

@@ -27,7 +27,9 @@ Bindings = dict[tuple[str, str], Any]
 """(module, name) → what it stands for."""
 
 
-def _load() -> None:
+@functools.cache
+def load() -> None:
+    """Imports all modules of the engine."""
     for name in ENGINE:
         package = importlib.import_module(f"dataflow.{name}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
@@ -38,7 +40,7 @@ def _load() -> None:
 @functools.cache
 def clocks() -> tuple[tuple[str, str], ...]:
     """Every module of the engine that reads the clock, with the name under which it does."""
-    _load()
+    load()
     prefixes = tuple(f"dataflow.{name}." for name in ENGINE)
     return tuple(
         (name, "time")

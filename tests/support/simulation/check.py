@@ -21,7 +21,6 @@ from typing import Any
 from dataflow.graph import Graph
 from dataflow.graph.load import load_bundle
 from dataflow.recording import Recording, RecordingError
-from dataflow.recording.parts import Storage
 from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
@@ -29,11 +28,14 @@ from dataflow.supervision.core.report import RunReport
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
 from dataflow.sync import messages_of
+from dataflow.verification.complete import complete
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.processes import Call
+from simulation import reloading
 from simulation.bindings import bound
+from simulation.keeping import check_losses_of_files, files_of, joined, kept_by_flight
 from simulation.run import Machine, Outcome, simulate
 from simulation.scenario import PATIENCE, TICKING, TIMEOUT, Scenario
 from simulation.world import Violation
@@ -51,46 +53,121 @@ class Result:
 
 def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
     """Runs a scenario and everything that must hold of it. Raises `Violation`."""
-    path = folder / "run.mcap"
-    path.unlink(missing_ok=True)
+    for old in folder.rglob("*.mcap"):
+        old.unlink()
+    with reloading.fresh_files():
+        return _check(scenario, folder, replay=replay)
+
+
+def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
     graph = scenario.load()
-    outcome = simulate(_plan(scenario, graph, path), scenario.machine, scenario.happenings, limit=scenario.limit)
+    plan = _plan(scenario, graph, folder)
+    outcome = simulate(plan, scenario.machine, scenario.happenings, limit=scenario.limit)
+    report = outcome.report
     if outcome.failure is not None and not scenario.may_fail:
         raise Violation(f"the run failed: {outcome.failure}\n{outcome.failure.details}")
     if scenario.only_paused:
         _check_pauses(outcome)
-    try:
-        verdict = _verify(path, outcome, scenario)
-        report = outcome.report
-        if scenario.snapshots and verdict == "identical":
-            _verify_from_middle(path)
-        drops = 0
-        if report is not None:
-            drops = _check_losses(path, graph, report, live=scenario.live)
-            if not scenario.live:
-                _check_window(path, graph, scenario, report)
-        replayed = replay and report is not None and verdict == "identical" and _may_replay(scenario, report)
-        if replayed:
-            assert report is not None
-            _check_replay(scenario, path, report)
-    finally:
-        path.unlink(missing_ok=True)
+    if scenario.keeping.flight:
+        return Result(outcome, _check_flight(outcome))
+    path = _joined(scenario, folder, outcome)
+    verdict = _verify(path, outcome, scenario)
+    if scenario.keeping.states and verdict == "identical" and not scenario.keeping.topics:
+        _verify_from_middle(path)
+    drops = 0
+    if report is not None and _holds_all(outcome):
+        drops = _check_losses(path, graph, report, live=scenario.live)
+        if not scenario.live:
+            _check_window(path, graph, scenario, report)
+    if report is not None and verdict == "identical" and scenario.keeping.topics:
+        _check_completion(path, folder / "complete.mcap", report)
+    replayed = replay and report is not None and verdict == "identical" and _may_replay(scenario, report)
+    if replayed:
+        assert report is not None
+        _check_replay(scenario, path, report)
     return Result(outcome, verdict, replayed, drops)
 
 
-def _plan(scenario: Scenario, graph: Graph, path: Path) -> RunPlan:
+def _plan(scenario: Scenario, graph: Graph, folder: Path) -> RunPlan:
+    flight = scenario.keeping.flight
     return RunPlan(
         graph,
         placement=scenario.placement,
-        record=path,
+        record=None if flight else folder / "run.mcap",
+        flight=folder / "flight" if flight else None,
         live=scenario.live,
         rate=scenario.rate,
-        storage=Storage(on_failure="end"),
+        storage=scenario.keeping.storage,
         faults=iter(scenario.faults) if scenario.faults and scenario.live else None,
         window=(scenario.window, 1 << 20),
         start_timeout=TIMEOUT,
         stall_timeout=TIMEOUT,
     )
+
+
+# Files
+
+
+def _holds_all(outcome: Outcome) -> bool:
+    """Whether the files hold all that the recorder was given."""
+    facts = {} if outcome.report is None else outcome.report.files.get("@recorder", {})
+    return not (facts.get("lost") or facts.get("deleted") or "@recorder" in outcome.killed)
+
+
+def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
+    """The recording as one file; each of its parts is verified as far as it goes."""
+    files = files_of(folder / "run.mcap")
+    if len(files) < 2:
+        return files[0] if files else folder / "run.mcap"
+    for file in files:
+        _unchanged(file)
+    try:
+        path = joined(files, folder / "joined.mcap")
+    except RecordingError as error:
+        raise Violation(f"its parts cannot be joined: {error}") from error
+    if outcome.report is not None and "@recorder" not in outcome.killed:
+        deleted = outcome.report.files["@recorder"]["deleted"]
+        if not deleted:
+            check_losses_of_files(outcome.report, path)
+    return path
+
+
+def _check_flight(outcome: Outcome) -> str:
+    """What a flight recorder has kept re-executes as far as its states are known."""
+    if outcome.report is None:
+        return "no recording"
+    kept = kept_by_flight(outcome.report)
+    for one in kept:
+        _unchanged(Path(one["path"]))
+    return "kept" if kept else "nothing kept"
+
+
+def _unchanged(path: Path) -> None:
+    """A part of a recording verifies without a difference."""
+    try:
+        report = verified(path)
+    except (ReplayError, RecordingError) as error:
+        if "there is nothing to verify" in str(error):
+            return
+        raise Violation(f"{path.name} cannot be verified: {error}") from error
+    if any(v.first is not None for v in report.operators) or report.changed:
+        raise Violation(f"{path.name} is verified as different:\n{_explained(report)}")
+
+
+def _check_completion(path: Path, out: Path, report: RunReport) -> None:
+    """A thin recording is completed to the streams of the run."""
+    with bound({("dataflow.verification.complete", "call_workers"): _call_here}):
+        made = complete(path, out, overwrite=True)
+    if not made.whole:
+        raise Violation(f"a thin recording cannot be completed: {made}")
+    with Recording(out) as recording:
+        lacking = [
+            stream
+            for stream, (number, _) in report.streams.items()
+            if stream in recording.streams and recording.streams[stream].count != number
+        ]
+    if lacking and not report.restarts:
+        raise Violation(f"completed, a thin recording lacks messages of {', '.join(lacking)}")
 
 
 def _check_pauses(outcome: Outcome) -> None:
@@ -116,14 +193,15 @@ def _verify(path: Path, outcome: Outcome, scenario: Scenario) -> str:
     try:
         report = verified(path)
     except (ReplayError, RecordingError) as error:
-        if outcome.failure is None:
+        if outcome.failure is None and _has_sources(scenario.load()) and _holds_all(outcome):
             raise Violation(f"the recording cannot be verified: {error}") from error
         return "nothing to verify"
     if outcome.failure is None:
         if report.identical:
             return "identical"
         unchanged = all(report.verdict(v) in ("identical", "unverifiable") for v in report.operators)
-        if unchanged and not report.changed and _missed_by_recorder(outcome.report):
+        lacks = _missed_by_recorder(outcome.report) or not _holds_all(outcome) or not _has_sources(scenario.load())
+        if unchanged and not report.changed and lacks:
             return "unverifiable"
         raise Violation(f"verified as different:\n{_explained(report)}")
     if any(v.first is not None for v in report.operators) or report.changed:
@@ -133,6 +211,12 @@ def _verify(path: Path, outcome: Outcome, scenario: Scenario) -> str:
         if lost:
             raise Violation(f"records of a live run are lost:\n{_explained(report)}")
     return "cut" if report.cut else "identical" if report.identical else "unverifiable"
+
+
+def _has_sources(graph: Graph) -> bool:
+    """Whether a recording has all that cannot be made again."""
+    given = {s for s, made in graph.streams.items() if graph.nodes[made.node].source}
+    return given <= set(graph.record.streams)
 
 
 def _missed_by_recorder(report: RunReport | None) -> int:
@@ -169,7 +253,9 @@ def verified(path: Path, *, start: float | None = None, jobs: int = 1) -> Verify
         ("dataflow.graph", "load_bundle"): _load_bundle,
     }
     importlib.import_module("dataflow.verification.facts")
-    with bound(bindings):
+    if reloading.Files.revision:
+        reloading.leave_files(path)
+    with bound(bindings | reloading.bindings()):
         return verify(path, start=start, jobs=jobs, workers=_call_here)
 
 

@@ -9,6 +9,7 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from simulation.world import World
@@ -51,6 +52,15 @@ class Disk:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._written += count
         return os.write(descriptor, data[:count])
+
+    def grow(self, more: int) -> None:
+        """Makes room, as by deleting what others have written."""
+        if self._room is not None:
+            self._room += more
+
+    def statvfs(self, folder: Path) -> Any:
+        whole = self._room or 1 << 40
+        return SimpleNamespace(f_bavail=max(0, whole - self._written), f_frsize=1, f_blocks=whole)
 
     def ftruncate(self, descriptor: int, size: int) -> None:
         self._written -= os.fstat(descriptor).st_size - size

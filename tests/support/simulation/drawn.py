@@ -1,8 +1,10 @@
-"""Graphs by seed: a few operators of any kind, wired at random, with feedback wherever an input looks into the past."""
+"""Graphs by seed: a few operators of any kind, wired at random, with feedback wherever an input looks into the past;
+some of them in a nested graph."""
 
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Iterator, Mapping
 
 KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
@@ -22,6 +24,7 @@ KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "Beat": ("x rest", ("y",)),
     "Placed": ("x constant!", ("y",)),
     "Arm": ("x", ("y",)),
+    "Hoard": ("x", ("y",)),
 }
 """Operators with their inputs and outputs. An input takes a stream from above; `!` a static one, `*` several, `<` any,
 also from below, and `@` mostly the operator's own."""
@@ -66,6 +69,40 @@ def _stream(r: random.Random, port: str, name: str, streams: list[str], statics:
         case "@" | "<":
             return r.choice([*streams, *below])
     return r.choice(streams)
+
+
+NESTED = "part.yaml"
+_STREAM = re.compile(r"\b(\w+)/(\w+)\b")
+
+
+def nested(lines: tuple[str, ...], r: random.Random) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Moves some operators into a nested graph, which the outer one may use twice. Returns the lines of both."""
+    names = [line.partition(":")[0] for line in lines]
+    movable = [k for k, line in enumerate(lines) if any(f":{kind}," in line for kind in KINDS)]
+    moved = set(r.sample(movable, k=r.randint(1, len(movable))))
+    inside = {names[k] for k in moved}
+    inputs: dict[str, str] = {}
+
+    def inner(found: re.Match[str]) -> str:
+        return found[0] if found[1] in inside else inputs.setdefault(found[0], f"i{len(inputs)}")
+
+    def outer(found: re.Match[str]) -> str:
+        return f"part/{found[1]}_{found[2]}" if found[1] in inside else found[0]
+
+    operators = [f"  {_STREAM.sub(inner, lines[k])}" for k in sorted(moved)]
+    ports = [(names[k], port) for k in moved for kind in KINDS if f":{kind}," in lines[k] for port in KINDS[kind][1]]
+    outputs = ", ".join(f"{name}_{port}: {name}/{port}" for name, port in ports)
+    text = [
+        "graph: part",
+        f"inputs: [{', '.join(inputs.values())}]",
+        f"outputs: {{{outputs}}}",
+        "operators:",
+        *operators,
+    ]
+    wired = ", ".join(f"{name}: {_STREAM.sub(outer, stream)}" for stream, name in inputs.items())
+    rest = [_STREAM.sub(outer, line) for k, line in enumerate(lines) if k not in moved]
+    rest += [f"{name}: {{use: {NESTED}, inputs: {{{wired}}}}}" for name in ("part", "again")[: r.choice((1, 1, 2))]]
+    return tuple(rest), tuple(text)
 
 
 def repeats(lines: tuple[str, ...]) -> bool:

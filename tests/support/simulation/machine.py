@@ -7,6 +7,7 @@ the code that ships is replaced, but for the network, the nursery and what a run
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import select
@@ -182,26 +183,31 @@ class Threading:
 
 
 class SimpleQueue:
-    """`queue.SimpleQueue`."""
+    """`queue.SimpleQueue`, and with `most` items `queue.Queue`."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, world: World, most: float = math.inf) -> None:
+        self._world, self._most = world, most
         self._items: deque[Any] = deque()
         self._waiters = Waiters(world)
 
     def put(self, item: Any) -> None:
         self._world.call()
+        while len(self._items) >= self._most:
+            self._waiters.wait()
         self._items.append(item)
         self._waiters.notify()
 
-    def get(self, timeout: float) -> Any:
+    def get(self, timeout: float = math.inf) -> Any:
         self._world.call()
         until = self._world.now + timeout
         while not self._items:
             if self._world.now >= until:
                 raise queue.Empty
-            self._waiters.wait(until - self._world.now)
-        return self._items.popleft()
+            self._waiters.wait(None if until == math.inf else until - self._world.now)
+        item = self._items.popleft()
+        if self._most < math.inf:
+            self._waiters.notify()
+        return item
 
     def get_nowait(self) -> Any:
         self._world.call()
@@ -223,6 +229,7 @@ class Queue:
 
     def __init__(self, world: World) -> None:
         self.SimpleQueue = lambda: SimpleQueue(world)
+        self.Queue = lambda most: SimpleQueue(world, most)
 
 
 class Pipe:

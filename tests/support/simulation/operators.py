@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from dataflow.messages import FeatureVector, Message
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 
 START = 1_700_000_000_000_000_000
+REFUSES = 3
+"""The revision of an operator's code that does not take the states of those before."""
 
 
 def _no_time(seconds: float) -> None:
@@ -80,7 +82,13 @@ class Device(Counter):
             yield step
 
 
-class Relay(Operator):
+class Revised:
+    """Marks an operator whose code may be replaced while it runs (`reloading`); `revision` numbers the code."""
+
+    revision: ClassVar[int] = 0
+
+
+class Relay(Revised, Operator):
     """Passes on what it gets, with noise."""
 
     x: In[FeatureVector]
@@ -89,7 +97,7 @@ class Relay(Operator):
 
     def process(self, x: FeatureVector) -> FeatureVector:
         labour(x.stamp, self.work)
-        return value(x.stamp, number(x) + self.rng.normal())
+        return value(x.stamp, number(x) + self.rng.normal() + 1000 * self.revision)
 
 
 class Timer(Operator, every="250us"):
@@ -131,7 +139,7 @@ class Mix(Operator, tolerance="3ms"):
         )
 
 
-class Smooth(Operator, every="25ms"):
+class Smooth(Revised, Operator, every="25ms"):
     """A running mean, on every message and on a timer: it has state, and sometimes emits nothing."""
 
     x: In[FeatureVector]
@@ -148,12 +156,14 @@ class Smooth(Operator, every="25ms"):
             self.state = 0.9 * self.state + 0.1 * number(x)
         if self.calls % 7 == 3:
             return None
-        return value(context.stamp, self.state, self.calls, float(context.tick))
+        return value(context.stamp, self.state, self.calls, float(context.tick), self.revision)
 
     def snapshot(self) -> Any:
         return {"state": self.state, "calls": self.calls}
 
     def restore(self, state: Any) -> None:
+        if self.revision == REFUSES:
+            raise ValueError("a state of another kind")
         self.state, self.calls = state["state"], state["calls"]
 
     def finish(self) -> FeatureVector | None:
@@ -376,3 +386,24 @@ class Arm(Operator):
 
     def process(self, x: FeatureVector) -> FeatureVector:
         return value(x.stamp, number(x))
+
+
+class Hoard(Revised, Operator):
+    """Remembers much: its states are large."""
+
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+    size: int = Param(4000, ge=1, doc="numbers that it remembers")
+
+    def setup(self) -> None:
+        self.memory = np.zeros(self.size)
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        self.memory = np.roll(self.memory, 1) * 0.97 + self.rng.normal(size=self.size)
+        return value(x.stamp, number(x), float(self.memory.sum()), self.revision)
+
+    def snapshot(self) -> Any:
+        return self.memory
+
+    def restore(self, state: Any) -> None:
+        self.memory = np.array(state)

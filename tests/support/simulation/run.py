@@ -16,16 +16,26 @@ from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.run import _metadata
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.transport import make_ring
-from dataflow.transport.keys import runtime_key
+from dataflow.transport.keys import local_key, runtime_key
 from simulation import bindings, machine, memory, network, operators
 from simulation.disk import Disk
 from simulation.processes import SUPERVISOR, Nursery
+from simulation.reloading import Files
 from simulation.sleep import watched
 from simulation.world import Process, Violation, World
 
 LIMIT = 200.0
 """Simulated seconds after which a run hangs: far above the sum of all timeouts, and of what work takes."""
 MEGABYTES = 50_000_000
+QUICKER = {
+    ("dataflow.execution.runner", "CPU_SPACING"): 20_000_000,
+    ("dataflow.sinks.flight_recorder", "SHORTEST"): 20_000_000,
+    ("dataflow.sinks.outage", "FIRST_PAUSE"): 0.1,
+}
+"""Constants of the engine that are for longer runs than those here: between states by CPU time (ns), of a flight
+recorder's files (ns of event time), before a full disk is tried again (s)."""
+SPLIT_FLUSHES = {("dataflow.sinks.sink", "FLUSH_EVERY"): 0.05}
+"""What is written decides when a file is full: here that has to be soon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +44,8 @@ class Happening:
 
     `pause` freezes the supervisor (for `span` s) and with it the process `target`, or all where that is "*".
     `set` changes the parameters `fields` of the operator `target`, `play` does the `action` to what is not live.
+    `reload` has the operator `target` go on with the next revision of its code, `trigger` asks a flight recorder to
+    keep what was, `room` gives the disk `bytes` more.
     `kill`, `freeze` (for `span` s) and `kill_before` (before the `effect`-th thing that it does and others can see, of
     the `life`-th process with that label) happen to the process `target`; `stop` asks for an orderly end.
     """
@@ -111,6 +123,8 @@ class Simulation:
         with contextlib.ExitStack() as stack:
             stack.callback(sys.setswitchinterval, interval)
             stack.enter_context(bindings.bound(self._bindings()))
+            if self._plan.storage.splitting.size is not None:
+                stack.enter_context(bindings.bound(SPLIT_FLUSHES))
             stack.enter_context(watched(self.world))
             stack.enter_context(contextlib.redirect_stderr(_Words(self)))
             time = machine.Time(self.world)
@@ -126,7 +140,7 @@ class Simulation:
 
     def _play(self) -> None:
         plan = self._plan
-        if plan.record is not None:
+        if plan.keeps_records:
             plan = replace(plan, metadata=_metadata(plan, self._mode))
         self._supervisor = Supervisor(plan, on_output=lambda label, line: self.outcome.words.append(f"{label}: {line}"))
         process = self.world.process(SUPERVISOR)
@@ -198,6 +212,10 @@ class Simulation:
             (f"{supervision}.run", "machine_facts"): lambda environment: facts,
             ("dataflow.recording.mcap.container", "os"): self.disk,
             ("dataflow.recording.parts", "os"): self.disk,
+            ("dataflow.sinks.outage", "os"): self.disk,
+            ("dataflow.sinks.flight_files", "queue"): machine.Queue(world),
+            ("dataflow.sinks.flight_files", "threading"): threads,
+            **QUICKER,
             ("dataflow.execution.source", "Tripwire"): _NoTripwire,
         }
 
@@ -233,7 +251,17 @@ class Simulation:
                 assert self._supervisor is not None
                 self._supervisor.play(**fields)
             case "set":
-                self._ask(runtime_key(self._plan.graph.namespace, "param", happening.target), fields)
+                for name, value in fields.items():
+                    key = runtime_key(self._plan.graph.namespace, "param", happening.target)
+                    self._ask(key, {"name": name, "value": value})
+            case "reload":
+                Files.revision += 1
+                self._ask(local_key(self._plan.graph.namespace, "reload", happening.target), {"reload": True})
+            case "trigger":
+                assert self._supervisor is not None
+                self._supervisor.trigger("asked for")
+            case "room":
+                self.disk.grow(fields["bytes"])
             case "kill" if process is not None:
                 world.kill(process)
             case "freeze" if process is not None:
@@ -248,13 +276,10 @@ class Simulation:
                     world.after(fields["span"], functools.partial(world.thaw, each))
 
     def _ask(self, key: str, fields: Mapping[str, Any]) -> None:
-        """Has the process that serves a key, if it lives, change parameters, as Zenoh's thread would."""
+        """Has the process that serves a key, if it lives, answer a request, as Zenoh's thread would."""
         process, answer = self._served.get(key, (None, None))
-        if process is None or process.dead or answer is None:
-            return
-        for name, value in fields.items():
-            query = network.Query({"name": name, "value": value})
-            self.world.start("zenoh", process, functools.partial(answer, query))
+        if process is not None and not process.dead and answer is not None:
+            self.world.start("zenoh", process, functools.partial(answer, network.Query(dict(fields))))
 
 
 class _Words:

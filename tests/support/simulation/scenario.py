@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 from dataflow.chaos.plan import Fault
 from dataflow.graph import Graph, GraphError, load_text
 from dataflow.graph.model import Placement
-from simulation.drawn import drawn, repeats
+from simulation.drawn import NESTED, drawn, nested, repeats
+from simulation.keeping import PLAIN, Keeping, keeping_of
+from simulation.operators import Revised
 from simulation.run import LIMIT, Happening, Machine
 
 _USE = "use: simulation.operators"
@@ -72,9 +74,12 @@ POLICIES = (
     f"queue: newest, size: 16, wait: forever, {_RESTART}",
     f"queue: oldest, size: 2, wait: 15ms, deadline: 200ms, {_RESTART}",
     "wait: 0ms, restart: {max: 1, backoff: 100ms}",
+    f"on_stale: drop, {_RESTART}",
+    f"queue: newest, size: 1, on_stale: drop, wait: 15ms, {_RESTART}",
 )
 FOREVER = 1e6
 """Seconds that a process is frozen for good."""
+GENTLE = ("pause", "set", "play", "reload", "trigger", "room")
 PATIENCE = 2.5
 """Seconds of a freeze that every run outlives."""
 TIMEOUT = 20.0
@@ -95,25 +100,28 @@ class Scenario:
     policy: str
     placement: Placement
     window: int
-    snapshots: bool
     machine: Machine
+    keeping: Keeping = PLAIN
     happenings: tuple[Happening, ...] = ()
     faults: tuple[Fault, ...] = ()
     parts: tuple[str, ...] = ()
     """The operators of a drawn graph, a line of YAML each."""
+    inner: tuple[str, ...] = ()
+    """The nested graph that it uses, line by line."""
     rate: float | None = None
 
     def load(self) -> Graph:
         return load(
             self.graph,
             self.parts,
+            self.inner,
             self.live,
             self.count,
             self.period,
             self.work,
             self.reading,
             self.policy,
-            self.snapshots,
+            self.keeping.section,
         )
 
     @property
@@ -127,12 +135,13 @@ class Scenario:
             h.kind.startswith("kill") or (h.kind == "freeze" and h.fields["span"] > PATIENCE) for h in self.happenings
         )
         ends = ends or kinds.count("stop") > 1 or ("deadline" in self.policy and {"freeze", "stop"} <= set(kinds))
-        return ends or self.machine.room is not None or any(f.kind in ("raise", "hang") for f in self.faults)
+        full = self.machine.room is not None and self.keeping.storage.on_failure == "end"
+        return ends or full or any(f.kind in ("raise", "hang") for f in self.faults)
 
     @property
     def only_paused(self) -> bool:
         """Whether nothing happens for which a process may be killed or blamed."""
-        harmless = all(h.kind in ("pause", "set", "play") for h in self.happenings)
+        harmless = all(h.kind in GENTLE for h in self.happenings)
         return harmless and not self.faults and self.machine.room is None and self.machine.slow_disk == 0.0
 
     @property
@@ -149,7 +158,7 @@ class Scenario:
         lines = [
             f"seed {self.seed}: graph {self.graph!r}, {how}, {self.placement}, {self.count} steps of "
             f"{self.period / 1e6:g} ms, work up to {self.work:g} s, window {self.window}"
-            + (", snapshots" if self.snapshots else "")
+            + str(self.keeping)
             + ("" if self.rate is None else f", rate {self.rate:g}"),
             f"  machine: seed {machine.seed}, pace {machine.pace:g}, gives way {machine.preempt:g}"
             + ("" if machine.room is None else f", disk of {machine.room} bytes")
@@ -158,6 +167,7 @@ class Scenario:
             + (f", rings of {machine.ring_bytes} bytes" if machine.ring_bytes != 1 << 20 else ""),
         ]
         lines += [f"  {part}" for part in self.parts]
+        lines += [f"  | {line}" for line in self.inner]
         lines += [f"  {happening}" for happening in self.happenings]
         lines += [f"  {f.at:.4f} s after the release {f.kind} {f.operator} {dict(f.fields)}" for f in self.faults]
         return "\n".join(lines)
@@ -167,16 +177,16 @@ class Scenario:
 def load(
     graph: str,
     parts: tuple[str, ...],
+    inner: tuple[str, ...],
     live: bool,
     count: int,
     period: int,
     work: float,
     reading: float,
     policy: str,
-    snapshots: bool,
+    record: str,
 ) -> Graph:
     """Loads one of the graphs; loading takes longer than some runs, so each is loaded once."""
-    record = "record: {snapshots: 60ms}\n" if snapshots else ""
     drawn_here = "".join(f"\n  {part}" for part in parts) + "\n"
     operators = {TICKING: TICKS, DRAWN: drawn_here}.get(graph) or GRAPHS[graph]
     text = f"graph: {graph}\nnamespace: sim\n{record}operators:{operators}"
@@ -193,9 +203,10 @@ def load(
         "READING": str(reading),
         "WORK": str(work),
     }
+    part = "\n".join(inner)
     for word, meaning in words.items():
-        text = text.replace(word, meaning)
-    return load_text(text)
+        text, part = text.replace(word, meaning), part.replace(word, meaning)
+    return load_text(text, files={NESTED: part} if inner else None)
 
 
 def scenario_of(seed: int) -> Scenario:
@@ -223,13 +234,22 @@ def scenario_of(seed: int) -> Scenario:
         policy=r.choice(POLICIES) if live else "",
         placement=r.choice(("process_each", "process_each", "one_process")),
         window=r.choice((2, 4, 256)),
-        snapshots=r.random() < 0.3,
+        keeping=Keeping(states="snapshots: 60ms" if r.random() < 0.3 else ""),
         machine=machine,
     )
     if live and random.Random(f"ticks {seed}").random() < 0.05:
         plain = replace(plain, graph=TICKING)
     elif random.Random(f"drawn {seed}").random() < 0.6:
         plain = _drawn(plain, random.Random(f"wired {seed}"))
+    kept = random.Random(f"kept {seed}")
+    with contextlib.suppress(GraphError):  # its streams are not in this graph
+        recorded = replace(plain, keeping=keeping_of(kept, plain.keeping))
+        recorded.load()
+        plain = recorded
+    if plain.keeping.storage.on_failure == "go_on" and (plain.machine.room is not None or kept.random() < 0.5):
+        plain = replace(plain, machine=replace(plain.machine, room=kept.choice((20_000, 30_000, 60_000))))
+    if plain.keeping.flight or plain.keeping.has_parts:
+        plain = replace(plain, count=kept.choice((12, 40)))
     return _with_events(plain, r)
 
 
@@ -238,11 +258,13 @@ def _drawn(plain: Scenario, r: random.Random) -> Scenario:
     rate = r.choice((0.5, 1.0, 4.0)) if not plain.live and r.random() < 0.2 else None
     for _ in range(MOST_TRIES):
         placement = r.choice(PLACEMENTS)
-        found = replace(plain, graph=DRAWN, parts=drawn(r, live=plain.live), rate=rate, placement=placement)
+        parts = drawn(r, live=plain.live)
+        found = replace(plain, graph=DRAWN, parts=parts, rate=rate, placement=placement)
         with contextlib.suppress(GraphError):  # its feedback would wait for itself
             found.load()
-            if repeats(found.parts):
-                return found
+            if repeats(parts):
+                outer, inner = nested(parts, r) if r.random() < 0.25 else (parts, ())
+                return replace(found, parts=outer, inner=inner)
     return plain
 
 
@@ -251,6 +273,7 @@ def _with_events(plain: Scenario, r: random.Random) -> Scenario:
     labels = [*graph.processes(plain.placement)]
     happenings = [_happening(plain, labels, r) for _ in range(r.choice((0, 0, 1, 1, 2, 3)))]
     happenings += _gentle(plain, graph, r)
+    happenings += _asked(plain, graph, random.Random(f"asked {plain.seed}"))
     faults = [_fault(graph, r) for _ in range(r.choice((0, 0, 1, 2)))] if plain.live else []
     return replace(
         plain,
@@ -292,6 +315,24 @@ def _gentle(plain: Scenario, graph: Graph, r: random.Random) -> list[Happening]:
             Happening(round(at + r.random(), 4), "play", "", {"action": r.choice(("resume", "resume", "step"))})
         )
         found.append(Happening(round(at + 1.0 + r.random(), 4), "play", "", {"action": "resume"}))
+    return found
+
+
+def _asked(plain: Scenario, graph: Graph, r: random.Random) -> list[Happening]:
+    """What a person asks of a run, and a disk that has room again."""
+    found = []
+    span = plain.count * plain.period * 1e-9
+    operators = [name for name, node in graph.nodes.items() if issubclass(node.operator, Revised)]
+    if plain.live and operators and r.random() < 0.35:
+        for _ in range(r.choice((1, 1, 2, 3))):
+            found.append(Happening(round(r.random() * max(span, 0.2), 4), "reload", r.choice(operators)))
+    if plain.keeping.flight:
+        found += [Happening(round(r.random() * span, 4), "trigger") for _ in range(r.choice((0, 1, 2)))]
+    if plain.machine.room is not None and r.random() < 0.8:
+        for _ in range(r.choice((1, 2, 5))):
+            found.append(
+                Happening(round(r.random() * 0.6, 4), "room", fields={"bytes": r.choice((2_000, 9_000, 1 << 30))})
+            )
     return found
 
 

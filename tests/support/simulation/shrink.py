@@ -12,6 +12,7 @@ from pathlib import Path
 
 from simulation.check import check
 from simulation.drawn import without
+from simulation.keeping import PLAIN
 from simulation.run import Machine
 from simulation.scenario import Scenario
 from simulation.world import Violation
@@ -70,8 +71,9 @@ def _smaller(scenario: Scenario) -> Iterator[Scenario]:
         for k in range(len(parts)):
             if "max" not in parts[k] and "backoff" not in parts[k]:
                 yield replace(scenario, policy=", ".join(parts[:k] + parts[k + 1 :]))
-    if scenario.snapshots:
-        yield replace(scenario, snapshots=False)
+    for keeping in (PLAIN, replace(scenario.keeping, states=""), replace(scenario.keeping, topics="")):
+        if keeping != scenario.keeping:
+            yield replace(scenario, keeping=keeping)
     for fewer in without(scenario.parts):
         yield replace(scenario, parts=fewer)
     for name, value in (("rate", None), ("work", 0.0), ("reading", 0.0), ("window", 256)):

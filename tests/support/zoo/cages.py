@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dataflow.graph import Graph, load_text
+from zoo.operators import STEPS
 
 REPEATS = (
     *("Hard", "KeptGenerator", "Pool", "Loop", "Views", "Draws", "States", "LazyLibrary", "LazyModule", "Command"),
@@ -16,6 +17,8 @@ DOES_NOT = (
     *("Race", "Clock", "LateClock", "Entropy", "OwnGenerator", "Process", "Background"),
     *("Sometimes", "Stamps", "ZeroSigns", "Sums", "ClockedState", "LastWord"),
 )
+AT_THE_END = ("Sums", "LastWord")
+"""Those of `DOES_NOT` whose calls repeat: a run that was killed has nothing of them that does not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +30,9 @@ class Cage:
     verdicts: Mapping[str, str]
     together: Mapping[str, str]
 
-    def graph(self) -> Graph:
+    def graph(self, steps: int = STEPS) -> Graph:
         lines = [f"  {n}: {{use: 'zoo.operators:{use}', inputs: {{x: {x}}}}}" for n, (use, x) in self.operators.items()]
-        source = "  src: {use: 'zoo.operators:Steps'}"
+        source = f"  src: {{use: 'zoo.operators:Steps', params: {{steps: {steps}}}}}"
         return load_text("\n".join(["graph: zoo", "record: {snapshots: 500ms}", "operators:", source, *lines]))
 
 

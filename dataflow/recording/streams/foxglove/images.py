@@ -15,7 +15,14 @@ from dataflow.messages import CameraInfo, CompressedImage, CompressedVideo, Dept
 from dataflow.messages.images import VIDEO_FORMATS
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.foxglove.values import Fields, Parts, frozen, matrix, timestamp_of, with_field
-from dataflow.recording.streams.pixels import as_depth, as_image, as_image16, as_millimetres, stored_rows
+from dataflow.recording.streams.pixels import (
+    as_depth,
+    as_image,
+    as_image16,
+    as_millimetres,
+    rows_without_padding,
+    stored_rows,
+)
 
 UINT32_MAX = 2**32 - 1
 
@@ -62,15 +69,13 @@ def rows_of(proto: RawImage, dtype: str, channels: int) -> npt.NDArray[Any]:
     itemsize = np.dtype(dtype).itemsize
     used = proto.width * channels * itemsize
     step = proto.step or used
-    if step < used or len(proto.data) < step * proto.height:
+    if step < used or len(proto.data) < step * (proto.height - 1) + used:
         raise RecordingError(
             f"RawImage of {proto.width}x{proto.height} {proto.encoding} needs rows of {used} bytes, "
             f"got step {proto.step} and {len(proto.data)} bytes"
         )
     shape = (proto.height, proto.width) if channels == 1 else (proto.height, proto.width, channels)
-    data = np.frombuffer(proto.data, np.uint8)[: step * proto.height]
-    if step != used:
-        data = np.ascontiguousarray(data.reshape(proto.height, step)[:, :used]).reshape(-1)
+    data = rows_without_padding(np.frombuffer(proto.data, np.uint8), proto.height, step, used)
     pixels = data.view(dtype).reshape(shape)
     pixels.flags.writeable = False
     return pixels

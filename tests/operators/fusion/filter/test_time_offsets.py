@@ -74,6 +74,7 @@ def test_an_unknown_offset_is_found(kind: str, offset: float) -> None:
     assert filter.health["wrong"].refused < 10
 
 
+@pytest.mark.long
 def test_an_offset_that_nothing_tells_of_keeps_its_sigma() -> None:
     samples = [Sample(k * 10_000_000, np.zeros(3), -GRAVITY, NOISE) for k in range(3)]
     node = first_node(samples, Prior(heading=0.0), -GRAVITY[2], at_rest=True)

@@ -114,6 +114,7 @@ def test_a_way_through_a_room_is_followed_within_its_covariance() -> None:
     assert texts(played) == ["tracking: the map begins here", *["tracking"] * 24]
 
 
+@pytest.mark.long
 def test_points_with_times_are_deskewed() -> None:
     clouds = [scan(ROOM, circling, k, timed=True) for k in range(20)]
     off = errors(play(LidarOdometry(), {"cloud": clouds}), circling)

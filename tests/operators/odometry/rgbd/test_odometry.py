@@ -343,6 +343,17 @@ def test_sparse_depth_is_depth(share: float) -> None:
     assert errors(results, poses)[0] < 0.03
 
 
+def test_holes_in_the_depth_make_no_more_keyframes() -> None:
+    """Half of the depth is missing, in blocks, elsewhere in each frame."""
+    rng = np.random.default_rng(3)
+    frames, poses = sequence(25)
+    kept = [np.kron(rng.random((SIZE[1] // 16, SIZE[0] // 16)) < 0.5, np.ones((16, 16))) > 0 for _ in frames]
+    results = follow([(g, np.where(k, d, np.float32(0))) for (g, d), k in zip(frames, kept, strict=True)])
+    assert {r.status for r in results} == {Status.TRACKING}
+    assert sum(r.keyframe for r in results) <= 10  # 5 with the whole depth
+    assert errors(results, poses)[0] < 0.01
+
+
 @pytest.mark.long
 def test_keyframes_are_renewed_where_depth_reaches_less_far() -> None:
     """Most of what comes into view is beyond the reach of the depth camera: poorer keyframes are all that there is."""

@@ -59,9 +59,12 @@ def keyframe(wall: NDArray[np.uint8], x: int, segment: int = 0) -> Keyframe:
     )
 
 
-def found(frame: Frame, keyframes: list[Keyframe]) -> list[tuple[NDArray[np.float64], Keyframe]]:
+def found(
+    frame: Frame, keyframes: list[Keyframe], others: list[Keyframe] | None = None
+) -> list[tuple[NDArray[np.float64], Keyframe]]:
+    """What a view is taken for among keyframes, in a map that may hold others."""
     known = LocalMap(30)
-    known.keyframes = keyframes
+    known.keyframes = keyframes + (others or [])
     fitter = Fitter(CAMERA, CONFIG, Noise(0.5, 1.0))
     return [(fit.T_world_camera, k) for fit, k in recognised(frame, keyframes, fitter, AHEAD, np.eye(4), known)]
 
@@ -78,6 +81,17 @@ def test_a_view_between_keyframes_is_found_where_it_is() -> None:
 def test_a_view_of_another_wall_is_found_nowhere() -> None:
     wall = pattern(1)
     assert found(view(pattern(2), 420), [keyframe(wall, x) for x in (0, 200, 500, 800)]) == []
+
+
+@pytest.mark.parametrize("twice", [True, False])
+def test_a_view_that_fits_another_part_of_the_map_as_well_is_found_nowhere(twice: bool) -> None:
+    """The same picture hangs 4.6 m farther on, where no keyframe is chosen."""
+    wall = pattern(1)
+    if twice:
+        wall[:, 600:] = wall[:, :600]
+    near, far = [keyframe(wall, x) for x in (0, 200)], [keyframe(wall, x) for x in (600, 800)]
+    assert len(found(view(wall, 150), near)) == 1
+    assert len(found(view(wall, 150), near, far)) == (not twice)
 
 
 def test_each_segment_is_looked_into_by_itself() -> None:

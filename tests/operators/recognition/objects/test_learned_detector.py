@@ -87,6 +87,7 @@ def test_a_learned_object_is_found_where_it_is_and_nowhere_else(learned: Path) -
     assert false <= 1
 
 
+@pytest.mark.long
 def test_known_classes_are_those_of_the_detector_where_nothing_was_learned(learned: Path) -> None:
     pixels, _ = scenery(201, sign=False)
     (known,) = play(CustomDetector(), {"image": [image(pixels)]})["detections"]

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import Activity, Diagnostics, Pose, SceneGraph
+from dataflow.messages import Activity, Classification, Diagnostics, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import Played, play
 from operators.scene import SceneGraphBuilder
@@ -346,3 +346,40 @@ def test_orientation_turns_a_footprint() -> None:
     assert isinstance(graph, SceneGraph)
     floor = graph.ids.tolist().index(0)
     np.testing.assert_allclose(graph.sizes[floor, :2], [0.8, 1.5], atol=1e-9)
+
+
+def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves() -> None:
+    seen = [room(k, [(2, "car", (8 + 0.3 * k, 3, 0.7), (4, 1.8, 1.5)), TABLE]) for k in range(8)]
+    acts = {}
+    for sure in (0.05, 0.5, 0.95):
+        nodes = [each.replace(moving=np.array([sure, np.nan], np.float32)) for each in seen]
+        played = play(SceneGraphBuilder(), {"nodes": nodes})
+        graph, act = played["graph"][-1], played["activities"][-1]
+        assert isinstance(graph, SceneGraph)
+        assert isinstance(act, Activity)
+        assert graph.moving is not None
+        assert graph.moving[graph.names().index("car 2")] == np.float32(sure)
+        acts[sure] = act.class_names[act.class_ids[0]]
+    assert acts == {0.05: "resting", 0.5: "unknown", 0.95: "driving"}
+
+
+def test_joints_say_who_sits_and_without_them_nobody_is_said_to_stand() -> None:
+    def said(*rows: tuple[int, str, float]) -> list[tuple[str, float]]:
+        names = ("standing", "sitting")
+        joints = [
+            Classification(
+                stamp=(k + 1) * STEP,
+                class_names=names,
+                class_ids=np.array([names.index(name) for _, name, _ in rows], np.int32),
+                scores=np.array([score for _, _, score in rows], np.float32),
+                ids=np.array([i for i, _, _ in rows], np.int64),
+            )
+            for k in range(5)
+        ]
+        nodes = [room(k, [person(4, 2, id=8), person(6, -2, id=9)]) for k in range(5)]
+        act = play(Builder(), {"nodes": nodes, "postures": joints})["activities"][-1]
+        assert isinstance(act, Activity)
+        return [(act.class_names[c], round(float(s), 2)) for c, s in zip(act.class_ids, act.scores, strict=True)]
+
+    assert said((8, "sitting", 0.8), (9, "standing", 0.9)) == [("sitting", 0.8), ("standing", 0.9)]
+    assert said((9, "sitting", 0.7)) == [("unknown", 0.3), ("sitting", 0.7)]

@@ -227,6 +227,16 @@ def test_what_was_seen_beside_what_is_in_the_snapshot() -> None:
     assert known.objects[1].beside[2] > 0
 
 
+def test_what_was_seen_beside_a_thing_that_is_no_more_is_forgotten() -> None:
+    beside: Solid = ((2.0, 0.13, 0.1), (0.12, 0.12, 0.12))
+    both = [[(THING, BOX), (beside, BOX)]] * 3
+
+    assert sum(len(o.beside) for o in after(both).objects.values()) == 2
+    known = after([*both[:2], *[[(THING, BOX)]] * 10])
+    assert len(known.objects) == 1
+    assert not only(known).beside
+
+
 def test_a_snapshot_from_before_that_was_counted_is_taken_up() -> None:
     known = after([[(THING, BOX)]] * 5)
     earlier = known.snapshot()

@@ -151,6 +151,7 @@ def test_lidar_points_lie_on_what_is_there_and_noise_is_along_the_beam() -> None
     assert angle < 1e-3
 
 
+@pytest.mark.long
 def test_lidar_and_depth_camera_measure_the_same_surfaces() -> None:
     source = robot(
         duration="100ms",

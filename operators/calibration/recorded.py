@@ -1,0 +1,136 @@
+"""Views of a board in the recorded images of one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.api.recordings import RecordedStreams
+from dataflow.api.stream import RecordedStream
+from dataflow.messages import CameraInfo, CompressedImage, Image, Message
+from operators.calibration import coverage
+from operators.calibration.boards import Board, View
+from operators.calibration.camera import BLURRED, Fitted, Model, different, fit_camera, warnings_of
+
+Along = Callable[[list[int], str], Iterable[int]]
+"""Gives places one by one, with a display of how far it is under a name."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Seen:
+    """The images of a stream, `looked` of them, of `size` (width, height), and their `views` of a board."""
+
+    name: str
+    frame: str
+    board: Board
+    size: tuple[int, int]
+    looked: int
+    views: tuple[View, ...]
+
+    @property
+    def blurred(self) -> int:
+        """Views that are too blurred to be used."""
+        return sum(view.blur > BLURRED for view in self.views)
+
+    def fit(self, model: Model) -> Fitted:
+        """Returns the camera's calibration. Raises ValueError, with what the images showed."""
+        try:
+            return fit_camera(self.board, different(self.views, self.size[0]), self.frame, self.size, model)
+        except ValueError as error:
+            raise ValueError(
+                f"{self.name}: {error} (a board in {len(self.views)} of {self.looked} images, {self.blurred} blurred, "
+                "the others alike)"
+            ) from error
+
+    def covered(self, fitted: Fitted) -> NDArray[np.int32]:
+        """Returns the number of views (H, W) with the board at each pixel."""
+        return coverage.counts(fitted.views, self.size)
+
+    def warnings(self, fitted: Fitted) -> list[str]:
+        """Returns what makes the calibration poor, each with what would mend it."""
+        found = warnings_of(fitted)
+        if self.blurred > len(self.views) / 4:
+            found.append(
+                f"{self.blurred} of {len(self.views)} views are blurred and left out: move slowly, or expose shorter"
+            )
+        if lacking := coverage.unseen_parts(self.covered(fitted)):
+            found.append(f"hardly any board was in these parts of the image: {', '.join(lacking)}")
+        return found
+
+
+def look(board: Board, stream: RecordedStream, every: float, along: Along) -> Seen:
+    """Returns what the images of a stream show of a board, one each `every` seconds.
+
+    Raises ValueError where images differ in size, none can be read, or none shows the board.
+    """
+    name, frame, size, looked, views = stream.info.name, "", (0, 0), 0, list[View]()
+    for place in along(_spaced(stream.stamps, every), name):
+        message = stream[place]
+        grey = _grey(message)
+        if grey is None:
+            continue
+        now = (grey.shape[1], grey.shape[0])
+        if looked and now != size:
+            raise ValueError(f"{name} has images of {size[0]}x{size[1]} and of {now[0]}x{now[1]} pixels: one is needed")
+        size, frame, looked = now, str(getattr(message, "frame", "")), looked + 1
+        if (view := board.find(message.stamp, grey)) is not None:
+            views.append(view)
+    if not looked:
+        raise ValueError(f"{name} has no image that can be read")
+    if not views:
+        raise ValueError(f"{name}: no board in {looked} images: are its counts right ({board})?")
+    return Seen(name, frame, board, size, looked, tuple(views))
+
+
+def stream_of(
+    streams: RecordedStreams, name: str | None, types: tuple[type[Message], ...], option: str, what: str
+) -> RecordedStream:
+    """Returns the stream of a name, or the only one of its types. Raises ValueError, StreamNameError."""
+    there = [each for each in streams if streams[each].info.message_type in types]
+    if name is None:
+        if len(there) != 1:
+            listed = ", ".join(there) or "none"
+            raise ValueError(f"{streams.path} has {len(there)} streams of {what} ({listed}): {option} names one")
+        return streams[there[0]]
+    stream = streams[name]
+    if stream.info.name not in there:
+        raise ValueError(f"{stream.info.name} holds no {what}; there are {', '.join(there) or 'none'}")
+    return stream
+
+
+def images_of(streams: RecordedStreams, name: str | None, option: str) -> RecordedStream:
+    """Returns a stream of images. Raises ValueError, StreamNameError."""
+    return stream_of(streams, name, (Image, CompressedImage), option, "images")
+
+
+def intrinsics_of(streams: RecordedStreams, frame: str) -> CameraInfo:
+    """Returns the recorded calibration of a frame. Raises ValueError where there is none."""
+    for name in streams:
+        stream = streams[name]
+        if stream.info.message_type is CameraInfo and len(stream):
+            info = stream[0]
+            if isinstance(info, CameraInfo) and info.frame == frame:
+                return info
+    raise ValueError(f"{streams.path} has no calibration of the frame {frame!r}: --camera FILE gives it")
+
+
+def _spaced(stamps: NDArray[np.int64], every: float) -> list[int]:
+    """Places of messages at least `every` seconds apart."""
+    found: list[int] = []
+    for place, stamp in enumerate(stamps.tolist()):
+        if not found or stamp - int(stamps[found[-1]]) >= round(every * 1e9):
+            found.append(place)
+    return found
+
+
+def _grey(message: Message) -> NDArray[np.uint8] | None:
+    if isinstance(message, CompressedImage):
+        read = cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE)
+        return None if read is None else np.asarray(read, np.uint8)
+    assert isinstance(message, Image)
+    grey = message.data if message.data.ndim == 2 else cv2.cvtColor(message.data, cv2.COLOR_RGB2GRAY)
+    return np.ascontiguousarray(grey, np.uint8)

@@ -1,0 +1,156 @@
+"""Velodyne packets written here, from a capture and over loopback: clouds have the sensor's geometry and times."""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dataflow.messages import PointCloud
+from dataflow.operator import SourceError
+from dataflow.testing import play
+from operators.sources import VelodyneFile, VelodyneLidar
+
+START = 1_700_000_000
+"""Seconds, 800 s after a full hour."""
+DELAY = 0.0003
+"""Seconds from a packet's first firing to its capture."""
+EVERY = 0.00132710
+"""Seconds between packets of a VLP-16, by its manual: 24 firings of 55.296 µs."""
+ELEVATIONS = range(-15, 16, 2)
+"""Degrees of a VLP-16's lasers, by its manual."""
+WALL = 10.0
+
+need = pytest.mark.skipif(
+    "velodyne_decoder" not in sys.modules and not __import__("importlib").util.find_spec("velodyne_decoder"),
+    reason="needs the extra [lidar]",
+)
+
+
+def packet(number: int, distance: float = WALL) -> bytes:
+    """A packet of a VLP-16 at 10 turns a second, 2 mm units: a sphere around it; reflectivity is the laser's number."""
+    returns = b"".join(struct.pack("<HB", round(distance / 0.002), laser % 16) for laser in range(32))
+    azimuth = 48 * 10 * number
+    blocks = b"".join(struct.pack("<HH", 0xEEFF, (azimuth + 40 * k) % 36000) + returns for k in range(12))
+    return blocks + struct.pack("<IBB", 800_000_000 + round(number * EVERY * 1e6), 0x37, 0x22)
+
+
+def capture(path: Path, packets: list[bytes], cut: int = 0) -> Path:
+    """Writes a pcap of UDP datagrams, stamped from START on; the last `cut` bytes are missing."""
+    rows = [struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)]
+    for k, data in enumerate(packets):
+        udp = struct.pack(">HHHH", 2368, 2368, 8 + len(data), 0) + data
+        ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0, b"\xc0\xa8\x01\xc9", b"\xff" * 4)
+        frame = b"\xff" * 6 + b"\x02" * 6 + b"\x08\x00" + ip + udp
+        seconds, micros = divmod(round((START + DELAY + k * EVERY) * 1e6), 10**6)
+        rows.append(struct.pack("<IIII", seconds, micros, len(frame), len(frame)) + frame)
+    whole = b"".join(rows)
+    path.write_bytes(whole[: len(whole) - cut])
+    return path
+
+
+@need
+def test_clouds_of_a_capture_have_the_sensors_geometry_and_times(tmp_path: Path) -> None:
+    turns = [packet(k) for k in range(230)]  # 75 a turn
+    source = VelodyneFile(input=str(capture(tmp_path / "a.pcap", [*turns[:100], bytes(512), *turns[100:]])))
+    clouds = play(source)["cloud"]
+
+    assert len(clouds) == 4  # three turns and the rest
+    cloud = clouds[1]
+    assert isinstance(cloud, PointCloud)
+    assert cloud.rings is not None
+    assert cloud.intensities is not None
+    assert cloud.time_offsets is not None
+    assert np.linalg.norm(cloud.points, axis=1) == pytest.approx(WALL, abs=0.02)
+    elevation = np.degrees(np.arctan2(cloud.points[:, 2], np.hypot(cloud.points[:, 0], cloud.points[:, 1])))
+    for ring, degrees in enumerate(ELEVATIONS):
+        assert elevation[cloud.rings == ring] == pytest.approx(degrees, abs=0.1)
+    heading = np.unwrap(np.arctan2(cloud.points[:, 1], cloud.points[:, 0])[cloud.rings == 0])
+    assert heading[-1] - heading[0] == pytest.approx(-2 * math.pi, abs=0.02)  # clockwise from above
+    assert set(cloud.intensities) == set(range(16))
+    assert np.ptp(cloud.time_offsets) == pytest.approx(75 * EVERY, abs=2 * EVERY)
+    assert clouds[2].stamp - cloud.stamp == pytest.approx(75 * EVERY * 1e9, abs=2e3)
+    assert source.summary() == {"clock": "arrival", "packets": 230, "other_datagrams": 1, "past": 0}
+
+
+@need
+def test_the_sensors_clock_gives_the_time_within_the_hour(tmp_path: Path) -> None:
+    file = str(capture(tmp_path / "a.pcap", [packet(k) for k in range(160)]))
+    arrived, sensed = (play(VelodyneFile(input=file, clock=clock))["cloud"] for clock in ("arrival", "sensor"))
+
+    assert START % 3600 == 800
+    for a, b in zip(arrived, sensed, strict=True):
+        assert a.stamp - b.stamp == pytest.approx(DELAY * 1e9, abs=2e3)
+
+
+@need
+def test_a_capture_that_breaks_off_gives_what_it_holds(tmp_path: Path) -> None:
+    clouds = play(VelodyneFile(input=str(capture(tmp_path / "a.pcap", [packet(k) for k in range(160)], cut=1250))))
+    assert len(clouds["cloud"]) == 3
+
+
+@need
+@pytest.mark.parametrize("content", [b"", b"no capture at all, but a longer text than a header"])
+def test_a_file_that_is_no_capture_is_named(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.pcap").write_bytes(content)
+    source = VelodyneFile(input=str(tmp_path / "a.pcap"))
+    source.setup()
+    with pytest.raises(SourceError, match="is no capture of packets"):
+        list(source.stream())
+
+
+@need
+def test_a_lidar_over_udp_is_read_and_its_silence_drops_the_turn(caplog: pytest.LogCaptureFixture) -> None:
+    source = VelodyneLidar(input="udp://127.0.0.1:2368")
+    times = iter([*((START * 10**9 + round(k * EVERY * 1e9), packet(k)) for k in range(100))])
+    later = ((START + 60) * 10**9 + round(k * EVERY * 1e9) for k in range(200))
+    source.setup()
+    source.close()
+    steps: list[tuple[int, bytes | None]] = [*times, ((START + 1) * 10**9, None), ((START + 2) * 10**9, None)]
+    steps += [(arrival, packet(k)) for k, arrival in enumerate(later)]
+
+    def read(port: int) -> tuple[bytes | None, int]:
+        arrival, data = steps.pop(0)
+        if not steps:
+            source.stop_reading()
+        return data, arrival
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("operators.sources.velodyne.read_port", read)
+        clouds = [step["cloud"] for step in source.stream()]
+
+    assert [cloud.stamp // 10**9 - START for cloud in clouds] == [0, 60, 60, 60]
+    assert all(np.ptp(cloud.time_offsets) < 0.11 for cloud in clouds)  # type: ignore[union-attr]
+    assert source.summary()["unplugged"] == 1
+    assert [r.getMessage() for r in caplog.records] == [
+        "no packets from the LiDAR at udp://127.0.0.1:2368: it is waited for"
+    ]
+
+
+@need
+def test_datagrams_of_loopback_become_clouds() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    source = VelodyneLidar(input=f"udp://127.0.0.1:{port}")
+    source.setup()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for k in range(90):
+            sender.sendto(packet(k), ("127.0.0.1", port))
+        sender.sendto(b"position", ("127.0.0.1", port))
+    cloud = next(source.stream())["cloud"]
+    source.close()
+
+    assert isinstance(cloud, PointCloud)
+    assert np.linalg.norm(cloud.points, axis=1) == pytest.approx(WALL, abs=0.02)
+
+
+def test_without_the_package_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "velodyne_decoder", None)
+    with pytest.raises(SourceError, match=r"need the package velodyne_decoder: pip install 'robot-dataflow\[lidar\]'"):
+        VelodyneFile(input=str(capture(tmp_path / "a.pcap", []))).setup()
