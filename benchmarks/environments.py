@@ -3,8 +3,8 @@
 python benchmarks/environments.py [--rounds 3]
 
 Builds environments with numpy 1.26.4 from the package index, runs a graph of a source and two operators in none of
-them, with one operator in one and with each in another, and gives the least time of `dataflow run` and its CPU time. Then
-numpy is brought to this installation's version in one, and `dataflow verify` has to name it. Exit code 1 where an
+them, with one operator in one and with each in another, and gives the least time of `dataflow run` and its CPU time.
+Then numpy is brought to this installation's version in one, and `dataflow verify` has to name it. Exit code 1 where an
 environment costs more than 1 s of CPU time, or the change is not named.
 """
 
