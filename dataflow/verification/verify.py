@@ -219,9 +219,14 @@ def _parts(
     graph: Graph, log: FiringLog, books: Books, operators: Sequence[str], *, held: Collection[str], **options: Any
 ) -> list[partition.Job]:
     """Returns the parts of the operators of each environment by itself."""
-    plan = partial(partition.planned, graph, log, books, held=held, cores=len(os.sched_getaffinity(0)), **options)
-    envs = dict.fromkeys(graph.nodes[name].env for name in operators)
-    return [part for env in envs for part in plan(_in(env, graph, operators, held))]
+    envs, cores = dict.fromkeys(graph.nodes[name].env for name in operators), len(os.sched_getaffinity(0))
+    return [
+        part
+        for env in envs
+        for part in partition.planned(
+            graph, log, books, _in(env, graph, operators, held), held=held, cores=cores, **options
+        )
+    ]
 
 
 def _in(env: str | None, graph: Graph, operators: Iterable[str], held: Collection[str]) -> tuple[str, ...]:

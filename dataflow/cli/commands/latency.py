@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
@@ -18,6 +18,9 @@ from dataflow.cli.support.arguments import (
     output_file,
 )
 from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
+
+if TYPE_CHECKING:
+    from dataflow.analysis.latency import PathLatency
 
 
 def latency(
@@ -66,7 +69,11 @@ def latency(
         raise fail(f"{recording}: no firing of a sink is recorded that a source's message caused")
     if json:
         print_json([path.as_json() for path in found])
-        return
+    else:
+        _print(found)
+
+
+def _print(found: list[PathLatency]) -> None:
     made = table("from", "to", *_NUMBERS[:4], "costs most", *_NUMBERS[4:], right=_NUMBERS)
     made.padding = (0, 0, 0, 0)
     for name in (0, 1, 6):
