@@ -19,7 +19,7 @@ from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting, al
 
 DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # errors of odometry beyond its covariance, over a metre
 STEP = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # and at each keyframe
-PART, PARTS = 2.5, 12  # metres between views, and views, that are looked at before a map counts as found
+ASIDE, RIVALS = 2.5, 12  # metres from a place, and views beyond these that are looked at before it is believed
 AMBIGUOUS = "ambiguous: another place explains the scan as well"
 LEAST = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # of a sight: noise and calibration err alike in all
 
@@ -115,19 +115,16 @@ class LidarGraph(PlaceGraph[LidarView]):
         return loops
 
     def _elsewhere(self, number: int, T: Matrix, eyes: Eyes[LidarView]) -> bool:
-        """Returns whether a scan may have been taken elsewhere as well, by one view of each other part of the map.
+        """Returns whether a scan may have been taken elsewhere as well, by the views there that look most like it.
 
-        The views that look most alike may all be at one of two places that are alike.
+        Those that look most alike of all may be at one of two places that are alike.
         """
         view = self.nodes[number].view
         assert view is not None
-        likeness, places, chosen = self._index.likeness(view), [T[:3, 3]], list[int]()
-        for k in sorted(self._old(number), key=lambda k: -likeness[k]):
-            at = self.nodes[k].T[:3, 3]
-            if all(np.linalg.norm(at - other) > PART for other in places):
-                places.append(at)
-                chosen.append(k)
-        sights = self._sights(number, chosen[:PARTS], eyes, False, Added())
+        likeness = self._index.likeness(view)
+        others = [k for k in self._old(number) if np.linalg.norm((self.nodes[k].T - T)[:3, 3]) > ASIDE]
+        chosen = sorted(others, key=lambda k: -likeness[k])[:RIVALS]
+        sights = self._sights(number, chosen, eyes, False, Added())
         return any(apart(T, self.nodes[k].T @ seen.T_known_seen) for k, seen in sights)
 
 
