@@ -88,6 +88,31 @@ def state(
         return {"call": fired.number, "parts": sorted({*before, *after}), "part" if part else "changed": shown}
 
 
+def lines(
+    recording: str, operator: str, call: str = "diff", graph: str | None = None, path: list[str] | None = None
+) -> Any:
+    """Name the lines that can have made a call of an operator other than recorded (`call` as in `goto`).
+
+    `changes`: where the operator's code differs from that which was recorded, as far as that is in git's commits or was
+    replaced by a reload (`recorded_code`); first those without which the call gives what was recorded (`mends`), then
+    those that ran in it. `raised`: the line of its error. `alone`: the lines that ran in it and in none of the 8
+    calls before. `ran`, where there are no changes: all its lines.
+    """
+    from dataflow.debugging.suspects import ranges, suspects
+
+    with _debugger(recording, operator, graph) as (debugger, origin, opened):
+        found = suspects(opened, debugger, _at(debugger, origin, call).number)
+    values = {
+        "call": found.number,
+        "same": found.same,
+        "raised": found.raised,
+        "recorded_code": {name: where or "not found" for name, where in found.modules.items()},
+        "changes": [asdict(change) for change in found.changes],
+        "alone": ranges(found.alone),
+    }
+    return values if found.changes else values | {"ran": ranges(found.ran)}
+
+
 def history(
     recording: str,
     operator: str,
@@ -231,6 +256,7 @@ def prove(
     call: str,
     expect: str,
     may_change: str = "True",
+    right: str | None = None,
     params: dict[str, Any] | None = None,
     graph: str | None = None,
     path: list[str] | None = None,
@@ -242,7 +268,8 @@ def prove(
     Proven is a fix by which the call gives another result than the recorded one, for which `expect` is true, all other
     calls of the operator that change are such that `may_change` is true, and every other operator that is given the
     recorded inputs makes what was recorded. Both are Python expressions over a call: inp, out, stamp, number, same,
-    error; `expect` also sees before and after, the states. `call`: as in `goto`.
+    error; `expect` also sees before and after, the states. `call`: as in `goto`. `right`: a recording that right code
+    made: the operator makes all that is recorded there, too.
     """
     expected, allowed = _compiled("expect", expect), _compiled("may_change", may_change)
     with _debugger(recording, operator, graph, params) as (debugger, origin, _):
@@ -271,11 +298,16 @@ def prove(
     bad = {
         n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)
     } | dict.fromkeys(others, "not re-executed")
+    of_right = "identical"
+    if right is not None:
+        report = _verify(_file(right), [name], with_graph)[1]
+        of_right = next((report.verdict(v) for v in report.operators if v.operator == name), "not re-executed")
     reasons = [
         *(() if differs else [f"call {number} still gives what was recorded"]),
         *(() if meets else [f"call {number}: expect is false: {expect}"]),
         *([f"calls that may not change do: {refused[:MOST_CHANGED]}"] if refused else ()),
         *([f"other operators: {bad}"] if bad else ()),
+        *([f"{name} in {right}: {of_right}"] if of_right != "identical" else ()),
     ]
     return {
         "proven": not reasons,
@@ -287,7 +319,8 @@ def prove(
 
 
 TOOLS: Mapping[str, Callable[..., Any]] = {
-    each.__name__: each for each in (verify, why, goto, diff, state, history, what_if, capture, blame, drops, prove)
+    each.__name__: each
+    for each in (verify, why, goto, diff, lines, state, history, what_if, capture, blame, drops, prove)
 }
 
 
