@@ -3,10 +3,11 @@
 python benchmarks/agents.py [--seed N] [--bugs N]
 
 Ten operators that ship run on two seconds of the bundled recording, in a copy of their package with a git commit.
-Faults are drawn from the modules that one of them alone uses (`tools/mutants.py`); a fault that changes no output, or
-that fails before the first call, is drawn again. A fixed policy then calls tools alone: `verify` names the operator,
-`diff` the call, `lines` the line; `prove` judges the right fix, and for one fault of each operator a wrong one: another
-fault in the same function. Which call differs first is read beside that, from the records of a run with the fault.
+Faults are drawn from the modules that one of them alone uses (`tools/mutants.py`), from lines that run in its calls or
+are in no function; one that changes no output, or fails before the first call, is drawn again. A fixed policy then
+calls tools alone: `verify` names the operator, `diff` the call, `lines` the line; `prove` judges the right fix, and for
+one fault of each operator a wrong one: another fault in the same function. Which call differs first is read beside
+that, from the records of a run with the fault.
 Exit code 1 where an operator or a call is missed, more than a quarter of the lines are, or a fix is misjudged.
 """
 
@@ -27,8 +28,10 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -37,6 +40,8 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 from mutants import Mutant, mutants_of  # noqa: E402
 
+from dataflow.debugging.debugger import Debugger  # noqa: E402
+from dataflow.debugging.lines import Lines, homes_of  # noqa: E402
 from dataflow.graph import load_graph  # noqa: E402
 from dataflow.graph.code import code_now  # noqa: E402
 from dataflow.recording import Recording  # noqa: E402
@@ -107,6 +112,8 @@ LIMIT = 120
 """Seconds of a run; a fault by which it takes longer is drawn again."""
 MOST_DRAWN = 40
 """Faults drawn for a bug."""
+WHOLE = (1, 10**9)
+"""Lines of what is in no function."""
 COLUMNS = ("operator", "call", "line", "line among changes", "line without git", "right fix", "wrong fix")
 INNOCENT = 5
 """Most changes without effect that `lines` is shown along with the bug."""
@@ -175,7 +182,13 @@ class Bench:
 
     def drawn(self, operator: str, seed: int) -> Iterator[Mutant]:
         """Yields the faults of an operator's own modules in random order, equal ones for equal seeds."""
-        every = [mutant for file in self.files[operator] for mutant in mutants_of(file, file.read_bytes())]
+        ran = {(Path(file), line) for file, line in forked(_ran, self.good, operator)}
+        every = [
+            mutant
+            for file in self.files[operator]
+            for mutant in mutants_of(file, file.read_bytes())
+            if (self.checkout / file, mutant.line) in ran or function_of(mutant) == WHOLE
+        ]
         random.Random(f"{seed} {operator}").shuffle(every)
         yield from every[:MOST_DRAWN]
 
@@ -236,6 +249,20 @@ def _outcomes(recording: Path, operator: str) -> list[Any]:
     return [[r.outcome, [None if o is None else o.digest.hex() for o in r.outputs or ()]] for r in records]
 
 
+def _ran(recording: Path, operator: str) -> list[tuple[str, int]]:
+    """Returns the lines that ran in the calls of an operator."""
+    found = set[tuple[str, int]]()
+
+    def at_line(frame: FrameType, _: int) -> None:
+        found.add((frame.f_code.co_filename, frame.f_lineno))
+
+    with Recording(recording) as opened, closing(Debugger(opened, operator)) as debugger:
+        through = Lines(at_line, homes_of(debugger.node.operator.__module__)).through
+        for _ in debugger.each(0, len(debugger.calls) - 1, through):
+            continue
+    return sorted(found)
+
+
 def _files(checkout: Path) -> dict[str, list[str]]:
     """Returns the files of the modules that one operator alone uses."""
     nodes = load_graph("agents.yaml").nodes
@@ -274,19 +301,20 @@ def function_of(mutant: Mutant) -> tuple[int, int]:
         for node in ast.walk(ast.parse(mutant.file.read_bytes()))
         if isinstance(node, ast.FunctionDef) and node.lineno <= mutant.line <= (node.end_lineno or 0)
     ]
-    return max(spans, default=(1, 10**9))
+    return max(spans, default=WHOLE)
 
 
 def apart(mutant: Mutant, others: list[Mutant]) -> bool:
     """Returns whether a fault lies on lines that neither those of others nor their neighbours are."""
-    lines = mutant.file.read_bytes().count(b"\n", mutant.start, mutant.end) + mutant.line
     return all(
-        lines + 1 < each.line or last_line(each) + 1 < mutant.line for each in others if each.file == mutant.file
+        last_line(mutant) + 1 < each.line or last_line(each) + 1 < mutant.line
+        for each in others
+        if each.file == mutant.file
     )
 
 
 def last_line(mutant: Mutant) -> int:
-    return mutant.file.read_bytes().count(b"\n", mutant.start, mutant.end) + mutant.line
+    return int(mutant.line + mutant.file.read_bytes().count(b"\n", mutant.start, mutant.end))
 
 
 def named(found: Any, bug: Bug) -> str:

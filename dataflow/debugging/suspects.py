@@ -49,7 +49,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Suspects:
-    """What can have made a call other than recorded. `raised`: where its error was raised, the innermost line of the
+    """Holds what can have made a call other than recorded. `raised`: where its error was raised, the innermost line of the
     operator's source. `modules`: of each one that differs, where its recorded text was found; None where it was not.
     `changes`: those that mend the call first, then those that ran. `ran`: the lines that ran in the call, and in
     none of the `BEFORE` calls before it: `alone`."""
