@@ -38,7 +38,7 @@ from places import extractor, with_head  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
 import dataflow  # noqa: E402
-from dataflow.messages import TrackState  # noqa: E402
+from dataflow.messages import Image, Tracks, TrackState  # noqa: E402
 from operators.detection.custom.folder import read_detection_data  # noqa: E402
 from operators.learning.backbone import current_names  # noqa: E402
 from operators.learning.loop import Settings, train  # noqa: E402
@@ -122,8 +122,8 @@ def cut_out(worlds: Path, folder: Path, *, halves: bool = False) -> Classificati
     """
     read = read_detection_data(worlds, 0)
     if halves:
-        images = sorted((*read.training, *read.validation), key=lambda image: image.file)
-        read = replace(read, training=tuple(images[::2]), validation=tuple(images[1::2]))
+        whole = sorted((*read.training, *read.validation), key=lambda image: image.file)
+        read = replace(read, training=tuple(whole[::2]), validation=tuple(whole[1::2]))
     parts: dict[str, list[LabelledImage]] = {"training": [], "validation": []}
     for part, images in (("training", read.training), ("validation", read.validation)):
         count = np.zeros(len(read.classes), np.int64)
@@ -155,11 +155,11 @@ def frequent(data: ClassificationData) -> ClassificationData:
         np.bincount([i.label for i in part], minlength=len(data.classes)) for part in (data.training, data.validation)
     ]
     kept = np.flatnonzero(np.minimum(*sides) >= FEW).tolist()
-    parts = [
+    training, validation = (
         tuple(LabelledImage(i.file, kept.index(i.label)) for i in part if i.label in kept)
         for part in (data.training, data.validation)
-    ]
-    return ClassificationData(tuple(data.classes[k] for k in kept), *parts)
+    )
+    return ClassificationData(tuple(data.classes[k] for k in kept), training, validation)
 
 
 def described(images: Sequence[LabelledImage], backbone: Path) -> NDArray[np.float64]:
@@ -179,7 +179,7 @@ def people(recording: Path, backbone: Path) -> None:
         of: dict[int, list[LabelledImage]] = {}
         for image in stream[images]:
             found = at.get(image.stamp)
-            if found is None:
+            if not (isinstance(image, Image) and isinstance(found, Tracks) and found.boxes is not None):
                 continue
             for k in np.flatnonzero((found.states == TrackState.CONFIRMED) & (found.unseen == 0)).tolist():
                 x1, y1, x2, y2 = np.clip(found.boxes[k], 0, (image.width, image.height) * 2).round().astype(int)

@@ -78,7 +78,7 @@ def _recorded(path: Path, operators: Iterable[str]) -> Mapping[str, int]:
 def verdicts(path: Path) -> Mapping[str, str]:
     """The verdict on each operator of a recording."""
     report = verify(path)
-    return {v.operator: report.verdict(v) for v in report.operators}
+    return {v.operator: "nothing verified" if report.empty else report.verdict(v) for v in report.operators}
 
 
 def right(cage: Cage, way: str, placement: str) -> Mapping[str, str]:

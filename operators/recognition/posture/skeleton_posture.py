@@ -71,7 +71,7 @@ def _thigh_along_trunk(joints: dict[str, F32]) -> float | None:
     )
     if not shoulders or not hips:
         return None
-    trunk = np.mean(hips, axis=0, dtype=np.float64) - np.mean(shoulders, axis=0, dtype=np.float64)
+    trunk = np.array(hips, np.float64).mean(axis=0) - np.array(shoulders, np.float64).mean(axis=0)
     length = float(trunk @ trunk)
     thighs = [
         joints[f"{s}_knee"].astype(np.float64) - joints[f"{s}_hip"]

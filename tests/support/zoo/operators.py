@@ -42,7 +42,7 @@ class Steps(Source):
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         for k in range(self.steps):
-            rows = np.array([[k + 2, 1], [1, 3]], np.float64)
+            rows = np.array([[k + 2, 1], [1, 3]], np.float32)
             yield {"out": FeatureVector(stamp=10**18 + k * 20_000_000, vectors=rows, model="zoo")}
 
 
@@ -150,6 +150,9 @@ class Draws(Hard):
 
 class States(Hard):
     """Takes the states of the global generators with it to the next firing."""
+
+    numpy: Any
+    python: Any
 
     def work(self, x: FeatureVector) -> list[float]:
         if self.calls > 1:
@@ -337,7 +340,7 @@ class OwnGenerator(Hard):
 class Sometimes(Hard):
     """Emits by chance."""
 
-    def process(self, x: FeatureVector) -> FeatureVector | None:
+    def process(self, x: FeatureVector) -> FeatureVector | None:  # type: ignore[override]
         return super().process(x) if os.urandom(1)[0] & 1 else None
 
 
@@ -471,6 +474,8 @@ class KeepsEmitted(Hard):
 
 class Before(Hard):
     """Adds the input before to each input."""
+
+    last: FeatureVector
 
     def work(self, x: FeatureVector) -> float:
         before = self.last if self.calls > 1 else x
