@@ -275,12 +275,10 @@ def prove(
     with _debugger(recording, operator, graph, params) as (debugger, origin, _):
         fired = _at(debugger, origin, call)
         number, name, changed_graph = fired.number, debugger.node.name, debugger.graph
-        meets = bool(_evaluated(expected, expect, _names(fired)))
-        differs = not fired.same
+        meets, differs = bool(_evaluated(expected, expect, _names(fired))), not fired.same
         shown = _shown(fired, debugger, origin)
         say(f"call {number} of {name} made again; all its calls follow")
-        changed: list[int] = []
-        refused: list[int] = []
+        changed, refused = list[int](), list[int]()
 
         def visit(each: Fired) -> bool:
             if not each.same:
@@ -295,13 +293,9 @@ def prove(
     others, report = _verify(_file(recording), None, with_graph)
     verdicts = {v.operator: report.verdict(v) for v in report.operators if v.operator != name}
     after = _downstream(changed_graph, name)
-    bad = {
-        n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)
-    } | dict.fromkeys(others, "not re-executed")
-    of_right = "identical"
-    if right is not None:
-        report = _verify(_file(right), [name], with_graph)[1]
-        of_right = next((report.verdict(v) for v in report.operators if v.operator == name), "not re-executed")
+    bad = {n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)}
+    bad |= dict.fromkeys(others, "not re-executed")
+    of_right = "identical" if right is None else _verdict(_file(right), name, with_graph)
     reasons = [
         *(() if differs else [f"call {number} still gives what was recorded"]),
         *(() if meets else [f"call {number}: expect is false: {expect}"]),
@@ -363,6 +357,12 @@ def _verify(file: Path, only: Sequence[str] | None, graph: Graph | None) -> tupl
 
     report = verify_recording(file, graph=graph, only=only or None)
     return sorted(report.absent), report
+
+
+def _verdict(file: Path, operator: str, graph: Graph | None) -> str:
+    """Returns what verification says of one operator."""
+    report = _verify(file, [operator], graph)[1]
+    return next((report.verdict(v) for v in report.operators if v.operator == operator), "not re-executed")
 
 
 def _call_of(file: Path, operator: str, first: Mapping[str, Any]) -> int:
