@@ -206,7 +206,7 @@ def test_seeds(first: int, memory: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [23_000_041, 23_000_109, 23_000_334, 23_000_461, 23_000_570])
+@pytest.mark.parametrize("seed", [23_000_041, 23_000_109, 23_000_334, 23_000_461, 23_000_570, 23_000_869])
 def test_seeds_that_broke_a_promise_once(seed: int, memory: Path) -> None:
     check(scenario_of(seed), memory)
 
