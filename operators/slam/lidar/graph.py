@@ -13,13 +13,14 @@ from operators.odometry.lidar.search import apart
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import SAVED, KeyframeGraph, Node
 from operators.slam.lidar.scan_context import likeness
-from operators.slam.lidar.view import LidarEyes, LidarView
+from operators.slam.lidar.view import LidarEyes, LidarSight, LidarView
 from operators.slam.place_graph import PlaceGraph
 from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting, alike
 
 DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # errors of odometry beyond its covariance, over a metre
 STEP = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # and at each keyframe
 ASIDE, RIVALS = 2.5, 12  # metres from a place, and views beyond these that are looked at before it is believed
+RIVAL = 0.1  # by which the score of another place may be less than that of the best where it explains a scan as well
 AMBIGUOUS = "ambiguous: another place explains the scan as well"
 LEAST = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # of a sight: noise and calibration err alike in all
 
@@ -109,23 +110,30 @@ class LidarGraph(PlaceGraph[LidarView]):
             added.refused.append(AMBIGUOUS)
             return []
         loops = self._weighed(number, sights[:1])
-        if loops and not self.located and self._elsewhere(number, poses[0], eyes):
+        if loops and not self.located and self._elsewhere(number, *sights[0], eyes):
             added.refused.append(AMBIGUOUS)
             return []
         return loops
 
-    def _elsewhere(self, number: int, T: Matrix, eyes: Eyes[LidarView]) -> bool:
+    def _elsewhere(self, number: int, known: int, best: Sighting, eyes: Eyes[LidarView]) -> bool:
         """Returns whether a scan may have been taken elsewhere as well, by the views there that look most like it.
 
         Those that look most alike of all may be at one of two places that are alike.
         """
-        view = self.nodes[number].view
+        view, T = self.nodes[number].view, self.nodes[known].T @ best.T_known_seen
         assert view is not None
+        assert isinstance(best, LidarSight)
+        least = best.registered.score - RIVAL
         likeness = self._index.likeness(view)
         others = [k for k in self._old(number) if np.linalg.norm((self.nodes[k].T - T)[:3, 3]) > ASIDE]
         chosen = sorted(others, key=lambda k: -likeness[k])[:RIVALS]
         sights = self._sights(number, chosen, eyes, False, Added())
-        return any(apart(T, self.nodes[k].T @ seen.T_known_seen) for k, seen in sights)
+        return any(
+            isinstance(seen, LidarSight)
+            and seen.registered.score > least
+            and apart(T, self.nodes[k].T @ seen.T_known_seen)
+            for k, seen in sights
+        )
 
 
 def between(node: Node[LidarView], T_odom: Matrix, covariance_odom: Matrix) -> Matrix:
