@@ -192,11 +192,14 @@ def test_an_odd_message_is_read_as_far_as_it_makes_sense_and_the_rest_is_named(
     ("message", "reason"),
     [
         (cloud([("x", 0, 7, 3), *XYZ[1:]], points(6)), "whose field x has 3 values a point"),
+        (encoded("32FC3; tiff compressed", file(".tiff", COLOUR.astype(np.float32))), "holds float32 of 6x8x3, which no"),
+        (encoded("16UC1; tiff compressed", file(".tiff", COLOUR.astype(np.uint16))), "holds uint16 of 6x8x3, which no"),
+        (encoded("tiff", file(".tiff", METRES.astype(np.int32))), "holds int32 of 6x8, which no"),
         (camera("equidistant", 5), "a distortion of 5 coefficients, of which equidistant has 4 at most"),
         (encoded("h264", b"\0\0\0\x1f\x65\x88" + bytes(40)), "without a start code"),
         (ros("visualization_msgs/Marker", header=header(T), type=1, action=2), "a marker that deletes"),
     ],
-    ids=["three values", "five coefficients", "AVCC", "deletion"],
+    ids=["three values", "float colours", "colours as depth", "int32", "five coefficients", "AVCC", "deletion"],
 )
 def test_a_message_that_makes_no_sense_is_left_as_it_is_with_its_reason(
     tmp_path: Path, message: Any, reason: str
