@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dataflow.execution.snapshots import pack_state, unpack_state
 from operators.scene.map.cells import Cells
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.moving import RecentPlaces
@@ -43,7 +45,7 @@ def judged(place: Callable[[float], Block], speed: float, ahead: float, again: i
     Only what lies `ahead` of the scanner by its x is seen of it, as in a camera's image. `again`: the scan at which a
     snapshot takes the place of what was kept.
     """
-    recent, vehicle = RecentPlaces(SIDE, 0.1), None
+    recent, vehicle = RecentPlaces(0.1), None
     for k in range(21):
         eye = np.array([speed * k / 10, 0.0, 1.7])
         points, of = scanned([HOUSE, place(k / 10)], eye)
@@ -54,7 +56,7 @@ def judged(place: Callable[[float], Block], speed: float, ahead: float, again: i
         vehicle.cells, vehicle.center = cells, cells.middle
         recent.judge(k * TENTH, [vehicle], view)
         if k == again:
-            kept, recent = recent.snapshot(), RecentPlaces(SIDE, 0.1)
+            kept, recent = recent.snapshot(), RecentPlaces(0.1)
             recent.restore(kept)
     assert vehicle is not None
     return vehicle
@@ -89,6 +91,23 @@ def test_nothing_tells_of_the_first_view_and_a_restored_memory_goes_on_the_same(
     points, of = scanned([HOUSE, beside(8)], eye)
     vehicle = MapObject(7, Cells.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
     assert np.isnan(vehicle.moving)
-    RecentPlaces(SIDE, 0.1).judge(0, [vehicle], RangeView(points - eye, np.eye(4), 0.012))
+    RecentPlaces(0.1).judge(0, [vehicle], RangeView(points - eye, np.eye(4), 0.012))
     assert vehicle.moving == 0.5
     assert judged(lambda t: beside(8 + t), 2.0, 0).moving == judged(lambda t: beside(8 + t), 2.0, 0, again=9).moving
+
+
+def test_voxels_that_are_added_later_are_of_no_moment_before() -> None:
+    eye = np.array([0.0, 0.0, 1.7])
+    points, of = scanned([HOUSE, beside(8)], eye)
+    vehicle = MapObject(7, Cells.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
+    recent = RecentPlaces(0.1)
+    view = RangeView(points - eye, np.block([[np.eye(3), eye[:, None]], [np.zeros(3), 1.0]]), 0.012)
+    recent.judge(0, [vehicle], view)
+    restored = RecentPlaces(0.1)
+    restored.restore(unpack_state(pack_state(recent.snapshot())))
+    vehicle.cells.add(Cells.of(points[of == 1] - [0, 6, 0], SIDE))
+    vehicle.cells = Cells.of(points[of == 1], SIDE)
+    again = replace(vehicle)
+    recent.judge(6 * TENTH, [vehicle], view)
+    restored.judge(6 * TENTH, [again], view)
+    assert vehicle.moving == again.moving
