@@ -17,6 +17,7 @@ from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import Played, play
 from operators.scene import SceneGraphBuilder
 from operators.scene.bodies import Body, footprint_share, gap
+from operators.scene.graph.layers import GraphSettings, LayeredGraph
 from operators.scene.relations import Hysteresis
 
 Builder = partial(SceneGraphBuilder, labels="simulator")
@@ -361,6 +362,17 @@ def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves() -> None:
         assert graph.moving[graph.names().index("car 2")] == np.float32(sure)
         acts[sure] = act.class_names[act.class_ids[0]]
     assert acts == {0.05: "resting", 0.5: "unknown", 0.95: "driving"}
+
+
+@pytest.mark.parametrize(("moving", "speed"), [(0.05, 0.0), (0.5, 10.0), (np.nan, 10.0), (0.95, 10.0)])
+def test_an_agent_has_the_velocity_of_its_centre_unless_it_is_known_to_stand(moving: float, speed: float) -> None:
+    graph = LayeredGraph(GraphSettings())
+    for k in range(8):
+        center, size = np.array([40 + 2.0 * k, 3, 0.7]), np.array([4, 1.8, 1.5])
+        car = Body(2, "car", center, size, 0.0, np.zeros(3), frozenset({"agent"}), moving)
+        now = graph.update(k * STEP, [car], None)
+    velocity = next(b.velocity for b in now.bodies if b.id == 2)
+    np.testing.assert_allclose(velocity, [speed, 0, 0], atol=1e-9)
 
 
 def test_joints_say_who_sits_and_without_them_nobody_is_said_to_stand() -> None:

@@ -39,7 +39,9 @@ def scanned(blocks: Sequence[Block], eye: Array) -> tuple[Array, NDArray[np.int6
     return eye + ways[there] * best[there, None], of[there]
 
 
-def judged(place: Callable[[float], Block], speed: float, ahead: float, again: int | None = None) -> MapObject:
+def judged(
+    place: Callable[[float], Block], speed: float, ahead: float, again: int | None = None, house: Block = HOUSE
+) -> MapObject:
     """Returns a vehicle as it is after two seconds, scanned ten times a second from a car that drives at a speed.
 
     Only what lies `ahead` of the scanner by its x is seen of it, as in a camera's image. `again`: the scan at which a
@@ -48,7 +50,7 @@ def judged(place: Callable[[float], Block], speed: float, ahead: float, again: i
     recent, vehicle = RecentPlaces(0.1), None
     for k in range(21):
         eye = np.array([speed * k / 10, 0.0, 1.7])
-        points, of = scanned([HOUSE, place(k / 10)], eye)
+        points, of = scanned([house, place(k / 10)], eye)
         view = RangeView(points - eye, np.block([[np.eye(3), eye[:, None]], [np.zeros(3), 1.0]]), 0.012)
         cells = Cells.of(points[(of == 1) & (points[:, 0] > eye[0] + ahead)], SIDE)
         if vehicle is None:
@@ -111,3 +113,32 @@ def test_voxels_that_are_added_later_are_of_no_moment_before() -> None:
     recent.judge(6 * TENTH, [vehicle], view)
     restored.judge(6 * TENTH, [again], view)
     assert vehicle.moving == again.moving
+
+
+def test_the_places_of_a_car_of_a_few_voxels_say_nothing_and_its_centre_counts() -> None:
+    far = ((200, 0, 10), (1, 400, 30))
+    car = judged(lambda t: ((90 + 10 * t, 3, 1), (4.5, 1.8, 1.5)), 0, 0, house=far)
+    assert 0 < len(car.cells) < 5
+    assert np.isnan(car.moving)
+
+
+def test_what_is_known_of_a_car_outlasts_a_view_that_says_nothing() -> None:
+    recent, car = RecentPlaces(0.1), MapObject(7, Cells.of(np.array([[8.0, 3, 1]]), SIDE), np.array([1.0]), 1.0, 0, 0)
+    empty = RangeView(np.zeros((0, 3)), np.eye(4), 0.012)
+    recent.judge(0, [car], empty)
+    car.moving = 0.04
+    kept = [recent.judge((6 + k) * TENTH, [car], empty) or car.moving for k in range(5)]
+    assert kept[:2] == [0.27, 0.385]
+    assert np.isnan(kept[-1])
+
+
+def test_whether_a_car_that_was_hidden_moves_is_open() -> None:
+    eye, T = np.array([0.0, 0.0, 1.7]), np.block([[np.eye(3), np.array([[0.0], [0.0], [1.7]])], [np.zeros(3), 1.0]])
+    wall: Block = ((8, 2, 1.5), (0.5, 6, 3))
+    before, _ = scanned([HOUSE, beside(20), wall], eye)
+    now, of = scanned([HOUSE, beside(20)], eye)
+    car, other = (MapObject(i, Cells.of(now[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0) for i in (7, 8))
+    recent = RecentPlaces(0.1)
+    recent.judge(0, [other], RangeView(before - eye, T, 0.012))
+    recent.judge(6 * TENTH, [car], RangeView(now - eye, T, 0.012))
+    assert car.moving == 0.5
