@@ -364,6 +364,25 @@ def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves() -> None:
     assert acts == {0.05: "resting", 0.5: "unknown", 0.95: "driving"}
 
 
+@pytest.mark.parametrize(("moving", "ago", "said"), [(0.98, 1, "driving"), (0.98, 2, "unknown"), (0.02, 2, "resting")])
+def test_a_vehicle_out_of_sight_may_have_stopped(moving: float, ago: float, said: str) -> None:
+    nodes = [
+        room(k, [(2, "car", (8, 3, 0.7), (4, 1.8, 1.5)), TABLE]).replace(
+            moving=np.array([moving, np.nan], np.float32),
+            last_seen=np.array([(k + 1) * STEP - round(ago * 1e9)] * 2),
+        )
+        for k in range(4)
+    ]
+    played = play(SceneGraphBuilder(), {"nodes": nodes})
+    graph, act = played["graph"][-1], played["activities"][-1]
+    assert isinstance(graph, SceneGraph)
+    assert isinstance(act, Activity)
+    assert act.class_names[act.class_ids[0]] == said
+    assert graph.moving is not None
+    unsure = said == "unknown"
+    assert graph.moving[graph.names().index("car 2")] == np.float32(0.5 if unsure else moving)
+
+
 @pytest.mark.parametrize(("moving", "speed"), [(0.05, 0.0), (0.5, 10.0), (np.nan, 10.0), (0.95, 10.0)])
 def test_an_agent_has_the_velocity_of_its_centre_unless_it_is_known_to_stand(moving: float, speed: float) -> None:
     graph = LayeredGraph(GraphSettings())
