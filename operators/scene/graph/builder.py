@@ -61,8 +61,8 @@ class SceneGraphBuilder(Operator):
     )
     postures: Sampled[Classification] = Sampled(
         required=False,
-        doc="whether people stand or sit, by SkeletonPosture; with it, what one in sight does who does neither by it, "
-        "nor anything else, is unknown",
+        doc="whether people stand or sit, by SkeletonPosture, by ids of nodes; with it, what one in sight does who "
+        "does neither by it, nor anything else, is unknown; without ids they are of none",
     )
     graph: Out[SceneGraph] = Out(doc="all nodes and the relations that hold, with their scores")
     activities: Out[Activity] = Out(doc="what agents do, to what, since when, and their likeliest goal")
@@ -227,8 +227,10 @@ def _in_sight(nodes: SceneGraph) -> NDArray[np.bool_]:
 def _postures_of(nodes: SceneGraph, postures: Classification) -> dict[int, tuple[str, float]]:
     """Returns what the joints of people show, and `unknown` for the nodes in sight of which none do."""
     shown = dict.fromkeys(nodes.ids[_in_sight(nodes)].tolist(), (UNKNOWN, 0.3))
-    ids = [] if postures.ids is None else postures.ids.tolist()
-    return shown | dict(zip(ids, zip(postures.labels(), postures.scores.tolist(), strict=True), strict=True))
+    if postures.ids is None:
+        return shown
+    told = zip(postures.labels(), postures.scores.tolist(), strict=True)
+    return shown | dict(zip(postures.ids.tolist(), told, strict=True))
 
 
 def _recognized(act: Act, recognized: Activity, *, in_sight: bool) -> Act:

@@ -394,6 +394,15 @@ def test_an_agent_has_the_velocity_of_its_centre_unless_it_is_known_to_stand(mov
     np.testing.assert_allclose(velocity, [speed, 0, 0], atol=1e-9)
 
 
+def test_postures_without_ids_are_of_no_node() -> None:
+    sitting = Classification(
+        stamp=STEP, class_names=("sitting",), class_ids=np.array([0], np.int32), scores=np.array([0.9], np.float32)
+    )
+    act = play(Builder(), {"nodes": [room(0, [person(4, 2, id=1)])], "postures": [sitting]})["activities"][0]
+    assert isinstance(act, Activity)
+    assert act.class_names[act.class_ids[0]] == "unknown"
+
+
 def test_joints_say_who_sits_and_without_them_nobody_is_said_to_stand() -> None:
     def said(*rows: tuple[int, str, float]) -> list[tuple[str, float]]:
         names = ("standing", "sitting")
