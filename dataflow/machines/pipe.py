@@ -44,9 +44,16 @@ class Clocks:
         self._exchanges: deque[tuple[int, int]] = deque(maxlen=EXCHANGES)
 
     def exchanged(self, asked: int, taken: int, answered: int, heard: int) -> None:
-        """Takes one exchange (ns): asked here, taken and answered there by that clock, heard here."""
-        delay = (heard - asked) - (answered - taken)
-        self._exchanges.append((delay, ((taken - asked) + (answered - heard)) // 2))
+        """Takes one exchange (ns): asked here, taken and answered there by that clock, heard here.
+
+        Those before are forgotten where their delays cannot explain the difference: a clock was set, or has drifted.
+        """
+        delay, offset = (heard - asked) - (answered - taken), ((taken - asked) + (answered - heard)) // 2
+        if delay < 0:  # a clock was set in its midst
+            return
+        if (best := self.best) is not None and abs(offset - best[1]) > (delay + best[0]) // 2 + 1:
+            self._exchanges = deque(maxlen=EXCHANGES)
+        self._exchanges.append((delay, offset))
 
     @property
     def best(self) -> tuple[int, int] | None:

@@ -56,7 +56,7 @@ class Control:
                 self.probing, self.released = False, True
                 self._release(fields["first"], fields["at"])
             case "clock":
-                self._live.clock_measured(fields["offset"])
+                self._live.clock_measured(fields["offset"], fields["delay"])
             case "absent":
                 self._mark(fields["streams"], absent=fields["absent"])
             case "ended_elsewhere":

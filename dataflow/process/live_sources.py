@@ -165,11 +165,12 @@ class LiveSources:
         self._faults[name] = SourceFaults()
         self._restarts[name] = Restarts(runner.node.live.restart, time.monotonic)
 
-    def clock_measured(self, offset: int) -> None:
-        """Takes by how much this machine's clock is ahead (ns), for sources whose stamps are corrected by that."""
+    def clock_measured(self, offset: int, delay: int) -> None:
+        """Takes by how much this machine's clock is ahead (ns), at most half of `delay` wrong, for sources whose stamps
+        are corrected by that."""
         for runner in self.runners:
             if runner.node.live.corrected and runner.source.real_time:
-                runner.clock.measured(offset)
+                runner.clock.measured(offset, delay)
 
     @property
     def ended(self) -> bool:

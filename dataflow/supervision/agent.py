@@ -154,7 +154,8 @@ class Stay:
         self._children: Children | None = None
         self._endpoints: dict[str, str] = {}
         self._wanted: Mapping[str, Any] = {}
-        self._corrected: list[str] = []
+        self._corrected: frozenset[str] = frozenset()
+        self._going: set[str] = set()
         self._clock_due = 0.0
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._pipe = Pipe(
@@ -248,6 +249,7 @@ class Stay:
             case "begin":
                 self._begin()
             case "spawn" if self._children is not None:
+                self._going.discard(label)  # until it has its configuration, it takes no other message
                 self._children.spawn(label)
             case "send" if self._children is not None:
                 self._send(label, fields["kind"], fields["fields"], replaces=fields["replaces"])
@@ -295,7 +297,7 @@ class Stay:
         graph = Graph.from_json(wanted["graph"])
         processes = {fields["label"]: ProcessPlan(**fields) for fields in wanted["processes"]}
         corrected = {name for name, node in graph.nodes.items() if node.live.corrected}
-        self._corrected = [label for label, process in processes.items() if corrected & {*process.nodes}]
+        self._corrected = frozenset(label for label, process in processes.items() if corrected & {*process.nodes})
         gate = wanted["gate"]["label"]
         self._pipe.bounded = wanted["live"]
         rings = Rings([*processes, gate], {(maker, taker): tuple(keys) for maker, taker, keys in wanted["pairs"]})
@@ -324,10 +326,12 @@ class Stay:
         if kind == "operators":
             fields["listen"] = [self._endpoints[label]]
             fields["graph"]["network"] |= {"listen": [], "connect": [self._router], "tls": {}, "access_control": {}}
-        elif kind == "go" and (best := self._pipe.clocks.best) is not None:
-            fields["at"] -= best[1] * 1e-9
-            self._clock_due = 0.0
-            self._tell_clock()
+        elif kind == "go":
+            self._going.add(label)
+            if (best := self._pipe.clocks.best) is not None:
+                fields["at"] -= best[1] * 1e-9
+                self._clock_due = 0.0
+                self._tell_clock()
         self._children.send(label, kind, fields, replaces=replaces)
 
     def _tell_clock(self) -> None:
@@ -335,8 +339,8 @@ class Stay:
         now, best = time.monotonic(), self._pipe.clocks.best
         if self._children is not None and best is not None and now >= self._clock_due:
             self._clock_due = now + CLOCK_EVERY
-            for label in self._corrected:
-                self._children.send(label, "clock", {"offset": -best[1]}, replaces=True)
+            for label in self._corrected & self._going:
+                self._children.send(label, "clock", {"offset": -best[1], "delay": best[0]}, replaces=True)
 
     def _printed(self, label: str, line: str) -> None:
         self._say(label, "printed", line=line)

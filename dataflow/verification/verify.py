@@ -142,8 +142,9 @@ def verify(
 
     answers = attempt((one.request(), one.operators) for one in task.parts)
     divided, left = slices.answer(task.books, answers)
-    for env in {played.nodes[name].env for name in left}:
-        answers += attempt([({}, _in(env, played, [n for n in task.operators if n in left], task.held))])
+    if left:
+        envs = dict.fromkeys(played.nodes[name].env for name in task.operators if name in left)
+        answers += attempt([({}, _in(env, played, left, task.operators, task.held)) for env in envs])
     answers.append(divided)
     report = _report(task, answers, tolerance, start)
     if report.culprits:
@@ -224,14 +225,16 @@ def _parts(
         part
         for env in envs
         for part in partition.planned(
-            graph, log, books, _in(env, graph, operators, held), held=held, cores=cores, **options
+            graph, log, books, _in(env, graph, operators, operators, held), held=held, cores=cores, **options
         )
     ]
 
 
-def _in(env: str | None, graph: Graph, operators: Iterable[str], held: Collection[str]) -> tuple[str, ...]:
-    """Returns the operators of an environment, and those that make what these take and is not `held`."""
-    chosen = with_makers(held, graph, {name for name in operators if graph.nodes[name].env == env})
+def _in(
+    env: str | None, graph: Graph, wanted: Iterable[str], operators: Iterable[str], held: Collection[str]
+) -> tuple[str, ...]:
+    """Returns those `wanted` of an environment, and the `operators` that make what these take and is not `held`."""
+    chosen = with_makers(held, graph, {name for name in wanted if graph.nodes[name].env == env})
     return tuple(name for name in operators if name in chosen)
 
 

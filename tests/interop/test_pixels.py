@@ -75,6 +75,11 @@ def test_big_endian_and_padded_rows() -> None:
     assert stored_rows("mono8", 2, 2, 3, padded).tolist() == [[1, 2], [3, 4]]
 
 
+def test_padding_that_the_last_row_lacks_takes_no_memory() -> None:
+    row = np.arange(3, dtype=np.uint8)
+    assert stored_rows("mono8", 3, 1, 1 << 62, row).tolist() == [[0, 1, 2]]
+
+
 def test_what_does_not_fit_is_refused_with_its_numbers() -> None:
     with pytest.raises(RecordingError, match="needs rows of 12 bytes, got step 12 and 5 bytes"):
         stored_rows("rgb8", 4, 2, 0, np.zeros(5, np.uint8))

@@ -121,6 +121,18 @@ def test_the_offset_of_clocks_is_that_of_the_shortest_exchange() -> None:
     assert clocks.best == (20, 1000)
 
 
+def test_exchanges_from_before_a_clock_was_set_are_forgotten() -> None:
+    clocks = Clocks()
+    for k in range(10):
+        clocks.exchanged(asked=k * 1000, taken=k * 1000 + 5, answered=k * 1000 + 5, heard=k * 1000 + 10)
+    clocks.exchanged(asked=11_000, taken=11_005, answered=61_005, heard=11_010)  # set ahead in the midst
+    assert clocks.best == (10, 0)
+
+    clocks.exchanged(asked=12_000, taken=62_020, answered=62_020, heard=12_040)
+
+    assert clocks.best == (40, 50_000)
+
+
 def test_what_waits_is_looked_at_seldom_however_much_of_it_may_not_be_dropped(
     link: Link, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tampering import tampered
 
 from dataflow.graph import Graph
 from dataflow.recording import Recording
@@ -133,3 +134,18 @@ def test_one_with_a_state_that_it_denies_is_verified_as_a_whole(kept: Path, divi
 
     assert any(each["look"]["operator"]["first"] for each in divided if "look" in each)
     assert report.identical
+
+
+def test_what_makes_inputs_that_were_not_recorded_is_repeated_with_one_that_differs(
+    kept: Path, tmp_path: Path, divided: list[dict[str, Any]]
+) -> None:
+    thin = tampered(
+        kept,
+        tmp_path / "thin.mcap",
+        messages=lambda found: [] if found.stream == "kept/smooth/mean" else [(found.message, found.seq)],
+    )
+
+    report = verify(thin, graph=with_look(kept, "Moody"), jobs=2)
+
+    assert sum("look" in each for each in divided) > 1
+    assert "look" in report.culprits

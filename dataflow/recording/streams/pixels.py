@@ -138,9 +138,8 @@ def rows_without_padding(data: Pixels, height: int, step: int, used: int) -> Pix
     """The first `used` of each `step` bytes, flat, for `height` rows; the last row may lack its padding."""
     if step == used:
         return data[: step * height]
-    if len(data) < step * height:
-        data = np.concatenate([data, np.zeros(step * height - len(data), np.uint8)])
-    return np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :used]).reshape(-1)
+    rows = np.ndarray((height, used), np.uint8, np.ascontiguousarray(data), strides=(step, 1))  # raises beyond its end
+    return np.ascontiguousarray(rows).reshape(-1)
 
 
 def _plain(rows: Pixels) -> Pixels:
