@@ -122,9 +122,7 @@ def test_an_operator_whose_environment_is_not_here_stops_the_verification_of_no_
 
 
 def test_a_recording_of_several_environments_is_not_completed(thin: Path, tmp_path: Path) -> None:
-    with pytest.raises(
-        ReplayError, match=r"run in several environments \(.*one, .*two\), and a recording is"
-    ):
+    with pytest.raises(ReplayError, match=r"run in several environments \(.*one, .*two\), and a recording is"):
         complete(thin, tmp_path / "out.mcap")
 
 

@@ -13,9 +13,12 @@ import pytest
 
 import dataflow
 from dataflow.graph import load_text
+from dataflow.recording import Recording
+from dataflow.records.firing import CALLS
+from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.text import json_text
-from dataflow.tool_server.tools import ToolError, answer
+from dataflow.tool_server.tools import ToolError, _call_of, answer
 
 SKIPPED, DEGREES = 613, 640
 """The first calls of `sum` and `sine` that the bugs change."""
@@ -34,6 +37,18 @@ def test_verify_names_culprits_with_their_first_call(bugs: dict[str, str]) -> No
     assert {each["operator"] for each in told["operators"]} == {"sine", "sum"}
     assert all(each["first"]["stamp"] for each in told["operators"])
     assert {each["operator"]: each["call"] for each in told["operators"]} == {"sum": SKIPPED, "sine": DEGREES}
+
+
+def test_a_recorded_state_is_of_the_call_behind_which_it_was_taken(bugs: dict[str, str]) -> None:
+    with Recording(Path(bugs["right"])) as recording:
+        records = FiringLog.read(recording).of("sum")
+    state = [record.kind for record in records].index("snapshot", 100)
+    before = sum(record.kind in CALLS for record in records[:state])
+
+    places = {n: _call_of(Path(bugs["right"]), "sum", {"incarnation": 0, "index": n}) for n in (0, state, state + 1)}
+
+    assert records[0].kind == "setup"
+    assert places == {0: {}, state: {"call": before - 1}, state + 1: {"call": before}}
 
 
 def test_a_call_is_shown_with_its_difference(bugs: dict[str, str]) -> None:
