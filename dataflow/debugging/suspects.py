@@ -49,10 +49,12 @@ class Change:
 
 @dataclass(frozen=True)
 class Suspects:
-    """Holds what can have made a call other than recorded. `raised`: where its error was raised, the innermost line of the
-    operator's source. `modules`: of each one that differs, where its recorded text was found; None where it was not.
-    `changes`: those that mend the call first, then those that ran. `ran`: the lines that ran in the call, and in
-    none of the `BEFORE` calls before it: `alone`."""
+    """Holds what can have made a call other than recorded.
+
+    `raised`: where its error was raised, the innermost line of the operator's source. `modules`: of each one that
+    differs, where its recorded text was found; None where it was not. `changes`: those that mend the call first, then
+    those that ran. `ran`: the lines that ran in the call; `alone`: those that ran in none of the `BEFORE` calls before.
+    """
 
     number: int
     same: bool

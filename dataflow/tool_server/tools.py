@@ -276,9 +276,8 @@ def prove(
         fired = _at(debugger, origin, call)
         number, name, changed_graph = fired.number, debugger.node.name, debugger.graph
         meets, differs = bool(_evaluated(expected, expect, _names(fired))), not fired.same
-        shown = _shown(fired, debugger, origin)
+        shown, changed, refused = _shown(fired, debugger, origin), list[int](), list[int]()
         say(f"call {number} of {name} made again; all its calls follow")
-        changed, refused = list[int](), list[int]()
 
         def visit(each: Fired) -> bool:
             if not each.same:
@@ -293,8 +292,8 @@ def prove(
     others, report = _verify(_file(recording), None, with_graph)
     verdicts = {v.operator: report.verdict(v) for v in report.operators if v.operator != name}
     after = _downstream(changed_graph, name)
-    bad = {n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)}
-    bad |= dict.fromkeys(others, "not re-executed")
+    wrong = {n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)}
+    bad = {**wrong, **dict.fromkeys(others, "not re-executed")}
     of_right = "identical" if right is None else _verdict(_file(right), name, with_graph)
     reasons = [
         *(() if differs else [f"call {number} still gives what was recorded"]),
@@ -360,7 +359,7 @@ def _verify(file: Path, only: Sequence[str] | None, graph: Graph | None) -> tupl
 
 
 def _verdict(file: Path, operator: str, graph: Graph | None) -> str:
-    """Returns what verification says of one operator."""
+    """Returns the verdict of verification on one operator."""
     report = _verify(file, [operator], graph)[1]
     return next((report.verdict(v) for v in report.operators if v.operator == operator), "not re-executed")
 
