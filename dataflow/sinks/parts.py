@@ -307,7 +307,7 @@ class PartsSink:
         saved = Counter({stream: part.sink.writer.saved(stream) for stream in self._streams})
         self._saved += saved - part.repeated
         held = self._statics.items()
-        self._copied |= {(name, *place) for name, (_, *place) in held if part.repeated[name] and saved[name]}
+        self._copied |= {(name, i, k) for name, (_, i, k) in held if part.repeated[name] and saved[name]}
         part.messages, part.bytes = (saved - part.repeated).total(), part.sink.writer.saved_bytes
         if part.messages or part.start is None:
             self._closed.append(part)

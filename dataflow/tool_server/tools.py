@@ -293,7 +293,7 @@ def prove(
     verdicts = {v.operator: report.verdict(v) for v in report.operators if v.operator != name}
     after = _downstream(changed_graph, name)
     wrong = {n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)}
-    bad = {**wrong, **dict.fromkeys(others, "not re-executed")}
+    bad: dict[str, str] = {**wrong, **dict.fromkeys(others, "not re-executed")}
     of_right = "identical" if right is None else _verdict(_file(right), name, with_graph)
     reasons = [
         *(() if differs else [f"call {number} still gives what was recorded"]),
