@@ -30,7 +30,7 @@ from dataflow.verification.verify import verify  # noqa: E402
 
 WAYS = ("run", "live", "killed")
 PLACEMENTS = {"each": "process_each", "one": "one_process"}
-WITHIN = 120.0
+WITHIN = 300.0
 """Seconds within which a run is over, or has recorded what it is killed for."""
 RECORDED = 10**18 + 1_500_000_000
 """The stamp (ns) up to which each operator has recorded calls when its run is killed: behind its first two states."""
