@@ -192,7 +192,10 @@ def test_an_odd_message_is_read_as_far_as_it_makes_sense_and_the_rest_is_named(
     ("message", "reason"),
     [
         (cloud([("x", 0, 7, 3), *XYZ[1:]], points(6)), "whose field x has 3 values a point"),
-        (encoded("32FC3; tiff compressed", file(".tiff", COLOUR.astype(np.float32))), "holds float32 of 6x8x3, which no"),
+        (
+            encoded("32FC3; tiff compressed", file(".tiff", COLOUR.astype(np.float32))),
+            "holds float32 of 6x8x3, which no",
+        ),
         (encoded("16UC1; tiff compressed", file(".tiff", COLOUR.astype(np.uint16))), "holds uint16 of 6x8x3, which no"),
         (encoded("tiff", file(".tiff", METRES.astype(np.int32))), "holds int32 of 6x8, which no"),
         (camera("equidistant", 5), "a distortion of 5 coefficients, of which equidistant has 4 at most"),

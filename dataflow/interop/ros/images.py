@@ -106,7 +106,9 @@ def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedIma
     encoding = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}.get(found.dtype.name)
     if encoding is None or found.ndim != 2:
         shape = "x".join(map(str, found.shape))
-        raise RecordingError(f"an image of format {format_!r} holds {found.dtype} of {shape}, which no message here holds")
+        raise RecordingError(
+            f"an image of format {format_!r} holds {found.dtype} of {shape}, which no message here holds"
+        )
     return DepthImage(stamp=stamp, frame=frame, data=as_depth(encoding, found))
 
 
