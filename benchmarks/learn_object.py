@@ -155,7 +155,9 @@ def written(folder: Path, name: str, count: int, shift: int = 0) -> tuple[Path, 
             for pixels, truth in views(name, kind, shift + first + k, each):
                 file = f"{len(images):03d}.png"
                 cv2.imwrite(str(place / file), pixels[..., ::-1])
-                images.append({"id": len(images), "file_name": file, "width": 640, "height": 480})
+                images.append(
+                    {"id": len(images), "file_name": file, "width": pixels.shape[1], "height": pixels.shape[0]}
+                )
                 for row in range(truth.count):
                     x1, y1, x2, y2 = truth.boxes[row].tolist()
                     clear = in_view(truth, VISIBLE, PIXELS)[row]
@@ -233,9 +235,10 @@ def real(data: Path, folder: Path) -> None:
         place.mkdir(parents=True, exist_ok=True)
         images, annotations = [], []
         for k in chosen:
+            height, width = views[k][0].shape[:2]
             cv2.imwrite(str(place / f"{k}.png"), views[k][0][..., ::-1])
             x1, y1, x2, y2 = np.asarray(views[k][1]).tolist()
-            images.append({"id": k, "file_name": f"{k}.png", "width": 640, "height": 480})
+            images.append({"id": k, "file_name": f"{k}.png", "width": width, "height": height})
             annotations.append({"id": k, "image_id": k, "bbox": [x1, y1, x2 - x1, y2 - y1], "category_id": 0})
         content = {"images": images, "annotations": annotations, "categories": [{"id": 0, "name": "thing"}]}
         (place / "annotations.json").write_text(json.dumps(content))
