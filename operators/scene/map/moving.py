@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 _EVERY, _AGO, _LONG_AGO = 0.3, 0.6, 2.0  # seconds between the views kept, and how long ago the one to compare was
 _MOVED = 0.4  # share of a place that is seen through now, or was before, of what is seen of it
 _STEEP = 2.0  # of the probability by that share
-_UNSURE = 0.1  # of the probability, off 0.5: what is known fades to it before the place is left to its centre
+_UNSURE = 0.1  # of the probability, off 0.5: knowledge fades to it before the centre counts
 _SEEN = 0.2  # share of the voxels looked at that must show either, for a place to tell
 
 
@@ -48,7 +48,7 @@ class RecentPlaces:
         """Sets `moving` of the movers of this view: 0.5 where that is hidden or nothing can be compared yet.
 
         It is NaN where no view looks at the places, as of a thing of a few voxels: the centre is all that is known of
-        it. What is known before fades first.
+        it. Earlier knowledge fades first.
         """
         kept = [m for m in self._moments if 0 <= stamp - m.stamp <= _LONG_AGO * 1e9]
         before = next((m for m in reversed(kept) if stamp - m.stamp >= _AGO * 1e9), None)
