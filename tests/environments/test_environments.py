@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from made_environments import environment, install, packages
 
+from dataflow.debugging.debugger import Debugger
 from dataflow.environments import EnvError, environment_of, lock
 from dataflow.graph import Graph, GraphError
 from dataflow.graph.load import load_text
@@ -17,6 +18,7 @@ from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.run import run
+from dataflow.verification.complete import complete
 from dataflow.verification.verify import verify
 
 TEXT = """
@@ -87,18 +89,51 @@ def test_operators_of_two_environments_share_no_process(environments: Path) -> N
         run(graph(environments), placement="one_process")
 
 
-def test_operators_that_only_one_process_could_repeat_are_refused(environments: Path, tmp_path: Path) -> None:
-    run(graph(environments, record="{exclude: first/y}"), record=tmp_path / "thin.mcap")
+@pytest.fixture(scope="module")
+def thin(environments: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("thin") / "thin.mcap"
+    run(graph(environments, record="{exclude: first/y}"), record=path)
+    return path
 
+
+def test_an_operator_that_only_one_process_could_repeat_with_its_maker_is_unverifiable(thin: Path) -> None:
+    report = verify(thin)
+
+    assert {v.operator: (v.verdict, v.missing) for v in report.operators} == {
+        "first": ("identical", ""),
+        "second": ("unverifiable", "gains/first/y"),
+    }
     with pytest.raises(ReplayError, match=r"'first' and 'second' run in two environments, .* 'gains/first/y': record"):
-        verify(tmp_path / "thin.mcap")
+        verify(thin, only=["second"])
 
 
-def test_an_operator_is_not_made_in_a_process_of_another_environment(environments: Path) -> None:
+def test_an_operator_whose_environment_is_not_here_stops_the_verification_of_no_other(
+    recorded: Path, environments: Path
+) -> None:
+    (environments / "two").rename(environments / "away")
+    try:
+        report = verify(recorded)
+    finally:
+        (environments / "away").rename(environments / "two")
+
+    assert not report.identical
+    assert {v.operator: v.verdict for v in report.operators} == {"first": "identical"}
+    assert "two' is no environment" in report.absent["second"]
+
+
+def test_a_recording_of_several_environments_is_not_completed(thin: Path, tmp_path: Path) -> None:
     with pytest.raises(
-        EnvError, match=r"operator 'first' needs the environment .*one', and this process is in that of"
+        ReplayError, match=r"run in several environments \(.*one, .*two\), and a recording is"
     ):
+        complete(thin, tmp_path / "out.mcap")
+
+
+def test_an_operator_is_not_made_in_a_process_of_another_environment(recorded: Path, environments: Path) -> None:
+    wrong = r"operator 'first' needs the environment .*one', and this process is in that of"
+    with pytest.raises(EnvError, match=wrong):
         graph(environments).nodes["first"].make()
+    with Recording(recorded) as recording, pytest.raises(EnvError, match=wrong):
+        Debugger(recording, "first").goto(0)
 
 
 def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_path: Path) -> None:
