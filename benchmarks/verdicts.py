@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -32,11 +30,12 @@ from dataflow.verification.verify import verify  # noqa: E402
 
 WAYS = ("run", "live", "killed")
 PLACEMENTS = {"each": "process_each", "one": "one_process"}
-STARTED_WITHIN = 120.0
+WITHIN = 120.0
+"""Seconds within which a run is over, or has recorded what it is killed for."""
 RECORDED = 10**18 + 1_500_000_000
 """The stamp (ns) up to which each operator has recorded calls when its run is killed: behind its first two states."""
-LONG = 1500
-"""Steps of a run that is killed."""
+LONG = 100_000
+"""Steps of a run that is killed: half an hour."""
 
 RUN = """
 import sys
@@ -48,21 +47,26 @@ run(CAGES[{cage!r}].graph({steps}), placement={placement!r}, record=Path({path!r
 """
 
 
-def record(name: str, way: str, placement: str, path: Path) -> None:
-    """Records a run of a cage in a process; that is killed when all its operators have recorded calls, if asked for."""
+def record(name: str, way: str, placement: str, path: Path) -> str:
+    """Records a run of a cage in a process; that is killed when all its operators have recorded calls, if asked for.
+
+    Returns why there is nothing to judge, or nothing.
+    """
     made = {"support": str(SUPPORT), "cage": name, "path": str(path), "live": way != "run"}
     steps = LONG if way == "killed" else STEPS
     program = RUN.format(placement=PLACEMENTS[placement], steps=steps, **made)
     with subprocess.Popen(
-        [sys.executable, "-c", program], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+        [sys.executable, "-c", program], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
     ) as running:
-        deadline = time.monotonic() + STARTED_WITHIN
-        while way == "killed" and running.poll() is None and time.monotonic() < deadline:
+        deadline, due = time.monotonic() + WITHIN, False
+        while running.poll() is None and not due and time.monotonic() < deadline:
             time.sleep(0.5)
-            if all(stamp > RECORDED for stamp in _recorded(path, CAGES[name].operators).values()):
-                os.kill(running.pid, signal.SIGKILL)
-                break
-        running.communicate(timeout=STARTED_WITHIN)
+            due = way == "killed" and all(s > RECORDED for s in _recorded(path, CAGES[name].operators).values())
+        ended = running.poll() is not None
+        running.kill()
+    if way == "killed":
+        return "" if due else "ended before it was killed" if ended else f"not recorded within {WITHIN:g} s"
+    return "" if ended else f"not over within {WITHIN:g} s"
 
 
 def _recorded(path: Path, operators: Iterable[str]) -> Mapping[str, int]:
@@ -76,9 +80,9 @@ def _recorded(path: Path, operators: Iterable[str]) -> Mapping[str, int]:
 
 
 def verdicts(path: Path) -> Mapping[str, str]:
-    """The verdict on each operator of a recording."""
+    """The verdict on each operator of a recording of which a call was verified."""
     report = verify(path)
-    return {v.operator: "nothing verified" if report.empty else report.verdict(v) for v in report.operators}
+    return {v.operator: report.verdict(v) if v.verified else "nothing verified" for v in report.operators}
 
 
 def right(cage: Cage, way: str, placement: str) -> Mapping[str, str]:
@@ -104,8 +108,9 @@ def main() -> int:
         found = {}
         for way, placement in columns:
             with tempfile.TemporaryDirectory() as folder:
-                record(name, way, placement, Path(folder) / "run.mcap")
-                found[way, placement] = verdicts(Path(folder) / "run.mcap")
+                fault = record(name, way, placement, Path(folder) / "run.mcap")
+                judged = {} if fault else verdicts(Path(folder) / "run.mcap")
+                found[way, placement] = {o: judged.get(o, fault or "no verdict") for o in cage.operators}
         for operator, (use, _) in cage.operators.items():
             cells = []
             for way, placement in columns:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from typing import Any, NamedTuple
 
 import xxhash
@@ -23,6 +23,8 @@ KEPT = 16_384
 """Latest messages of a stream whose spans are known; an older one has none to be the parent."""
 AT_ONCE = 512
 _INTERNAL, _ERROR = 1, 2
+_Place = tuple[int, int]
+"""Incarnation and number of a message."""
 
 
 class _Span(NamedTuple):
@@ -35,12 +37,15 @@ class Spans:
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
-        self._of: dict[str, dict[tuple[int, int], _Span]] = {name: {} for name in graph.streams}
+        self._of: dict[str, dict[_Place, _Span]] = {name: {} for name in graph.streams}
+        self._passed: dict[str, _Place] = {}
+        """Each stream's latest message that a record has come to."""
 
     def lines(self, records: Mapping[str, Iterable[FiringRecord]]) -> Iterator[str]:
-        """Yields lines of spans, by the times at which calls began. `records`: each operator's, in order."""
+        """Yields lines of spans, by the times at which calls began; a call comes behind those whose messages it was
+        given, by whichever clock they have their times. `records`: each operator's, in order."""
         waiting: dict[str, list[dict[str, Any]]] = {}
-        for record in heapq.merge(*records.values(), key=lambda each: each.wall_start):
+        for record in self._in_order(records):
             if record.kind in CALLS:
                 mine = waiting.setdefault(record.operator, [])
                 mine.append(self._span(record))
@@ -48,6 +53,44 @@ class Spans:
                     yield self._line(record.operator, waiting.pop(record.operator))
         for operator, spans in waiting.items():
             yield self._line(operator, spans)
+
+    def _in_order(self, records: Mapping[str, Iterable[FiringRecord]]) -> Iterator[FiringRecord]:
+        """Yields all records by the times at which calls began, each behind the messages that it was given."""
+        left = {name: iter(each) for name, each in records.items()}
+        heads: list[tuple[int, str, FiringRecord]] = []
+        held: dict[str, list[tuple[int, str, FiringRecord]]] = {}  # by the maker that is behind
+
+        def read(name: str) -> None:
+            if (record := next(left[name], None)) is None:
+                del left[name]
+            else:
+                heapq.heappush(heads, (record.wall_start, name, record))
+
+        for name in records:
+            read(name)
+        while heads or held:
+            if lost := not heads:  # they wait for each other's messages, whose records are lost
+                heads, held = sorted(head for each in held.values() for head in each), {}
+            head = heapq.heappop(heads)
+            _, name, record = head
+            maker = None if lost else self._behind(record, left.keys() - {name})
+            if maker is not None:
+                held.setdefault(maker, []).append(head)
+                continue
+            yield record
+            read(name)
+            for each in held.pop(name, ()):
+                heapq.heappush(heads, each)
+
+    def _behind(self, record: FiringRecord, makers: Set[str]) -> str | None:
+        """Returns one of `makers` whose records have not come to a message that a call was given; None where all
+        have."""
+        for ref in record.inputs.values():
+            for stream, place in _places(ref):
+                made = self._graph.streams.get(stream)
+                if made is not None and made.node in makers and self._passed.get(stream, (-1, -1)) < place:
+                    return made.node
+        return None
 
     def _span(self, record: FiringRecord) -> dict[str, Any]:
         name = f"{record.operator} {record.incarnation} {record.index}".encode()
@@ -80,19 +123,13 @@ class Spans:
 
     def _cause(self, ref: InputRef) -> _Span | None:
         """Returns the span in which the newest message of an input was made, as far as that is known."""
-        if isinstance(ref, MessageRef):
-            return self._of[ref.stream].get((ref.incarnation, ref.seq)) if ref.stream in self._of else None
-        if isinstance(ref, tuple):
-            made = (self._of.get(run.stream, {}).get((run.incarnation, run.last_seq)) for run in reversed(ref))
-        else:
-            made = (self._cause(each) for each in (ref or {}).values())
-        return next((each for each in made if each is not None), None)
+        return next((made for stream, place in _places(ref) if (made := self._of.get(stream, {}).get(place))), None)
 
     def _note(self, record: FiringRecord, own: _Span) -> None:
         for stream, emission in zip(self._graph.nodes[record.operator].outputs.values(), record.outputs, strict=False):
             if emission is not None:
-                kept = self._of[stream]
-                kept[record.incarnation, emission.seq] = own
+                kept, place = self._of[stream], (record.incarnation, emission.seq)
+                kept[place], self._passed[stream] = own, place
                 if len(kept) > KEPT:
                     del kept[next(iter(kept))]
 
@@ -101,3 +138,14 @@ class Spans:
         resource = {"attributes": [{"key": key, "value": {"stringValue": value}} for key, value in about.items()]}
         scope = {"scope": {"name": "robot-dataflow"}, "spans": spans}
         return json.dumps({"resourceSpans": [{"resource": resource, "scopeSpans": [scope]}]}, separators=(",", ":"))
+
+
+def _places(ref: InputRef) -> Iterator[tuple[str, _Place]]:
+    """Yields streams and places of the newest messages of an input, the one that counts as its cause first."""
+    if isinstance(ref, MessageRef):
+        yield ref.stream, (ref.incarnation, ref.seq)
+    elif isinstance(ref, tuple):
+        yield from ((run.stream, (run.incarnation, run.last_seq)) for run in reversed(ref))
+    else:
+        for each in (ref or {}).values():
+            yield from _places(each)

@@ -46,8 +46,9 @@ class Metrics:
         self._samples.setdefault(family, []).append((labels, value))
 
     def add_graph(self, found: RunningGraph, operators: Iterable[str], statuses: Sequence[ProcessStatus]) -> None:
-        """Adds a running graph by what its processes answer. The label `run` keeps runs of one graph apart."""
-        labels = {"graph": found.name, "run": str(found.pid)}
+        """Adds a running graph by what its processes answer. The label `run` keeps runs of one graph apart:
+        the process, or where that is on another machine, when it began."""
+        labels = {"graph": found.name, "run": str(found.pid or found.started)}
         self.add("dataflow_graph_up", 1, **labels)
         self.add("dataflow_graph_started_seconds", found.started, **labels)
         told = {operator: status for status in statuses for operator in status.restarts}

@@ -24,6 +24,7 @@ from dataflow.recording.layout import CUT, DIGESTS, ENDS, GRAPH, RECORDING, RUN,
 from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.streams.copying import Copy, Mask, Origin, framing
 from dataflow.recording.streams.cutting import Cut, cut_of
+from dataflow.recording.streams.part_folder import NOTHING_IN_IT, holds_nothing
 from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.sync.stamps import format_stamp
@@ -45,10 +46,17 @@ def merge(
     Parts of one run are joined: what several hold is taken once, and their firing records become one log. Of other
     recordings the run of the first one counts, with its graph and firing records; the others give their streams.
     `prefixes` are put before the names of the streams of each. Attachments and metadata of all go along
-    (`editing.extras`). Raises `RecordingError` for names that clash.
+    (`editing.extras`). What its writer began and stored nothing in is passed over. Raises `RecordingError` for names
+    that clash.
     """
     done = Edited(str(out))
     prefixes = [*prefixes, *[""] * (len(origins) - len(prefixes))]
+    if bare := [origin for origin in origins if holds_nothing(origin.file)]:
+        done.notes += [f"{origin.path} {NOTHING_IN_IT}" for origin in bare]
+        prefixes = [p for origin, p in zip(origins, prefixes, strict=True) if origin not in bare]
+        origins = [origin for origin in origins if origin not in bare]
+        if not origins:
+            raise RecordingError("nothing is in any of these files")
     one_run = not any(prefixes) and are_of_one_run(origins)
     with ExitStack() as stack:
         if one_run:

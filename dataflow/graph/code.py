@@ -11,9 +11,11 @@ import importlib.abc
 import importlib.util
 import os
 import re
+import subprocess
 import sys
 import sysconfig
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.machinery import ModuleSpec, PathFinder
@@ -28,6 +30,8 @@ from dataflow.messages.base import Message
 if TYPE_CHECKING:
     from dataflow.operator import Operator
 
+REVISIONS = 200
+"""Commits of a file in which its recorded text is looked for."""
 _ENGINE = __name__.partition(".")[0]
 _INSTALLED = ("/site-packages/", "/dist-packages/")
 _STANDARD = tuple(f"{sysconfig.get_path(kind)}/" for kind in ("stdlib", "platstdlib"))
@@ -128,6 +132,45 @@ def stored_operator(node: Node, digests: Mapping[str, str]) -> type[Operator] | 
         return None
     swap.put_back()
     return None if swap.late & differing else found
+
+
+@contextmanager
+def other_texts(node: Node, texts: Mapping[str, bytes]) -> Iterator[None]:
+    """Lets an operator have other texts of some of its modules, within the block. Raises `ReloadError`,
+    `OperatorImportError`."""
+    home, offers = node.operator.__module__, _offers(node)
+    own = _own_texts(home, offers)
+    again = _with_dependents({*texts, home, offers}, own)
+    swap = _Swap({name: own[name] for name in again & own.keys()} | dict(texts))
+    swap.load(node)
+    try:
+        yield
+    finally:
+        swap.put_back()
+
+
+def text_of(digest: str, file: Path) -> tuple[bytes, str] | None:
+    """Returns the text with a digest, and where it was: the store of reloads, or a commit of the file; None where it
+    is in neither. Of the file's commits the newest `REVISIONS` are looked at."""
+    if (text := _stored(digest)) is not None:
+        return text, "a reload"
+    git = ["git", "-C", str(file.parent)]
+    try:
+        listed = subprocess.run(
+            [*git, "log", f"-n{REVISIONS}", "--format=%H", "--", file.name],
+            capture_output=True,
+            timeout=30,
+            check=False,
+        )
+        for commit in listed.stdout.decode().split():
+            shown = subprocess.run(
+                [*git, "show", f"{commit}:./{file.name}"], capture_output=True, timeout=30, check=False
+            )
+            if digest_of(shown.stdout) == digest:
+                return shown.stdout, f"commit {commit[:12]}"
+    except (OSError, subprocess.TimeoutExpired):  # there is no git here, or it hangs
+        return None
+    return None
 
 
 def store() -> Path:

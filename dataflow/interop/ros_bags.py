@@ -41,8 +41,9 @@ class RosBag:
         promised: Counter[str] = Counter()
         for reader in self._readers:
             names = {c.id: c.topic for c in reader.connections}
-            for chunk in reader.chunk_infos:
-                promised.update({names[number]: held for number, held in chunk.connection_counts.items()})
+            for number, held in (each for chunk in reader.chunk_infos for each in chunk.connection_counts.items()):
+                if number in names:  # else the bag's end describes no such connection
+                    promised[names[number]] += held
         self.promised = promised
 
     def _topic(self, connection: Connection, index: Sequence[Any] | None) -> Topic:

@@ -7,7 +7,6 @@ operators in a deleted file that still matter (their parameters, how often they 
 from __future__ import annotations
 
 import shutil
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -20,6 +19,7 @@ from dataflow.graph.model import Graph
 from dataflow.graph.sections import Flight
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
+from dataflow.process.awake import AwakeClock
 from dataflow.recording import LogLine, RecordingError
 from dataflow.recording.parts import Storage
 from dataflow.records.cuts import Held
@@ -47,8 +47,8 @@ class Wanted:
     start: int
     due: int
     reasons: list[dict[str, Any]] = field(default_factory=list)
-    over: float = 0.0
-    """Time (s, steady) at which it was seen to be over; 0 until then."""
+    over: float | None = None
+    """Time (s, of a clock that goes on while the recorder runs) at which it was seen to be over; None until then."""
 
 
 class FlightSink:
@@ -67,6 +67,7 @@ class FlightSink:
         self.length = max(flight.keep // PARTS, SHORTEST)
         self.slack = 2 * (graph.record.snapshots if isinstance(graph.record.snapshots, int) else 0) + 2 * self.length
         """Returns how much more than what is to be kept is there: from a state of every operator on."""
+        self._awake = AwakeClock()
         self._clock = 0
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
@@ -134,6 +135,7 @@ class FlightSink:
 
     def flush(self) -> None:
         """Hands everything to the operating system, about once a second; a disk that had refused is tried again."""
+        self._awake()
         self._store(RecorderSink.flush)
         if self._sink is None and self._outage.over():
             self._begin()
@@ -273,8 +275,9 @@ class FlightSink:
         """Returns whether a span is over, and the firing records of it have had the time to come."""
         if self._clock <= wanted.due:
             return False
-        wanted.over = wanted.over or time.monotonic()
-        waited = time.monotonic() - wanted.over
+        now = self._awake()
+        wanted.over = now if wanted.over is None else wanted.over
+        waited = now - wanted.over
         behind = any(
             self._recorded.get(self.graph.streams[stream].node, 0) < min(message.stamp, wanted.due)
             for stream, (message, _, _) in self._newest.items()

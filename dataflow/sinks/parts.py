@@ -80,6 +80,8 @@ class PartsSink:
         self._clock = self._begun = self._diagnosed = 0
         self._given: Counter[str] = Counter()
         self._saved: Counter[str] = Counter()
+        self._copied: set[tuple[str, int, int]] = set()
+        """Static messages that lie in front of a part: the first of them may be in no file."""
         self._closed: list[Part] = []
         self._deleted = 0
         self._full: Part | None = None
@@ -169,6 +171,8 @@ class PartsSink:
         if (part := self._current) is not None:
             self._current = None
             self._finish(part, outcome, None)
+        for stream, copies in Counter(stream for stream, *_ in self._copied).items():
+            self._saved[stream] = max(self._saved[stream], copies)
         self.lost.messages = self._given - self._saved
         self._keep_to_limit()
         facts = {
@@ -302,6 +306,8 @@ class PartsSink:
     def _count(self, part: Part) -> None:
         saved = Counter({stream: part.sink.writer.saved(stream) for stream in self._streams})
         self._saved += saved - part.repeated
+        held = self._statics.items()
+        self._copied |= {(name, *place) for name, (_, *place) in held if part.repeated[name] and saved[name]}
         part.messages, part.bytes = (saved - part.repeated).total(), part.sink.writer.saved_bytes
         if part.messages or part.start is None:
             self._closed.append(part)

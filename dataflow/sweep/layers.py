@@ -37,7 +37,8 @@ def layered(
             streams |= {named[s]: replace(graph.streams[s], name=named[s], node=name) for s in node.outputs.values()}
         hidden |= {named[s] for s in graph.view.hide if s in named}
     first = graphs[0]
-    view = replace(first.view, hide=tuple(sorted(hidden)), keep=tuple(names[0].get(s, s) for s in first.view.keep))
+    kept = {named.get(s, s) for named in names for s in first.view.keep}
+    view = replace(first.view, hide=tuple(sorted(hidden)), keep=tuple(sorted(kept)))
     return replace(first, nodes=nodes, streams=streams, view=view), names[0], names[1]
 
 

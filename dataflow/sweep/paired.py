@@ -52,6 +52,12 @@ class Paired:
         """Returns whether B differs from A at 5 %, among all figures compared."""
         return self.adjusted < ALPHA
 
+    @property
+    def most_changed(self) -> list[str]:
+        """Returns the names of the recordings, first those that change the most in the direction of `difference`."""
+        by = sorted(self.recordings, key=lambda pair: pair[1], reverse=self.difference > 0)
+        return [name for name, _ in by]
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:

@@ -16,8 +16,8 @@ from dataflow.tool_server.tools import TOOLS
 
 INSTRUCTIONS = f"""\
 Tools to find the cause of a failure in a recorded run of a robot's operators, which re-executes bit for bit.
-Begin with verify: it names the operators that do not make what was recorded. Then why, diff, goto, state, history and
-blame lead to the call and the line; what_if tries a change, capture writes the test, prove checks the fix.
+Begin with verify: it names the operators that do not make what was recorded. Then why, diff, lines, goto, state,
+history and blame lead to the call and the line; what_if tries a change, capture writes the test, prove checks the fix.
 Recordings are files (.mcap) on this machine; graph is a graph file, path are folders in which operators' modules lie.
 An answer has at most {MOST_BYTES} bytes and names how to ask for the rest. A call of more than five seconds is
 answered by a job: ask for it with job(id)."""

@@ -88,6 +88,31 @@ def state(
         return {"call": fired.number, "parts": sorted({*before, *after}), "part" if part else "changed": shown}
 
 
+def lines(
+    recording: str, operator: str, call: str = "diff", graph: str | None = None, path: list[str] | None = None
+) -> Any:
+    """Name the lines that can have made a call of an operator other than recorded (`call` as in `goto`).
+
+    `changes`: where the operator's code differs from that which was recorded, as far as that is in git's commits or was
+    replaced by a reload (`recorded_code`); first those without which the call gives what was recorded (`mends`), then
+    those that ran in it. `raised`: the line of its error. `alone`: the lines that ran in it and in none of the 8
+    calls before. `ran`, where there are no changes: all its lines.
+    """
+    from dataflow.debugging.suspects import ranges, suspects
+
+    with _debugger(recording, operator, graph) as (debugger, origin, opened):
+        found = suspects(opened, debugger, _at(debugger, origin, call).number)
+    values = {
+        "call": found.number,
+        "same": found.same,
+        "raised": found.raised,
+        "recorded_code": {name: where or "not found" for name, where in found.modules.items()},
+        "changes": [asdict(change) for change in found.changes],
+        "alone": ranges(found.alone),
+    }
+    return values if found.changes else values | {"ran": ranges(found.ran)}
+
+
 def history(
     recording: str,
     operator: str,
@@ -231,6 +256,7 @@ def prove(
     call: str,
     expect: str,
     may_change: str = "True",
+    right: str | None = None,
     params: dict[str, Any] | None = None,
     graph: str | None = None,
     path: list[str] | None = None,
@@ -242,18 +268,17 @@ def prove(
     Proven is a fix by which the call gives another result than the recorded one, for which `expect` is true, all other
     calls of the operator that change are such that `may_change` is true, and every other operator that is given the
     recorded inputs makes what was recorded. Both are Python expressions over a call: inp, out, stamp, number, same,
-    error; `expect` also sees before and after, the states. `call`: as in `goto`.
+    error; `expect` also sees before and after, the states. `call`: as in `goto`. `right`: a recording that right code
+    made: the operator makes all that is recorded there, too.
     """
     expected, allowed = _compiled("expect", expect), _compiled("may_change", may_change)
     with _debugger(recording, operator, graph, params) as (debugger, origin, _):
         fired = _at(debugger, origin, call)
         number, name, changed_graph = fired.number, debugger.node.name, debugger.graph
-        meets = bool(_evaluated(expected, expect, _names(fired)))
-        differs = not fired.same
+        meets, differs = bool(_evaluated(expected, expect, _names(fired))), not fired.same
         shown = _shown(fired, debugger, origin)
         say(f"call {number} of {name} made again; all its calls follow")
-        changed: list[int] = []
-        refused: list[int] = []
+        changed, refused = list[int](), list[int]()
 
         def visit(each: Fired) -> bool:
             if not each.same:
@@ -268,14 +293,15 @@ def prove(
     others, report = _verify(_file(recording), None, with_graph)
     verdicts = {v.operator: report.verdict(v) for v in report.operators if v.operator != name}
     after = _downstream(changed_graph, name)
-    bad = {
-        n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)
-    } | dict.fromkeys(others, "not re-executed")
+    bad = {n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)}
+    bad |= dict.fromkeys(others, "not re-executed")
+    of_right = "identical" if right is None else _verdict(_file(right), name, with_graph)
     reasons = [
         *(() if differs else [f"call {number} still gives what was recorded"]),
         *(() if meets else [f"call {number}: expect is false: {expect}"]),
         *([f"calls that may not change do: {refused[:MOST_CHANGED]}"] if refused else ()),
         *([f"other operators: {bad}"] if bad else ()),
+        *([f"{name} in {right}: {of_right}"] if of_right != "identical" else ()),
     ]
     return {
         "proven": not reasons,
@@ -287,7 +313,8 @@ def prove(
 
 
 TOOLS: Mapping[str, Callable[..., Any]] = {
-    each.__name__: each for each in (verify, why, goto, diff, state, history, what_if, capture, blame, drops, prove)
+    each.__name__: each
+    for each in (verify, why, goto, diff, lines, state, history, what_if, capture, blame, drops, prove)
 }
 
 
@@ -330,6 +357,12 @@ def _verify(file: Path, only: Sequence[str] | None, graph: Graph | None) -> tupl
 
     report = verify_recording(file, graph=graph, only=only or None)
     return sorted(report.absent), report
+
+
+def _verdict(file: Path, operator: str, graph: Graph | None) -> str:
+    """Returns what verification says of one operator."""
+    report = _verify(file, [operator], graph)[1]
+    return next((report.verdict(v) for v in report.operators if v.operator == operator), "not re-executed")
 
 
 def _call_of(file: Path, operator: str, first: Mapping[str, Any]) -> int:

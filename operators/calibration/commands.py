@@ -25,7 +25,7 @@ from operators.calibration import camera_imu as mounts
 from operators.calibration import coverage, stereo
 from operators.calibration.boards import Board, Charuco, Chessboard
 from operators.calibration.camera import BLURRED, MODELS, Fitted, Model, different, tilts
-from operators.calibration.recorded import Along, Seen, images_of, intrinsics_of, look, stream_of
+from operators.calibration.recorded import Along, Seen, images_of, intrinsics_of, look, spaced, spaced_pairs, stream_of
 from operators.geometry.calibration_files import camera_text, read_camera, transforms_text
 
 COULD_NOT_RUN = 2
@@ -95,7 +95,8 @@ def camera(
         board, lens = _board(chessboard, charuco, square, marker, dictionary), _model(model)
         files = _places(out, ("camera.yaml", "camera.png"), overwrite)
         with opened(recording) as streams:
-            seen = look(board, images_of(streams, image, "--image"), every, _progress(json))
+            images = images_of(streams, image, "--image")
+            seen = look(board, images, spaced(images.stamps, every), _progress(json))
         fitted = seen.fit(lens)
         _write_camera(files, seen, fitted, fitted.info, recording)
         _report(_camera_json(seen, fitted), _camera_words(seen, fitted), seen.warnings(fitted), files, json=json)
@@ -134,10 +135,9 @@ def stereo_pair(
         board, lens = _board(chessboard, charuco, square, marker, dictionary, upright=True), _model(model)
         files = _places(out, ("left.yaml", "left.png", "right.yaml", "right.png", "stereo.yaml"), overwrite)
         with opened(recording) as streams:
-            both = [
-                look(board, images_of(streams, name, option), every, _progress(json))
-                for name, option in ((left, "--left"), (right, "--right"))
-            ]
+            images = images_of(streams, left, "--left"), images_of(streams, right, "--right")
+            places = spaced_pairs(*images, every, round(tolerance * 1e9))
+            both = [look(board, each, chosen, _progress(json)) for each, chosen in zip(images, places, strict=True)]
         kept = [seen.fit(lens) for seen in both]
         pair = _pair(both, kept, tolerance)
         for k, info in enumerate((pair.left, pair.right)):
@@ -190,7 +190,7 @@ def camera_imu(
             images = images_of(streams, image, "--image")
             inertial = stream_of(streams, imu, (Imu,), "--imu", "samples of an IMU")
             samples = [message for message in inertial if isinstance(message, Imu)]
-            seen = look(board, images, 0.0, _progress(json))
+            seen = look(board, images, spaced(images.stamps, 0.0), _progress(json))
             info = intrinsics_of(streams, seen.frame) if intrinsics is None else read_camera(intrinsics, seen.frame)
         if (info.width, info.height) != seen.size:
             raise ValueError(f"the calibration is of {info.width}x{info.height} pixels, the images have {seen.size}")

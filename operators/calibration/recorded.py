@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.api.asof import asof
 from dataflow.api.recordings import RecordedStreams
 from dataflow.api.stream import RecordedStream
 from dataflow.messages import CameraInfo, CompressedImage, Image, Message
@@ -62,13 +63,36 @@ class Seen:
         return found
 
 
-def look(board: Board, stream: RecordedStream, every: float, along: Along) -> Seen:
-    """Returns what the images of a stream show of a board, one each `every` seconds.
+def spaced(stamps: NDArray[np.int64], every: float) -> list[int]:
+    """Returns places of messages at least `every` seconds apart."""
+    found: list[int] = []
+    for place, stamp in enumerate(stamps.tolist()):
+        if not found or stamp - int(stamps[found[-1]]) >= round(every * 1e9):
+            found.append(place)
+    return found
+
+
+def spaced_pairs(left: RecordedStream, right: RecordedStream, every: float, tolerance: int) -> list[list[int]]:
+    """Returns places of images in two streams, those of a pair at most `tolerance` ns apart, at least `every` seconds
+    from pair to pair. Raises ValueError where no two images are so near."""
+    beside = asof(left.stamps, right.stamps, "nearest", tolerance)
+    there = np.flatnonzero(beside >= 0)
+    if not len(there):
+        raise ValueError(
+            f"no image of {left.info.name} lies within {tolerance / 1e6:g} ms of one of {right.info.name}: "
+            "--tolerance takes more"
+        )
+    chosen = there[spaced(left.stamps[there], every)]
+    return [chosen.tolist(), np.unique(beside[chosen]).tolist()]
+
+
+def look(board: Board, stream: RecordedStream, places: list[int], along: Along) -> Seen:
+    """Returns what images of a stream, at `places` in it, show of a board.
 
     Raises ValueError where images differ in size, none can be read, or none shows the board.
     """
     name, frame, size, looked, views = stream.info.name, "", (0, 0), 0, list[View]()
-    for place in along(_spaced(stream.stamps, every), name):
+    for place in along(places, name):
         message = stream[place]
         grey = _grey(message)
         if grey is None:
@@ -116,15 +140,6 @@ def intrinsics_of(streams: RecordedStreams, frame: str) -> CameraInfo:
             if isinstance(info, CameraInfo) and info.frame == frame:
                 return info
     raise ValueError(f"{streams.path} has no calibration of the frame {frame!r}: --camera FILE gives it")
-
-
-def _spaced(stamps: NDArray[np.int64], every: float) -> list[int]:
-    """Places of messages at least `every` seconds apart."""
-    found: list[int] = []
-    for place, stamp in enumerate(stamps.tolist()):
-        if not found or stamp - int(stamps[found[-1]]) >= round(every * 1e9):
-            found.append(place)
-    return found
 
 
 def _grey(message: Message) -> NDArray[np.uint8] | None:

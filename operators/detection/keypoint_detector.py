@@ -182,15 +182,14 @@ class KeypointDetector(Operator):
             ids=ids,
         )
 
-    def _persons(self, image: Image, detections: Detections2D) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Returns the boxes (N, 4) to look into, and the ids of what is in them, or their rows."""
+    def _persons(self, image: Image, detections: Detections2D) -> tuple[NDArray[np.float64], NDArray[np.int64] | None]:
+        """Returns the boxes (N, 4) to look into, and the ids of what is in them, where the detections have any."""
         names = np.array(detections.labels(), object)
         wide = (detections.boxes[:, 2:] > detections.boxes[:, :2]).all(axis=1)
         rows = np.flatnonzero(np.isin(names, self.classes) & (detections.scores >= self.min_score) & wide)
         if detections.stamp != image.stamp:
             rows = rows[:0]
-        ids = np.arange(detections.count) if detections.ids is None else detections.ids
-        return detections.boxes[rows].astype(np.float64), ids[rows].astype(np.int64)
+        return detections.boxes[rows].astype(np.float64), None if detections.ids is None else detections.ids[rows]
 
     def _points(self, image: Image, cuts: list[Cut]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Returns points (N, K, 2) of the image and their scores (N, K)."""

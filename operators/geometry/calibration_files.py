@@ -115,9 +115,9 @@ def read_transforms(paths: Sequence[Path]) -> Transforms:
     """
     rows: list[_Transform] = []
     for path in paths:
-        content = _read(path)
+        listed = _read(path).get("transforms")
         try:
-            found = [_Transform.model_validate(row) for row in content.get("transforms") or ()]
+            found = [_Transform.model_validate(row) for row in listed] if isinstance(listed, list) else []
         except ValidationError as error:
             raise CalibrationFileError(f"{path}: a transform is wrong: {_first(error)}") from error
         if not found:

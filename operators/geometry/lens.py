@@ -46,7 +46,7 @@ def undistorted(pixels: Pixels, info: CameraInfo) -> Pixels:
     image, or rays go sideways or backwards.
     """
     if not is_distorted(info):
-        return unproject(pixels, info.K)[:, :2]
+        return np.ascontiguousarray(unproject(pixels, info.K)[:, :2])  # as OpenCV takes it
     points = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
     D = _coefficients(info)
     if info.distortion_model == "equidistant":

@@ -13,6 +13,8 @@ import tty
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 
+import numpy as np
+
 from dataflow.messages import Message
 from dataflow.operator import Param, Source, SourceError
 
@@ -20,6 +22,10 @@ SHORTEST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
 """Seconds between two looks for a device that is gone: doubled from one to the next."""
 POLL = 200
 """Milliseconds after which a wait for bytes looks whether the run has ended."""
+BUFFER = 4 << 20
+"""Bytes of datagrams that may wait; the machine's net.core.rmem_max bounds them further."""
+_MEMINFO, _DROPS = 55, 8
+"""Linux's SO_MEMINFO, and the place of the dropped datagrams in it (sock_diag(7))."""
 
 
 class PortSource(Source, abstract=True):
@@ -121,8 +127,16 @@ def udp_port(address: str) -> int:
     host = host.strip("[]")
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as found:
         found.setblocking(False)
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
         found.bind((host, int(port)))
         return found.detach()
+
+
+def lost_datagrams(port: int) -> int:
+    """Returns how many datagrams found no room in a socket's buffer, or were damaged, since it was opened."""
+    with socket.socket(fileno=os.dup(port)) as found:
+        memory = np.frombuffer(found.getsockopt(socket.SOL_SOCKET, _MEMINFO, 4 * (_DROPS + 1)), np.uint32)
+    return int(memory[_DROPS])
 
 
 def _serial_port(path: str, baud: int) -> int:

@@ -15,8 +15,10 @@ from dataflow.messages import CameraInfo, DepthImage, Image, Message, Transforms
 from dataflow.operator import Out, Param, Source, SourceError
 from operators.sources.ports import LONGEST_PAUSE, SHORTEST_PAUSE
 
-SILENCE = 2.0
-"""Seconds without a frame after which a camera counts as unplugged."""
+SILENCE = 5.0
+"""Seconds without depth and colour of one moment after which a camera counts as unplugged: one may start late."""
+WAITING = 8
+"""Images that wait for their partner; the oldest beyond them has none."""
 POLL = 200
 """Milliseconds after which a wait for frames looks whether the run has ended."""
 MODELS = {"brown_conrady": "plumb_bob", "modified_brown_conrady": "plumb_bob", "kannala_brandt4": "equidistant"}
@@ -40,7 +42,7 @@ class RealSense(Source):
     depth_info: Out[CameraInfo] = Out(static=True, doc="calibration of the depth camera")
     extrinsics: Out[Transforms] = Out(static=True, doc="the colour camera in the depth camera's frame")
 
-    serial: str = Param("", doc="serial number; empty takes the first camera")
+    serial: str = Param("", doc="serial number; empty takes the first camera, and that one again after it was gone")
     width: int = Param(640, ge=1, unit="px", doc="width of both images")
     height: int = Param(480, ge=1, unit="px", doc="height of both images")
     rate: int = Param(30, ge=1, unit="Hz", doc="images a second")
@@ -49,10 +51,11 @@ class RealSense(Source):
 
     _unplugged, _single, _domain = 0, 0, "none"
     _sensors: tuple[Any, ...] = ()
+    _serial = ""
 
     def setup(self) -> None:
         """Raises SourceError where the package, the camera or a mode is not there."""
-        self._rs, self._stopped = _library(), threading.Event()
+        self._rs, self._stopped, self._serial = _library(), threading.Event(), self.serial
         self._open()
 
     def static_outputs(self) -> Mapping[str, Message]:
@@ -73,10 +76,10 @@ class RealSense(Source):
         last = time.monotonic()
         while not self._stopped.is_set():
             there, frame = self._queue.try_wait_for_frame(POLL)
-            if there:
+            for step in self._paired(frame) if there else ():
+                yield step
                 last = time.monotonic()
-                yield from self._paired(frame)
-            elif time.monotonic() - last > SILENCE:
+            if time.monotonic() - last > SILENCE:
                 self._look_for_it()
                 last = time.monotonic()
 
@@ -84,44 +87,46 @@ class RealSense(Source):
         self._stopped.set()
 
     def close(self) -> None:
-        for sensor in self._sensors:
+        for end in (end for sensor in self._sensors for end in (sensor.stop, sensor.close)):
             try:
-                sensor.stop()
-                sensor.close()
-            except RuntimeError as error:  # it is gone
-                self.log.debug("sensor of %s: %s", self.serial or "RealSense", error)
+                end()
+            except RuntimeError as error:  # it is gone, or has not started
+                self.log.debug("sensor of RealSense %s: %s", self._serial, error)
         self._sensors = ()
 
     def summary(self) -> Mapping[str, int | str]:
         return {"clock": self._domain, "without_partner": self._single, "unplugged": self._unplugged}
 
+    def _devices(self) -> list[Any]:
+        return list(self._rs.context().query_devices())
+
     def _device(self) -> Any:
-        """The camera. Raises SourceError."""
-        there = list(self._rs.context().query_devices())
-        serials = [device.get_info(self._rs.camera_info.serial_number) for device in there]
-        for device, serial in zip(there, serials, strict=True):
-            if self.serial in ("", serial):
+        """The camera; from then on no other. Raises SourceError."""
+        there = {device.get_info(self._rs.camera_info.serial_number): device for device in self._devices()}
+        for serial, device in there.items():
+            if self._serial in ("", serial):
+                self._serial = serial
                 return device
-        raise SourceError(f"no RealSense camera {self.serial}".strip() + f"; there are {', '.join(serials) or 'none'}")
+        raise SourceError(f"no RealSense camera {self._serial}".strip() + f"; there are {', '.join(there) or 'none'}")
 
     def _open(self) -> None:
         """Starts both cameras. Raises SourceError."""
         rs = self._rs
-        sensors = list(self._device().query_sensors())
         wanted = ((rs.stream.color, rs.format.rgb8), (rs.stream.depth, rs.format.z16))
-        found = [self._profile(sensors, *each) for each in wanted]
         self._queue = rs.frame_queue(2 * self.rate, keep_frames=True)
         self._waiting: tuple[deque[Any], deque[Any]] = (deque(), deque())
         self._began = time.time_ns()
-        try:
+        try:  # each call of the library fails for a camera that is unplugged meanwhile
+            sensors = list(self._device().query_sensors())
+            found = [self._profile(sensors, *each) for each in wanted]
             for sensor in {id(sensor): sensor for sensor, _ in found}.values():
                 sensor.open([profile for each, profile in found if each is sensor])
-                sensor.start(self._queue)
                 self._sensors = (*self._sensors, sensor)
+                sensor.start(self._queue)
+            self._profiles = tuple(profile.as_video_stream_profile() for _, profile in found)
         except RuntimeError as error:
             self.close()
             raise SourceError(f"the RealSense camera does not start: {error}") from error
-        self._profiles = tuple(profile.as_video_stream_profile() for _, profile in found)
 
     def _profile(self, sensors: list[Any], stream: Any, form: Any) -> tuple[Any, Any]:
         """The sensor that has a stream, and its mode. Raises SourceError."""
@@ -157,6 +162,9 @@ class RealSense(Source):
                 "image": Image(stamp=color_stamp, frame=self.image_frame, data=np.asarray(color.get_data())),
                 "depth": DepthImage(stamp=depth_stamp, frame=self.depth_frame, data=metres),
             }
+        if len(colors) + len(depths) > WAITING:
+            (colors or depths).popleft()
+            self._single += 1
 
     def _stamp(self, frame: Any) -> int:
         known = frame.frame_timestamp_domain != self._rs.timestamp_domain.hardware_clock
@@ -176,7 +184,7 @@ class RealSense(Source):
     def _look_for_it(self) -> None:
         """Waits until the camera is back, or the run ends."""
         self._unplugged += 1
-        self.log.warning("the RealSense camera gives no image any more: it is looked for")
+        self.log.warning("the RealSense camera gives no pair of images any more: it is looked for")
         self.close()
         pause = SHORTEST_PAUSE
         while not self._stopped.wait(pause):

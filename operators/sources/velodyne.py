@@ -13,7 +13,7 @@ import numpy as np
 
 from dataflow.messages import Message, PointCloud
 from dataflow.operator import Out, Param, Source, SourceError
-from operators.sources.ports import read_port, udp_port
+from operators.sources.ports import lost_datagrams, read_port, udp_port
 
 PACKET = 1206
 """Bytes of a packet with points."""
@@ -138,7 +138,7 @@ class VelodyneLidar(_Velodyne):
 
     input: str = Param("udp://0.0.0.0:2368", min_length=1, doc="udp://ADDRESS:PORT of this machine")
 
-    _silences, _port = 0, -1
+    _silences, _port, _lost = 0, -1, 0
 
     def setup(self) -> None:
         """Raises SourceError where the package or the address is not there."""
@@ -154,11 +154,13 @@ class VelodyneLidar(_Velodyne):
 
     def close(self) -> None:
         if self._port >= 0:
+            self._lost = lost_datagrams(self._port)
             os.close(self._port)
             self._port = -1
 
     def summary(self) -> Mapping[str, int | str]:
-        return {**super().summary(), "unplugged": self._silences}
+        lost = self._lost if self._port < 0 else lost_datagrams(self._port)
+        return {**super().summary(), "unplugged": self._silences, "lost_datagrams": lost}
 
     def _received(self) -> Iterator[tuple[int, bytes]]:
         silent = False

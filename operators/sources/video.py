@@ -137,9 +137,9 @@ class VideoFile(CalibratedImages):
         return self.first_stamp
 
 
-SET_BACK = 1_000_000_000
+SET_BACK = 100_000_000
 """Nanoseconds from which on a clock that is behind the last stamp was set back: stamps go on from there, as live runs
-allow."""
+allow. Of less, images are left out until the clock is ahead again."""
 
 
 class Webcam(CalibratedImages):
@@ -153,7 +153,7 @@ class Webcam(CalibratedImages):
 
     real_time = True
 
-    _unplugged = 0
+    _unplugged, _past = 0, 0
 
     input: str = Param("0", min_length=1, doc="number, device file or address of the camera")
     width: int | None = Param(None, ge=1, unit="px", doc="width to ask for; the camera may give another")
@@ -182,15 +182,17 @@ class Webcam(CalibratedImages):
             stamp = time.time_ns() - self.latency
             if bgr is None:
                 self._look_for_it()
-            elif stamp > last or last - stamp > SET_BACK:  # of less the next image is ahead again: this one is left out
+            elif stamp > last or last - stamp > SET_BACK:
                 last = stamp
                 yield self._image(stamp, np.asarray(bgr, np.uint8))
+            else:
+                self._past += 1
 
     def stop_reading(self) -> None:
         self._stopped.set()
 
     def summary(self) -> Mapping[str, int | str]:
-        return {"clock": "machine", "unplugged": self._unplugged}
+        return {"clock": "machine", "unplugged": self._unplugged, "past": self._past}
 
     def close(self) -> None:
         camera: cv2.VideoCapture | None = getattr(self, "_camera", None)

@@ -46,6 +46,32 @@ def test_a_trace_runs_from_a_message_of_a_source_to_all_that_it_caused() -> None
         assert re.fullmatch("[0-9a-f]{16}", span["spanId"])
 
 
+def test_a_trace_does_not_depend_on_the_clocks_of_machines() -> None:
+    graph = load_text(DIAMOND)
+    rounds = [one_round(graph, k, 100.0 + 20 * k, slow=10) for k in range(30)]
+    records = {name: [r for each in rounds for r in each[name]] for name in rounds[0]}
+
+    def links(early: int) -> dict[str, tuple[str, str | None, list[Any]]]:
+        clocks = {"slow": -early, "join": -early}
+        by_clock = {
+            name: [replace(r, wall_start=r.wall_start + clocks.get(name, 0)) for r in each]
+            for name, each in records.items()
+        }
+        spans = spans_of(DIAMOND, by_clock)
+        assert len(spans) == 120
+        return {s["spanId"]: (s["traceId"], s.get("parentSpanId"), s["links"]) for s in spans}
+
+    assert links(500_000_000) == links(-500_000_000) == links(0)
+
+
+def test_calls_whose_causes_have_lost_their_records_come_all_the_same() -> None:
+    graph = load_text(DIAMOND)
+    fast = [record("fast", k, k, 1, {"x": message(graph, "slow", 99)}) for k in range(3)]
+    slow = [record("slow", k, k, 1, {"x": message(graph, "fast", 99)}) for k in range(3)]
+
+    assert len(spans_of(DIAMOND, {"fast": fast, "slow": slow})) == 6
+
+
 def test_an_error_has_its_text_and_a_message_that_is_not_known_no_parent() -> None:
     graph = load_text(DIAMOND)
     lost = record("fast", 0, 1, 1, {"x": message(graph, "camera", 99)})

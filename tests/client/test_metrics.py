@@ -56,8 +56,8 @@ def test_every_figure_of_an_operator_is_a_sample() -> None:
 
 def test_no_two_samples_have_the_same_labels(tmp_path: Path) -> None:
     metrics = Metrics()
-    for pid in (1, 2):
-        found = RunningGraph("robot", "robot", pid, 0.0, (), 12.5, {})
+    for pid, started in ((1, 12.5), (2, 12.5), (0, 12.5), (0, 13.5)):  # pid 0: on other machines
+        found = RunningGraph("robot", "robot", pid, 0.0, (), started, {})
         status = ProcessStatus("p", {"camera": [7, 6, 2, 3, 5, 4]}, {"camera": 3}, frozenset(), {}, {})
         metrics.add_graph(found, ["camera"], [status])
 

@@ -18,7 +18,7 @@ import pytest
 import dataflow
 from dataflow.debugging.dap.session import Session, listen
 from dataflow.debugging.debugger import Debugger
-from dataflow.debugging.fired import Probe
+from dataflow.debugging.fired import Abandoned, Probe
 from dataflow.debugging.lines import homes_of, is_own
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
@@ -456,6 +456,44 @@ def test_a_pause_ends_a_way_to_a_call_far_away(recorded: tuple[Recording, Path])
         goto = {"expression": "goto 11", "context": "repl", "frameId": 1}
         assert client.at_once("evaluate", "pause", **goto)[0] == "pause"
         assert client.call() < 11
+
+
+def test_a_pause_stops_where_the_way_was_even_if_little_of_it_is_kept(
+    recorded: tuple[Recording, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look = Session._look_on_the_way
+
+    def paused(session: Session) -> None:
+        session._pauses = session._pauses or session._debugger.reached == 6
+        look(session)
+
+    monkeypatch.setattr("dataflow.debugging.ring.MOST_CALLS", 2)
+    monkeypatch.setattr(Session, "_look_on_the_way", paused)
+    with editing(recorded) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        client.value("goto 11", context="repl")
+        assert client.stopped()[0] == "pause"
+        assert client.call() == 7
+
+
+def test_a_pause_behind_the_last_call_stops_too(
+    recorded: tuple[Recording, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with editing(recorded, first=11) as client:
+        client.ask("configurationDone")
+        client.stopped()
+
+        def broken_off(session: Session, *_: object) -> None:
+            monkeypatch.undo()
+            session._debugger._made_on_the_way(3, None)
+            session._pauses = True
+            raise Abandoned
+
+        monkeypatch.setattr(Session, "_last", broken_off)
+        client.ask("continue")
+        assert client.stopped()[0] == "pause"
+        assert client.call() == 4
 
 
 def test_calls_are_made_once_on_the_way_and_twice_back_to_the_beginning(

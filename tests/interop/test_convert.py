@@ -344,8 +344,8 @@ def test_images_and_poses_without_a_depth_image_are_counted_as_7scenes_leaves_th
         done = Exported()
         DATASETS["7scenes"](material, tmp_path / "out", done)
 
-    assert done.lost["camera/image"]["image without a depth image within 20 ms, left out"] == 2
-    assert done.lost["camera/pose"]["pose without a depth image within 20 ms, left out"] == 2
+    assert done.lost["camera/image"]["image of which no frame was made, left out"] == 2
+    assert done.lost["camera/pose"]["pose of which no frame was made, left out"] == 2
 
 
 def test_kitti_folder_is_read_back(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from dataflow.interop.account import Account
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.own import export_own
 from dataflow.interop.export.report import Exported
+from dataflow.interop.ros.made import with_covariance
 from dataflow.messages import Message
 from dataflow.recording import Recording
 
@@ -68,9 +69,9 @@ def organised_short() -> Any:
     return cloud(XYZ, flat, width=3, height=2, row_step=40, point_step=12)
 
 
-def camera(model: str, coefficients: int) -> Any:
+def camera(model: str, coefficients: int, *more: float) -> Any:
     K = np.array([50.0, 0, 32, 0, 50, 24, 0, 0, 1])
-    d = np.full(coefficients, 0.1)
+    d = np.array([0.1] * coefficients + [*more])
     about = {"width": 64, "height": 48, "distortion_model": model}
     return ros("sensor_msgs/CameraInfo", header=header(T), d=d, k=K, **about)
 
@@ -134,8 +135,20 @@ ODD: dict[str, tuple[Any, Callable[[Any], bool], str]] = {
         camera("plumb_bob", 8), lambda m: m.distortion_model == "rational_polynomial", "no 8 coefficients"
     ),
     "plumb_bob_2": (
-        camera("plumb_bob", 2), lambda m: (m.distortion_model, m.distortion) == ("none", None), "2 coefficients"
+        camera("plumb_bob", 2), lambda m: (m.distortion_model, *m.distortion) == ("plumb_bob", 0.1, 0.1, 0, 0), ""
     ),
+    "equidistant_5": (
+        camera("equidistant", 4, 0.0), lambda m: (m.distortion_model, *m.distortion) == ("equidistant", *[0.1] * 4), ""
+    ),
+    "rational_polynomial_5": (
+        camera("rational_polynomial", 5),
+        lambda m: (m.distortion_model, *m.distortion) == ("rational_polynomial", *[0.1] * 5, 0, 0, 0),
+        "",
+    ),
+    "distortion": (
+        camera("plumb_bob", 4, float("nan")), lambda m: m.distortion is None, "a distortion that is not finite"
+    ),
+    "pose": (with_covariance(np.zeros(3), None, np.eye(6)), lambda m: (m.covariance == np.eye(6)).all(), ""),
     "path": (path(), lambda m: m.stamps is None, "the times of its poses"),
     "odometry": (
         unknown_errors(),
@@ -143,7 +156,8 @@ ODD: dict[str, tuple[Any, Callable[[Any], bool], str]] = {
         "covariance that is not finite",
     ),
     "temperature": (
-        ros("sensor_msgs/Temperature", header=header(T), variance=float("nan")), lambda m: m.variance is None, ""
+        ros("sensor_msgs/Temperature", header=header(T), variance=float("nan")), lambda m: m.variance is None,
+        "variance that is not finite",
     ),
     "tf": (transforms(), lambda m: m.child_frames == ("good",), "a transform to nan that is not finite"),
     "fix": (fix(), lambda m: m.longitude == 274.25 - 360, "a longitude of 180 to 360 degrees"),
@@ -178,10 +192,17 @@ def test_an_odd_message_is_read_as_far_as_it_makes_sense_and_the_rest_is_named(
     ("message", "reason"),
     [
         (cloud([("x", 0, 7, 3), *XYZ[1:]], points(6)), "whose field x has 3 values a point"),
+        (
+            encoded("32FC3; tiff compressed", file(".tiff", COLOUR.astype(np.float32))),
+            "holds float32 of 6x8x3, which no",
+        ),
+        (encoded("16UC1; tiff compressed", file(".tiff", COLOUR.astype(np.uint16))), "holds uint16 of 6x8x3, which no"),
+        (encoded("tiff", file(".tiff", METRES.astype(np.int32))), "holds int32 of 6x8, which no"),
+        (camera("equidistant", 5), "a distortion of 5 coefficients, of which equidistant has 4 at most"),
         (encoded("h264", b"\0\0\0\x1f\x65\x88" + bytes(40)), "without a start code"),
         (ros("visualization_msgs/Marker", header=header(T), type=1, action=2), "a marker that deletes"),
     ],
-    ids=["three values", "AVCC", "deletion"],
+    ids=["three values", "float colours", "colours as depth", "int32", "five coefficients", "AVCC", "deletion"],
 )
 def test_a_message_that_makes_no_sense_is_left_as_it_is_with_its_reason(
     tmp_path: Path, message: Any, reason: str

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import shutil
 import sqlite3
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from dataflow.interop.bag import BagError, shortfalls
+from dataflow.interop.bag import BagError, shortfalls, surpluses
 from dataflow.interop.export.foxglove import export_foxglove
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.own import export_own
@@ -174,6 +175,7 @@ def test_one_layout_under_two_names_is_one_topic_and_two_layouts_are_two(tmp_pat
     assert counted(tmp_path / "two.bag") == {"/said": 6, "/said (std_msgs/msg/Float64)": 1}
     bag = open_bag(tmp_path / "two.bag")
     assert "two types" in bag.notes[0]
+    assert shortfalls(bag) == surpluses(bag) == []
     bag.close()
 
 
@@ -279,6 +281,17 @@ def numbers(file: Path, values: range) -> None:
         for value in values:
             message = ros("std_msgs/Float64", ROS1, data=float(value))
             writer.write(connection, STAMPS[value], ROS1.serialize_ros1(message, kind))
+
+
+def test_a_chunk_of_a_connection_that_the_bag_does_not_describe_promises_nothing(tmp_path: Path) -> None:
+    numbers(tmp_path / "n.bag", range(4))
+    content = (tmp_path / "n.bag").read_bytes()
+    assert content.endswith(struct.pack("<II", 0, 4))  # connection and count of the last chunk's
+    (tmp_path / "n.bag").write_bytes(content[:-8] + struct.pack("<II", 7, 4))
+
+    bag = open_bag(tmp_path / "n.bag")
+    assert (bag.promised, len(list(bag.messages(["/n"])))) == ({}, 4)
+    bag.close()
 
 
 def test_the_parts_of_a_split_ros_1_recording_are_one_bag(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,23 @@ def test_a_trigger_of_a_run_that_is_behind_the_clock_keeps_what_it_had_come_to(
 def test_firing_records_that_are_late_are_waited_for(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     """As of a recorder that is behind, since its disk is slow."""
     sink, _ = flown(recorded, graph, tmp_path, asks=[10.0], late=6 * SECOND)
+    (one,) = sink.close("complete")["kept"]
+
+    with Recording(one["path"]) as kept:
+        assert max(m.stamp for m in kept.messages(["test/left/fast"])) >= 12 * SECOND - 60_000_000
+
+
+def test_a_pause_of_the_recorder_is_no_time_in_which_firing_records_would_have_come(
+    recorded: Path, graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a stopped container: the clock goes on by 40 s when the span has just ended."""
+    now = [0.0]
+    monkeypatch.setattr("dataflow.process.awake.time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def at(stamp: float) -> None:
+        now[0] = stamp + 40 * (stamp >= 12.2)
+
+    sink, _ = flown(recorded, graph, tmp_path, asks=[10.0], late=6 * SECOND, each=at)
     (one,) = sink.close("complete")["kept"]
 
     with Recording(one["path"]) as kept:

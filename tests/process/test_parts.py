@@ -204,6 +204,24 @@ def test_a_full_disk_is_outlived_and_what_is_lost_is_counted(
         assert "culprit" not in verdicts(path).values()
 
 
+def test_a_static_message_of_which_only_a_copy_is_stored_is_not_lost(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
+) -> None:
+    """The first part, which it came into, found no room."""
+
+    def at(seconds: float) -> None:
+        disk.full = seconds < 3
+
+    given = Given(recorded, graph, tmp_path / "run.mcap", GO_ON)
+    disk.full = True
+    facts = given.all(at)
+
+    with Recording(tmp_path / "run_001.mcap") as part:
+        assert part.streams["test/left/constant"].count == 1
+    assert "test/left/fast" in facts["lost"]["streams"]
+    assert "test/left/constant" not in facts["lost"]["streams"]
+
+
 def test_a_disk_that_stays_full_leaves_a_readable_recording(
     recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
 ) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from dataflow.editing.merge import merge
 from dataflow.editing.split import split
 from dataflow.interop.opening import is_foreign
 from dataflow.messages import Pose
@@ -121,6 +123,26 @@ def test_a_missing_part_is_named(folder: Path, tmp_path: Path) -> None:
 
     with pytest.raises(RecordingError, match=r"the part after live_000\.mcap is missing: number 1"):
         Recording(there)
+
+
+@pytest.mark.parametrize("kept", [0, 8, 53, 200])
+def test_a_part_that_its_writer_died_as_it_began_is_passed_over(folder: Path, tmp_path: Path, kept: int) -> None:
+    shutil.copytree(folder, tmp_path / "parts")
+    parts = parts_in(tmp_path / "parts")
+    begun = parts[-1].with_name(parts[-1].name.replace(f"_{len(parts) - 1:03}", f"_{len(parts):03}"))
+    begun.write_bytes(parts[-1].read_bytes()[:kept])
+
+    with Recording(folder) as expected, Recording(tmp_path / "parts") as recording:
+        assert recording.digests() == expected.digests()
+        assert recording.torn
+        assert any(begun.name in note and "holds nothing" in note for note in recording.damage)
+    if kept:
+        with ExitStack() as stack:
+            origins = [stack.enter_context(Origin(part)) for part in parts_in(tmp_path / "parts")]
+            done = merge(origins, tmp_path / "whole.mcap")
+        assert any(begun.name in note and "holds nothing" in note for note in done.notes)
+        with Recording(KEPT) as expected, Recording(tmp_path / "whole.mcap") as recording:
+            assert recording.digests() == expected.digests()
 
 
 def test_parts_without_what_they_share_follow_each_other(tmp_path: Path, pose: Callable[..., Pose]) -> None:

@@ -132,6 +132,30 @@ def test_a_full_disk_is_reported_and_leaves_a_readable_file(
     assert f"stamps up to {seqs[-1]}" in str(error)
 
 
+def test_the_end_of_a_file_is_one_write(
+    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that takes a tenth of a second for each would hold up a recorder for seconds."""
+    real, writes = os.write, list[int]()
+
+    def write(fd: int, data: Any) -> int:
+        writes.append(len(data))
+        return real(fd, data)
+
+    writer = RecordingWriter(tmp_path / "many.mcap", metadata={})
+    for k in range(40):
+        writer.add_stream(f"a{k}", Pose)
+        writer.write(f"a{k}", pose(1), seq=0)
+    monkeypatch.setattr(os, "write", write)
+    writer.flush()
+    assert len(writes) == 1
+    writer.close()
+
+    assert len(writes) <= 3  # the digests, which are metadata, and the index
+    with Recording(tmp_path / "many.mcap") as recording:
+        assert len(list(recording.messages())) == 40
+
+
 def test_a_file_size_limit_of_the_system_leaves_a_finished_file(tmp_path: Path, noise: Callable[..., Any]) -> None:
     """A real refusal by the kernel; cutting the torn chunk off makes room for the index."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -205,6 +205,12 @@ def test_seeds(first: int, memory: Path) -> None:
             pytest.fail(f"{scenario.describe()}\n{violation}")
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [23_000_041, 23_000_109, 23_000_334, 23_000_461, 23_000_570, 23_000_869])
+def test_seeds_that_broke_a_promise_once(seed: int, memory: Path) -> None:
+    check(scenario_of(seed), memory)
+
+
 @pytest.mark.parametrize("first", [0, *(pytest.param(at, marks=pytest.mark.long) for at in range(10, 100, 10))])
 def test_links_between_machines(first: int) -> None:
     """Frames arrive once and in order, whatever becomes of the link; clocks are known to half the delay."""

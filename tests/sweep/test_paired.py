@@ -53,6 +53,15 @@ def test_many_figures_are_judged_together() -> None:
     assert [one.figure for one in compared(figures) if one.differs] == ["x: recall"]
 
 
+def test_recordings_that_bring_the_difference_come_first_whether_b_is_better_or_worse() -> None:
+    changes = {f"r{k}": change for k, change in enumerate((0.3, 0.2, 0.0, -0.1))}
+    better = {name: (0.5, 0.5 + change) for name, change in changes.items()}
+    worse = {name: (b, a) for name, (a, b) in better.items()}
+    for figure in ("judge: recall", "judge: rmse", "judge: count"):
+        for pairs in (better, worse):
+            assert compared({figure: pairs})[0].most_changed == ["r0", "r1", "r2", "r3"]
+
+
 def test_the_worst_recordings_for_b_come_first() -> None:
     pairs = {"one": (1.0, 2.0), "two": (1.0, 0.5), "three": (1.0, 1.0)}
     falling, rising, open_ = ["one", "three", "two"], ["two", "three", "one"], ["one", "two", "three"]

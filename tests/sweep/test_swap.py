@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import dataflow
 from dataflow.graph import Graph
 from dataflow.messages import FeatureVector
 from dataflow.operator import In, Operator, Out, Param, Source
+from dataflow.sweep.layers import draw, layered
 from dataflow.sweep.plan import SweepError
 from dataflow.sweep.swap import Both, between, both, parts, shares
 
@@ -92,9 +94,14 @@ def test_without_an_operator_to_swap_there_is_no_answer() -> None:
         between((graph(), graph()), ["judge", "numbers"], FIGURE)
 
 
-def test_a_and_b_are_layers_of_one_file(tmp_path: Path) -> None:
-    from dataflow.sweep.layers import draw
+def test_clouds_of_both_are_kept_in_view() -> None:
+    one = graph()
+    one = replace(one, view=replace(one.view, keep=("swapped/right/out", "swapped/left/out")))
+    layers, _, _ = layered((one, one), frozenset({"swapped/right/out"}))
+    assert set(layers.view.keep) == {"A/right A/out", "B/right B/out", "swapped/left/out"}
 
+
+def test_a_and_b_are_layers_of_one_file(tmp_path: Path) -> None:
     one = compared(tmp_path, graph(right=1.0))
     assert one.different == {"swapped/right/out"}
     counts = draw(one, tmp_path / "layers.rrd").statistics()

@@ -11,9 +11,14 @@ from typing import Any
 
 import pytest
 
+import dataflow
+from dataflow.graph import load_text
+from dataflow.recording import Recording
+from dataflow.records.firing import CALLS
+from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.text import json_text
-from dataflow.tool_server.tools import ToolError, answer
+from dataflow.tool_server.tools import ToolError, _call_of, answer
 
 SKIPPED, DEGREES = 613, 640
 """The first calls of `sum` and `sine` that the bugs change."""
@@ -34,6 +39,18 @@ def test_verify_names_culprits_with_their_first_call(bugs: dict[str, str]) -> No
     assert {each["operator"]: each["call"] for each in told["operators"]} == {"sum": SKIPPED, "sine": DEGREES}
 
 
+def test_a_recorded_state_is_of_the_call_behind_which_it_was_taken(bugs: dict[str, str]) -> None:
+    with Recording(Path(bugs["right"])) as recording:
+        records = FiringLog.read(recording).of("sum")
+    state = [record.kind for record in records].index("snapshot", 100)
+    before = sum(record.kind in CALLS for record in records[:state])
+
+    places = {n: _call_of(Path(bugs["right"]), "sum", {"incarnation": 0, "index": n}) for n in (0, state, state + 1)}
+
+    assert records[0].kind == "setup"
+    assert places == {0: {}, state: {"call": before - 1}, state + 1: {"call": before}}
+
+
 def test_a_call_is_shown_with_its_difference(bugs: dict[str, str]) -> None:
     found = ask("diff", bugs["right"], operator="sine")
 
@@ -42,6 +59,59 @@ def test_a_call_is_shown_with_its_difference(bugs: dict[str, str]) -> None:
     assert found == ask("goto", bugs["right"], operator="sine", call=str(DEGREES))
     assert ask("goto", bugs["right"], operator="sine", call="@6.4")["number"] == DEGREES
     assert ask("goto", bugs["right"], operator="sine", call="-1")["number"] == 700
+
+
+SCALED = """
+from dataflow.messages import FeatureVector
+from dataflow.operator import In, Operator, Out
+
+
+class Scaled(Operator):
+    stateless = True
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(self, x):
+        vectors = x.vectors * 2
+        if x.vectors[0, 0] > 3:
+            vectors = vectors + 1
+        return {"y": FeatureVector(stamp=x.stamp, vectors=vectors, model="scaled")}
+"""
+
+
+def test_the_changed_line_that_made_a_call_differ_is_named_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "scaled_operators.py"
+    file.write_text(SCALED)
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=robot", "-c", "user.email=robot@localhost"]
+    for words in (["init", "-q"], ["add", file.name], ["commit", "-qm", "Right"]):
+        subprocess.run([*git, *words], check=True, timeout=60)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    graph = load_text(
+        "graph: scaled\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 8}}\n"
+        "  scaled: {use: 'scaled_operators:Scaled', inputs: {x: src/x}}\n"
+    )
+    recording = str(tmp_path / "right.mcap")
+    dataflow.run(graph, record=recording)
+    file.write_text(SCALED.replace("x.vectors * 2", "2.0 * x.vectors").replace("vectors + 1", "vectors + 10"))
+    monkeypatch.delitem(sys.modules, "scaled_operators")
+    wrong = SCALED[: SCALED.index("+ 1")].count("\n") + 1
+
+    told = ask("lines", recording, operator="scaled")
+    assert (told["call"], told["raised"]) == (4, None)
+    assert told["recorded_code"]["scaled_operators"].startswith("commit ")
+    assert [(each["first"], each["mends"], each["ran"]) for each in told["changes"]] == [
+        (wrong, True, True),
+        (wrong - 2, False, True),
+    ]
+    assert "vectors + 1\n" in told["changes"][0]["recorded"]
+    assert told["alone"] == {str(file): [[wrong, wrong]]}
+
+    (tmp_path / ".git").rename(tmp_path / "hidden")
+    told = ask("lines", recording, operator="scaled")
+    assert (told["changes"], told["recorded_code"]) == ([], {"scaled_operators": "not found"})
+    assert told["alone"] == {str(file): [[wrong, wrong]]}
 
 
 def test_the_state_before_and_after_a_call(bugs: dict[str, str]) -> None:
@@ -106,6 +176,16 @@ def test_a_proven_fix(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> 
     assert only["reasons"] == []
     assert only["proven"]
     assert only["other_operators"] == {"identical": ["sine"]}
+
+
+@pytest.mark.long
+def test_a_fix_makes_all_that_is_recorded_of_right_code(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = {"operator": "sum", "call": str(SKIPPED), "expect": "True", "right": bugs["right"]}
+    reasons = ask("prove", bugs["wrong"], **arguments)["reasons"]
+    assert reasons == ["call 613 still gives what was recorded", f"sum in {bugs['right']}: culprit"]
+
+    monkeypatch.setenv("ZOO_FIXED", "1")  # which mends sine, too
+    assert ask("prove", bugs["wrong"], **arguments)["reasons"] == ["other operators: {'sine': 'culprit'}"]
 
 
 def _added(state: Any, k: float) -> list[float]:

@@ -37,7 +37,7 @@ MOST_NAMED = 5
 LEAST = 6
 """Pairs that Wilcoxon's test needs for a p below 5 %."""
 EXPLAINED = 3
-"""Recordings whose change is explained, those that change the most."""
+"""Recordings whose change is explained."""
 WHOLE = 0.9
 """Share of a change from which an operator is said to bring it."""
 
@@ -55,8 +55,8 @@ Explain = Annotated[
     typer.Option(
         "--explain",
         metavar="FIGURE",
-        help=f"Which operator brings the change of this figure? Replays the {EXPLAINED} recordings where B is worst by "
-        "A, with the outputs of one operator after the other as B made them.",
+        help=f"Which operator brings the change of this figure? Replays the {EXPLAINED} recordings with the largest "
+        "change in the direction of its mean by A, with the outputs of one operator after the other as B made them.",
     ),
 ]
 Rerun = Annotated[
@@ -195,7 +195,7 @@ def _explained(plan: Sweep, figure: Paired, different: Sequence[Difference]) -> 
     from dataflow.sweep.swap import between, parts, shares
 
     made = []
-    for name, _ in figure.recordings[:EXPLAINED]:
+    for name in figure.most_changed[:EXPLAINED]:
         with tempfile.TemporaryDirectory(prefix="dataflow_compare_") as folder:
             one = _both(plan, name, folder)
             names = between(one.graphs, [d.operator for d in different], figure.figure)

@@ -147,8 +147,9 @@ def _named_by(failure: RunFailed, graph: Graph) -> str | None:
     """The parameter, such as `camera.path`, whose value stands in a failure; the one with the longest value."""
     node = graph.nodes.get(failure.operator or "")
     texts = {name: value for name, value in (node.params if node else {}).items() if isinstance(value, str) and value}
-    ends = r"(?![\w.-])"  # `imu` does not name the file imu.csv
-    named = [name for name, value in texts.items() if re.search(re.escape(str(Path(value))) + ends, str(failure))]
+    # `imu` names neither the file imu.csv nor my_imu; what a full stop follows is named
+    found = r"(?<![\w.-])%s(?!\.?[\w-])"
+    named = [name for name, value in texts.items() if re.search(found % re.escape(str(Path(value))), str(failure))]
     return f"{failure.operator}.{max(named, key=lambda name: len(texts[name]))}" if named else None
 
 

@@ -132,7 +132,8 @@ class Session:
             self._going = Going(going.call + 1, stops)
         else:
             self._say("this was the last call; at its last line again")
-            self._going = self._end(going.call + 1)
+            self._away = partial(self._end, going.call + 1)
+            self._going = self._led()
 
     def _led(self) -> Going:
         """Finds where a command leads; of one that fails, prints the reason and begins the call again."""
@@ -147,8 +148,8 @@ class Session:
             return Going(here, self._first_line)
 
     def _reached(self) -> Going:
-        """The call at which a way to another was broken off."""
-        return Going(max(self._debugger.reached, 0), self._first_line)
+        """The call behind the one at which a way to another was broken off: the only one to which no way leads anew."""
+        return Going(self._debugger.reached + 1, self._first_line)
 
     def _look_on_the_way(self) -> None:
         """Answers requests between two calls on the way to another, which a pause breaks off."""

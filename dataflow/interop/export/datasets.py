@@ -96,7 +96,7 @@ def export_7scenes(material: Material, folder: Path, done: Exported) -> None:
     for what, messages, used in (("image", images, taken), ("pose", poses, placed)):
         if left := len(messages) - len(used):
             stream = material.only("7-Scenes", *IMAGES) if what == "image" else optional(material, *POSES)
-            done.lose(material.names[stream or ""], f"{what} without a depth image within 20 ms, left out", left)
+            done.lose(material.names[stream or ""], f"{what} of which no frame was made, left out", left)
     done.files.append(str(folder))
     _intrinsics(material, folder, done)
 

@@ -103,7 +103,12 @@ def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedIma
         return Image16(stamp=stamp, frame=frame, data=found)
     if found.dtype == np.uint8:
         return Image(stamp=stamp, frame=frame, data=found)
-    encoding = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}.get(found.dtype.name, "")
+    encoding = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}.get(found.dtype.name)
+    if encoding is None or found.ndim != 2:
+        shape = "x".join(map(str, found.shape))
+        raise RecordingError(
+            f"an image of format {format_!r} holds {found.dtype} of {shape}, which no message here holds"
+        )
     return DepthImage(stamp=stamp, frame=frame, data=as_depth(encoding, found))
 
 
@@ -139,16 +144,17 @@ def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> Compre
 def camera_info(message: Any, stamp: int) -> CameraInfo:
     """sensor_msgs/CameraInfo, as it is for the image that comes: of the sensor's size where it is binned or a part is
     read out (REP 104), with K and P of those pixels. Raises `RecordingError` for a camera that is not calibrated (K
-    of zeros)."""
+    of zeros), and for coefficients that its lens model does not have."""
     K, D = first(message, "k", "K"), first(message, "d", "D")
     R, P = first(message, "r", "R"), first(message, "p", "P")
     model = str(message.distortion_model)
     if model == "plumb_bob" and len(D) in COEFFICIENTS["rational_polynomial"]:
         lose(message, f"the model plumb_bob, which has no {len(D)} coefficients (rational_polynomial has)")
         model = "rational_polynomial"
-    elif len(D) and len(D) not in COEFFICIENTS.get(model, (len(D),)):
-        lose(message, f"a distortion of {len(D)} coefficients, which {model} does not have")
-        model, D = "none", ()
+    elif np.isfinite(D).all():
+        D = _fitting(model, D)
+    else:
+        lose(message, "a distortion that is not finite")
     made = calibration(stamp, message.header.frame_id, message.width, message.height, model, K, D, R, P)
     roi, binning = message.roi, (int(message.binning_x) or 1, int(message.binning_y) or 1)
     if max(binning) > 1 and made.cx > 0.8 * made.width:
@@ -159,6 +165,17 @@ def camera_info(message: Any, stamp: int) -> CameraInfo:
     if roi.do_rectify:
         lose(message, "roi.do_rectify")
     return as_read_out(made, offset, part, binning)
+
+
+def _fitting(model: str, D: Any) -> Any:
+    """Coefficients with as many zeros behind them as a model takes. Raises `RecordingError` where it takes fewer."""
+    counts = COEFFICIENTS.get(model)
+    if counts is None or len(D) in (0, *counts):
+        return D
+    held = np.trim_zeros(np.asarray(D, np.float64), "b")
+    if len(held) > counts[-1]:
+        raise RecordingError(f"a distortion of {len(held)} coefficients, of which {model} has {counts[-1]} at most")
+    return np.append(held, np.zeros(min(count for count in counts if count >= len(held)) - len(held)))
 
 
 def as_read_out(

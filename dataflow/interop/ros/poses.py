@@ -35,7 +35,7 @@ def point(message: Any, stamp: int) -> Point:
 
 def pose(message: Any, stamp: int) -> Pose:
     """geometry_msgs/Pose, PoseStamped, PoseWithCovariance and PoseWithCovarianceStamped."""
-    placed, owner = message, None
+    placed, owner = message, message if hasattr(message, "covariance") else None
     while hasattr(placed, "pose"):
         placed = placed.pose
         owner = placed if hasattr(placed, "covariance") else owner
@@ -50,7 +50,7 @@ def pose(message: Any, stamp: int) -> Pose:
 
 def twist(message: Any, stamp: int) -> Twist:
     """geometry_msgs/Twist, TwistStamped and TwistWithCovarianceStamped."""
-    moved, owner = message, None
+    moved, owner = message, message if hasattr(message, "covariance") else None
     while hasattr(moved, "twist"):
         moved = moved.twist
         owner = moved if hasattr(moved, "covariance") else owner

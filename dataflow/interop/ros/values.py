@@ -49,8 +49,10 @@ def covariance(message: Any, name: str, size: int) -> F64 | None:
 
 
 def variance(message: Any) -> float | None:
-    """The variance of a reading; None where it is not known: no field, 0, below or not finite."""
+    """The variance of a reading; None where it is not known: no field, 0, below, or not finite, which is lost."""
     value = float(getattr(message, "variance", 0.0))
+    if not np.isfinite(value):
+        lose(message, "variance that is not finite")
     return value if 0 < value < np.inf else None
 
 

@@ -45,6 +45,8 @@ from dataflow.recording.parts import OWNER_ONLY, created
 
 CHUNK_BYTES = 4 * 1024 * 1024
 CHUNK_SECONDS = 1.0
+WRITE_BYTES = 64 * 1024
+"""What is smaller than this is written together."""
 
 
 class ContainerWriter:
@@ -278,7 +280,7 @@ class ContainerWriter:
         self._check_usable()
         try:
             written = 0
-            for part in parts:
+            for part in _together(parts):
                 view = memoryview(part)
                 while view:
                     count = os.write(self._fd, view)
@@ -329,3 +331,18 @@ class ContainerWriter:
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
+
+
+def _together(parts: Iterable[Buffer]) -> Iterator[Buffer | bytearray]:
+    """The parts, small ones joined: a disk may take its time for each write."""
+    small = bytearray()
+    for part in parts:
+        if small and len(small) + len(part) > WRITE_BYTES:
+            yield small
+            small = bytearray()
+        if len(part) > WRITE_BYTES:
+            yield part
+        else:
+            small += part
+    if small:
+        yield small

@@ -31,6 +31,13 @@ _PART = re.compile(r"(.+)_(\d{3,})\.mcap")
 _ONCE = (Kind.STREAM, Kind.COMPANION, Kind.FRAMES)
 """Channels whose times increase, so that a part holds again what is not after those before it."""
 
+NOTHING_IN_IT = "holds nothing: its writer died as it began the file"
+
+
+def holds_nothing(file: McapFile | PartedFile) -> bool:
+    """Tells whether the writer of a file died before it had stored a message or a record."""
+    return file.torn and not any(map(file.index.count, file.channels))
+
 
 def parts_in(folder: Path) -> list[Path]:
     """The parts of a recording that are a folder's only MCAP files, in order; none for any other folder.
@@ -54,23 +61,33 @@ class PartedFile:
     def __init__(self, path: Path, parts: Sequence[Path], *, watch: Watch | None = None) -> None:
         self.path = path
         self._files: list[McapFile] = []
+        bare: list[Path] = []
         cache = ChunkCache()
         try:
             for part in parts:
-                self._files.append(McapFile(part, watch=watch, cache=cache))
+                begun = None if not part.stat().st_size else McapFile(part, watch=watch, cache=cache)
+                if begun is None or holds_nothing(begun):
+                    bare.append(part)
+                    if begun is not None:
+                        begun.close()
+                    continue
+                self._files.append(begun)
                 if not any(name == RECORDING for name, _ in self._files[-1].metadata):
                     raise RecordingError(f"{part} is no recording of this program, so {path} is not one in parts")
         except BaseException:
             self.close()
             raise
+        if not self._files:
+            raise RecordingError(f"{path}: nothing is in any of its parts")
         self.header = self._files[0].header
-        self.torn = self._files[-1].torn
+        self.torn = self._files[-1].torn or parts[-1] in bare
         self.lost_bytes = sum(file.lost_bytes for file in self._files)
         self.nbytes = sum(file.nbytes for file in self._files)
         self.damage = [f"{f.path.name}: {note}" for f in self._files for note in f.damage]
         self.damage += [
             f"{f.path.name} has no proper end, and is not the last part" for f in self._files[:-1] if f.torn
         ]
+        self.damage += [f"{part.name} {NOTHING_IN_IT}" for part in bare]
         self.metadata = self._joined_metadata()
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}

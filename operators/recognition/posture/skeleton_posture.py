@@ -28,7 +28,7 @@ class SkeletonPosture(Operator):
     """
 
     keypoints: In[Keypoints2D] = In(
-        doc="joints of people with COCO's names; the ids are those of their nodes or tracks"
+        doc="joints of people with COCO's names; SceneGraphBuilder wants the ids of their nodes"
     )
     postures: Out[Classification] = Out(doc="standing or sitting, with probabilities, of each person whose joints tell")
 
@@ -53,14 +53,13 @@ class SkeletonPosture(Operator):
         self.state.counts.update({"persons": keypoints.count, "without a posture": keypoints.count - len(rows)})
         standing = 1 / (1 + np.exp(-_STEEP * (np.array(shares, np.float64) - _BETWEEN)))
         probabilities = np.column_stack([standing, 1 - standing]).astype(np.float32).reshape(-1, 2)
-        ids = np.arange(keypoints.count) if keypoints.ids is None else keypoints.ids
         return Classification(
             frame=keypoints.frame,
             class_names=POSTURES,
             class_ids=probabilities.argmax(axis=1).astype(np.int32),
             scores=probabilities.max(axis=1, initial=0.0),
             probabilities=probabilities,
-            ids=ids[rows].astype(np.int64),
+            ids=None if keypoints.ids is None else keypoints.ids[rows],
         )
 
 

@@ -61,8 +61,8 @@ class SceneGraphBuilder(Operator):
     )
     postures: Sampled[Classification] = Sampled(
         required=False,
-        doc="whether people stand or sit, by SkeletonPosture; with it, what one in sight does who does neither by it, "
-        "nor anything else, is unknown",
+        doc="whether people stand or sit, by SkeletonPosture, by ids of nodes; with it, what one in sight does who "
+        "does neither by it, nor anything else, is unknown; without ids they are of none",
     )
     graph: Out[SceneGraph] = Out(doc="all nodes and the relations that hold, with their scores")
     activities: Out[Activity] = Out(doc="what agents do, to what, since when, and their likeliest goal")
@@ -119,6 +119,9 @@ class SceneGraphBuilder(Operator):
         if "unknown classes" not in self.state.counts:
             things = [name for name in nodes.class_names if name not in SURFACES]
             self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, things)
+        if nodes.moving is not None:  # who drove may have stopped since; who stood still stands, as far as is known
+            moving = np.where(_in_sight(nodes), nodes.moving, np.minimum(nodes.moving, np.float32(0.5)))
+            nodes = nodes.replace(moving=moving)
         usable = _usable(nodes)
         bodies, unusable = self._bodies_of(nodes, usable), nodes.count - len(usable)
         fresh = postures is not None and nodes.stamp - postures.stamp <= self.fresh * 1e9
@@ -184,8 +187,7 @@ class SceneGraphBuilder(Operator):
     def _activities(self, nodes: SceneGraph, now: Snapshot, recognized: Activity | None) -> Activity:
         acts = list(now.acts)
         if recognized is not None and nodes.stamp - recognized.stamp <= self.fresh * 1e9:
-            seen = np.full(nodes.count, nodes.stamp) if nodes.last_seen is None else nodes.last_seen
-            shown = set(nodes.ids[nodes.stamp - seen <= _IN_SIGHT].tolist())
+            shown = set(nodes.ids[_in_sight(nodes)].tolist())
             acts = [_recognized(act, recognized, in_sight=act.agent in shown) for act in acts]
         names = tuple(dict.fromkeys([*ACTIVITIES, *(a.activity for a in acts)]))
         return Activity(
@@ -216,12 +218,19 @@ class SceneGraphBuilder(Operator):
         )
 
 
+def _in_sight(nodes: SceneGraph) -> NDArray[np.bool_]:
+    """Returns which nodes (N,) were seen just now."""
+    seen = np.full(nodes.count, nodes.stamp) if nodes.last_seen is None else nodes.last_seen
+    return np.asarray(nodes.stamp - seen <= _IN_SIGHT)
+
+
 def _postures_of(nodes: SceneGraph, postures: Classification) -> dict[int, tuple[str, float]]:
     """Returns what the joints of people show, and `unknown` for the nodes in sight of which none do."""
-    seen = np.full(nodes.count, nodes.stamp) if nodes.last_seen is None else nodes.last_seen
-    shown = dict.fromkeys(nodes.ids[nodes.stamp - seen <= _IN_SIGHT].tolist(), (UNKNOWN, 0.3))
-    ids = [] if postures.ids is None else postures.ids.tolist()
-    return shown | dict(zip(ids, zip(postures.labels(), postures.scores.tolist(), strict=True), strict=True))
+    shown = dict.fromkeys(nodes.ids[_in_sight(nodes)].tolist(), (UNKNOWN, 0.3))
+    if postures.ids is None:
+        return shown
+    told = zip(postures.labels(), postures.scores.tolist(), strict=True)
+    return shown | dict(zip(postures.ids.tolist(), told, strict=True))
 
 
 def _recognized(act: Act, recognized: Activity, *, in_sight: bool) -> Act:

@@ -101,7 +101,7 @@ class LayeredGraph(Remembered):
             if body.agent:
                 motion = self._motions.setdefault(body.id, Motion())
                 motion.add(time, body)
-                bodies[k] = replace(body, velocity=np.zeros(3) if body.moving <= 0.5 else motion.velocity())
+                bodies[k] = replace(body, velocity=np.zeros(3) if body.moving < 0.5 else motion.velocity())
         bodies = _with_room(bodies, T_world_robot)
         ids = {b.id for b in bodies}
         vanished = self._known - ids

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from operators.scene.map.cells import Cells
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.range_view import RangeView, Sight
+
+Array = NDArray[np.float64]
 
 _EVERY, _AGO, _LONG_AGO = 0.3, 0.6, 2.0  # seconds between the views kept, and how long ago the one to compare was
 _MOVED = 0.4  # share of a place that is seen through now, or was before, of what is seen of it
 _STEEP = 2.0  # of the probability by that share
+_UNSURE = 0.1  # of the probability, off 0.5: what is known fades to it before the place is left to its centre
 _SEEN = 0.2  # share of the voxels looked at that must show either, for a place to tell
 
 
 @dataclass(frozen=True, eq=False)
 class _Moment:
-    """One view, and the voxels that large movers had in it, by id."""
+    """One view, and the means (N, 3) of the voxels that large movers had in it, by id."""
 
     stamp: int
     view: RangeView
-    places: Mapping[int, Cells]
+    places: Mapping[int, Array]
 
 
 class RecentPlaces:
@@ -35,47 +39,58 @@ class RecentPlaces:
     through now, or much of the other was then.
     """
 
-    def __init__(self, side: float, margin: float) -> None:
-        """Takes the side of voxels, and the distance up to which a return may stray, metres."""
-        self._side, self._margin = side, margin
+    def __init__(self, margin: float) -> None:
+        """Takes the distance up to which a return may stray, metres."""
+        self._margin = margin
         self._moments: list[_Moment] = []
 
     def judge(self, stamp: int, movers: Sequence[MapObject], view: RangeView) -> None:
-        """Sets `moving` of the movers of this view; 0.5 where nothing shows it yet."""
+        """Sets `moving` of the movers of this view: 0.5 where that is hidden or nothing can be compared yet.
+
+        It is NaN where no view looks at the places, as of a thing of a few voxels: the centre is all that is known of
+        it. What is known before fades first.
+        """
         kept = [m for m in self._moments if 0 <= stamp - m.stamp <= _LONG_AGO * 1e9]
         before = next((m for m in reversed(kept) if stamp - m.stamp >= _AGO * 1e9), None)
         for each in movers:
             told = 0.5 if before is None else _moved(each, before, view, self._margin)
+            if math.isnan(told) and abs(each.moving - 0.5) > _UNSURE:
+                told = 0.5
             each.moving = told if not each.moving >= 0 else (each.moving + told) / 2
         self._moments = [m for m in kept if before is None or m.stamp >= before.stamp]
         if movers and (not kept or stamp - kept[-1].stamp >= _EVERY * 1e9):
-            self._moments.append(_Moment(stamp, view, {o.id: o.cells for o in movers}))
+            self._moments.append(_Moment(stamp, view, {o.id: o.cells.points for o in movers}))
 
     def snapshot(self) -> list[Any]:
-        return [
-            [m.stamp, m.view.snapshot(), [[i, cells.snapshot()] for i, cells in m.places.items()]]
-            for m in self._moments
-        ]
+        return [[m.stamp, m.view.snapshot(), [[i, points] for i, points in m.places.items()]] for m in self._moments]
 
     def restore(self, state: Iterable[Any]) -> None:
         self._moments = []
         for stamp, view, places in state:
-            cells = {int(i): Cells(self._side) for i, _ in places}
-            for i, each in places:
-                cells[int(i)].restore(each)
-            self._moments.append(_Moment(int(stamp), RangeView.restored(view), cells))
+            points = {int(i): np.array(each, np.float64) for i, each in places}
+            self._moments.append(_Moment(int(stamp), RangeView.restored(view), points))
 
 
 def _moved(object: MapObject, before: _Moment, view: RangeView, margin: float) -> float:
-    """Returns the probability that an object has moved since a moment; 0.5 where neither view shows its places."""
+    """Returns the probability that an object has moved since a moment.
+
+    0.5 where its places are hidden in the views, NaN where neither looks at them.
+    """
     sights = [before.view.of(object.cells.points, margin)]
     if object.id in before.places:
-        sights.append(view.of(before.places[object.id].points, margin))
+        sights.append(view.of(before.places[object.id], margin))
     shares = [share for share in map(_seen_through, sights) if share is not None]
-    return min(max(0.5 + _STEEP * (max(shares) - _MOVED), 0.02), 0.98) if shares else 0.5
+    if not shares:
+        return 0.5 if any(np.count_nonzero(sight.looked) >= _least(sight) for sight in sights) else math.nan
+    return min(max(0.5 + _STEEP * (max(shares) - _MOVED), 0.02), 0.98)
 
 
 def _seen_through(sight: Sight) -> float | None:
     """Returns the share of a place that is seen through, of what is seen of it; None where too little is."""
     free, taken = int(np.count_nonzero(sight.free)), int(np.count_nonzero(sight.confirmed))
-    return None if free + taken < max(5.0, _SEEN * len(sight.looked)) else free / (free + taken)
+    return None if free + taken < _least(sight) else free / (free + taken)
+
+
+def _least(sight: Sight) -> float:
+    """Returns how many voxels must be seen for a place to tell."""
+    return max(5.0, _SEEN * len(sight.looked))

@@ -59,7 +59,7 @@ class ObjectMap:
         self._next = 1
         self._stamp: int | None = None
         self._room, self._updates = RoomHeading(), 0
-        self._recent = RecentPlaces(settings.voxel, settings.margin)
+        self._recent = RecentPlaces(settings.margin)
         self._heading: float | None = None
         self.floor: float | None = None
         """Height of the floor, where it is known: what stands on it reaches down to it."""

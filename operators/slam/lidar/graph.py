@@ -127,12 +127,11 @@ class LidarGraph(PlaceGraph[LidarView]):
         likeness = self._index.likeness(view)
         others = [k for k in self._old(number) if np.linalg.norm((self.nodes[k].T - T)[:3, 3]) > ASIDE]
         chosen = sorted(others, key=lambda k: -likeness[k])[:RIVALS]
-        sights = self._sights(number, chosen, eyes, False, Added())
-        return any(
-            isinstance(seen, LidarSight)
+        return any(  # each look takes most of a second: the first rival ends them
+            isinstance(seen := eyes.sight(self.nodes, k, number, False), LidarSight)
             and seen.registered.score > least
             and apart(T, self.nodes[k].T @ seen.T_known_seen)
-            for k, seen in sights
+            for k in chosen
         )
 
 

@@ -12,11 +12,13 @@ from made_boards import Array, Lens, picture, pose, texture, turned
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from dataflow.api.recordings import open as opened
 from dataflow.messages import CameraInfo, CompressedImage, Image, Imu
 from dataflow.recording import RecordingWriter
 from dataflow.testing import play
 from operators.calibration.boards import Board, Charuco, Chessboard
 from operators.calibration.commands import calibrate
+from operators.calibration.recorded import spaced_pairs
 from operators.geometry.calibration_files import camera_text
 from operators.sources import ImageFolder, StaticTransforms
 
@@ -107,6 +109,27 @@ def test_a_pair_is_found_and_its_files_are_taken_by_sources(pair: Path, tmp_path
         "left.yaml", "left.png", "right.yaml", "right.png", "stereo.yaml",
     }  # fmt: skip
     assert "baseline" in run(f"stereo {pair} {CHARUCO} --model equidistant --every 0 --out {tmp_path} --overwrite")
+
+
+def test_pairs_are_spaced_together_when_one_camera_begins_later_and_loses_an_image(tmp_path: Path) -> None:
+    pixels, period, names = np.zeros((1, 1), np.uint8), 10**9 // 30, ("left", "right")
+    with RecordingWriter(tmp_path / "pair.mcap", metadata={}) as writer:
+        for name in names:
+            writer.add_stream(name, Image)
+        for k in range(300):
+            if k != 40:
+                writer.write("left", Image(stamp=k * period, frame="left", data=pixels), seq=k)
+            if k >= 3:
+                writer.write("right", Image(stamp=k * period + MS // 5, frame="right", data=pixels), seq=k)
+    with opened(tmp_path / "pair.mcap") as streams:
+        left, right = (streams[name] for name in names)
+        places = spaced_pairs(left, right, 0.25, 5 * MS)
+        apart = right.stamps[places[1]] - left.stamps[places[0]]
+        with pytest.raises(ValueError, match=r"no image of left lies within 0.1 ms of one of right: --tolerance takes"):
+            spaced_pairs(left, right, 0.25, MS // 10)
+
+    assert len(apart) == 38
+    assert (apart == MS // 5).all()
 
 
 @pytest.mark.long

@@ -95,3 +95,14 @@ def test_poor_figures_are_named() -> None:
         "the offset is known to ±4.0 ms only",
         "the IMU has 20 samples a second",
     ]
+
+
+def test_a_camera_without_distortion_turns_as_one_with_it() -> None:
+    lens, rng = Lens(bend=(0.0,) * 5), np.random.default_rng(2)
+    plain = CameraInfo(stamp=0, frame="camera", width=480, height=360, K=lens.K)
+    times = np.arange(0, 1, 0.05)
+    seen = [view(BOARD, lens, pose(BOARD, facing(t), (0.02, 0, 0.6)), rng, round(t * 1e9)) for t in times]
+    found = turning_of(BOARD, seen, plain, 0)
+
+    turned = [facing(a) @ facing(b).T for a, b in zip(found.begins, found.ends, strict=True)]
+    assert found.turns == pytest.approx(Rotation.from_matrix(turned).as_rotvec(), abs=0.01)

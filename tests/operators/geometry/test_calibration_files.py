@@ -118,6 +118,7 @@ ROW = "  - {frame: a, child_frame: b, translation: [0, 0, 0], rotation: [0, 0, 0
     [
         ("other: 1", "holds no transforms"),
         ("transforms:\n" + ROW.replace("rotation", "turn"), "a transform is wrong"),
+        ("transforms: 5", "holds no transforms: expected `transforms:` with a list"),
         ("transforms:\n" + ROW + ROW, "'b' occurs more than once"),
         (
             "transforms:\n" + ROW + ROW.replace("a,", "b,").replace("child_frame: b", "child_frame: a"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,9 +24,10 @@ need = pytest.mark.skipif(not importlib.util.find_spec("pyrealsense2"), reason="
 class Made:
     """A camera with a colour and a depth sensor."""
 
-    def __init__(self) -> None:
+    def __init__(self, serial: str = "12") -> None:
         self.rs = rs = realsense._library()
         self.device = rs.software_device()
+        self.device.register_info(rs.camera_info.serial_number, serial)
         self.depth_sensor, self.color_sensor = self.device.add_sensor("Stereo"), self.device.add_sensor("RGB")
         self.depth = self.depth_sensor.add_video_stream(self._mode(rs.stream.depth, 1, rs.format.z16, 2, 0.0))
         self.color = self.color_sensor.add_video_stream(self._mode(rs.stream.color, 2, rs.format.rgb8, 3, 0.1))
@@ -64,11 +66,9 @@ class Camera(RealSense):
 
     made: list[Made | None]
 
-    def _device(self) -> Any:
+    def _devices(self) -> list[Any]:
         found = self.made.pop(0)
-        if found is None:
-            raise SourceError("none")
-        return found.device
+        return [] if found is None else [found.device]
 
 
 def camera(*made: Made | None, **params: int) -> Camera:
@@ -142,7 +142,7 @@ def test_a_camera_that_is_unplugged_goes_on_when_it_is_back(
     monkeypatch.setattr(realsense, "SILENCE", -1.0)
     monkeypatch.setattr(realsense, "POLL", 1)
     first, second = Made(), Made()
-    source = camera(first, None, second)
+    source = camera(first, None, Made("another"), second)
     pauses: list[float] = []
     source.setup()
 
@@ -155,6 +155,7 @@ def test_a_camera_that_is_unplugged_goes_on_when_it_is_back(
 
     def opened() -> None:
         began()
+        monkeypatch.setattr(realsense, "SILENCE", 60.0)
         for depth in (True, False):
             second.send(9, depth=depth)
 
@@ -164,11 +165,55 @@ def test_a_camera_that_is_unplugged_goes_on_when_it_is_back(
 
     assert isinstance(step["image"], Image)
     assert (step["image"].data == 9).all()
-    assert pauses == [0.1, 0.2]
+    assert pauses == [0.1, 0.2, 0.4]
     assert source.summary()["unplugged"] == 1
     assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == [
-        "the RealSense camera gives no image any more: it is looked for"
+        "the RealSense camera gives no pair of images any more: it is looked for"
     ]
+
+
+@need
+def test_a_camera_whose_colour_stops_is_looked_for_and_its_depth_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Made()
+    source = camera(made, Made())
+    source.setup()
+    for number in range(50):
+        made.send(number, depth=True)
+    steps = source.stream()
+    looks: list[int] = []
+
+    def look() -> None:
+        looks.append(max(map(len, source._waiting)))
+        source.stop_reading()
+
+    monkeypatch.setattr(source, "_look_for_it", look)
+    now = iter(range(100))
+    monkeypatch.setattr("operators.sources.realsense.time.monotonic", lambda: next(now))
+    monkeypatch.setattr(realsense, "SILENCE", 30.0)
+    assert not list(steps)
+    source.close()
+
+    assert looks == [realsense.WAITING]
+    assert source.summary()["without_partner"] == 31 - realsense.WAITING
+
+
+@need
+@pytest.mark.parametrize("call", ["get_info", "query_sensors", "open", "start"])
+def test_a_camera_that_is_unplugged_while_it_is_opened_is_looked_for_again(
+    call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, device, sensor = camera(), Mock(), Mock()
+    device.get_info.return_value, device.query_sensors.return_value = "12", [sensor]
+    sensor.stop.side_effect = RuntimeError("it is not streaming")
+    getattr(device if hasattr(type(Made().device), call) else sensor, call).side_effect = RuntimeError("no such device")
+    source._rs = realsense._library()
+    monkeypatch.setattr(source, "_devices", lambda: [device])
+    monkeypatch.setattr(source, "_profile", lambda *_: (sensor, Mock()))
+    with pytest.raises(SourceError, match="does not start: no such device"):
+        source._open()
+
+    assert sensor.close.called == (call == "start")
+    assert source._sensors == ()
 
 
 @need

@@ -14,7 +14,7 @@ import pytest
 from dataflow.messages import PointCloud
 from dataflow.operator import SourceError
 from dataflow.testing import play
-from operators.sources import VelodyneFile, VelodyneLidar
+from operators.sources import VelodyneFile, VelodyneLidar, ports
 
 START = 1_700_000_000
 """Seconds, 800 s after a full hour."""
@@ -125,20 +125,25 @@ def test_a_lidar_over_udp_is_read_and_its_silence_drops_the_turn(caplog: pytest.
         clouds = [step["cloud"] for step in source.stream()]
 
     assert [cloud.stamp // 10**9 - START for cloud in clouds] == [0, 60, 60, 60]
-    assert all(np.ptp(cloud.time_offsets) < 0.11 for cloud in clouds)  # type: ignore[union-attr]
+    assert all(np.ptp(cloud.time_offsets) < 0.11 for cloud in clouds)  # type: ignore[attr-defined]
     assert source.summary()["unplugged"] == 1
     assert [r.getMessage() for r in caplog.records] == [
         "no packets from the LiDAR at udp://127.0.0.1:2368: it is waited for"
     ]
 
 
-@need
-def test_datagrams_of_loopback_become_clouds() -> None:
+def over_loopback() -> tuple[VelodyneLidar, int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     source = VelodyneLidar(input=f"udp://127.0.0.1:{port}")
     source.setup()
+    return source, port
+
+
+@need
+def test_datagrams_of_loopback_become_clouds() -> None:
+    source, port = over_loopback()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for k in range(90):
             sender.sendto(packet(k), ("127.0.0.1", port))
@@ -148,6 +153,26 @@ def test_datagrams_of_loopback_become_clouds() -> None:
 
     assert isinstance(cloud, PointCloud)
     assert np.linalg.norm(cloud.points, axis=1) == pytest.approx(WALL, abs=0.02)
+
+
+@need
+@pytest.mark.parametrize("buffer", [ports.BUFFER, 0])
+def test_packets_wait_for_a_late_graph_and_those_without_room_are_counted(
+    buffer: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ports, "BUFFER", buffer)
+    source, port = over_loopback()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for k in range(150):
+            sender.sendto(packet(k), ("127.0.0.1", port))
+    kept = 0
+    while ports.read_port(source._port)[0] is not None:
+        kept += 1
+    lost = source.summary()["lost_datagrams"]
+    source.close()
+
+    assert kept == 150 if buffer else 0 < kept < 150
+    assert lost == source.summary()["lost_datagrams"] == 150 - kept
 
 
 def test_without_the_package_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,15 +151,17 @@ def test_a_camera_that_is_unplugged_goes_on_when_it_is_back(monkeypatch: pytest.
 
 
 def test_images_go_on_when_the_clock_was_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = webcam(monkeypatch, Camera([picture(0), *(picture(10) for _ in range(4))]))
+    source = webcam(monkeypatch, Camera([picture(0), *(picture(10) for _ in range(5))]))
     source.setup()
     hour = 3600 * 1_000_000_000
-    clock = iter([2 * hour, 2 * hour - 5, hour, hour + 5])
+    less = hour - 200_000_000
+    clock = iter([2 * hour, 2 * hour - 5, hour, hour + 5, less])
     monkeypatch.setattr(time, "time_ns", lambda: next(clock))
 
-    stamps = [step["image"].stamp for step in islice(source.stream(), 3)]
+    stamps = [step["image"].stamp for step in islice(source.stream(), 4)]
 
-    assert stamps == [2 * hour, hour, hour + 5]
+    assert stamps == [2 * hour, hour, hour + 5, less]
+    assert source.summary()["past"] == 1
 
 
 def test_a_camera_that_comes_back_with_another_size_ends_the_source(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -159,10 +159,10 @@ class Smooth(Revised, Operator, every="25ms"):
         return value(context.stamp, self.state, self.calls, float(context.tick), self.revision)
 
     def snapshot(self) -> Any:
-        return {"state": self.state, "calls": self.calls}
+        return {"state": self.state, "calls": self.calls, "revision": self.revision}
 
     def restore(self, state: Any) -> None:
-        if self.revision == REFUSES:
+        if REFUSES == self.revision != state["revision"]:
             raise ValueError("a state of another kind")
         self.state, self.calls = state["state"], state["calls"]
 

@@ -92,7 +92,7 @@ def leave_files(path: Path) -> None:
     with Recording(path) as recording:
         log = FiringLog.read(recording)
         for name in log.operators:
-            for record in log.of(name):
+            for record in sorted(log.of(name), key=lambda r: r.incarnation):
                 for digest in (code_in(record) or {}).values():
                     last[name] = revisions.get(digest, 0)
     Files.last = last

@@ -65,7 +65,8 @@ def test_hidden_or_unsure_joints_tell_nothing() -> None:
     assert found.ids is not None
     assert found.ids.tolist() == [31]
     assert not operator.process(message(whole, scores=0.3)).labels()
-    assert operator.summary() == {"persons": 3, "without a posture": 2}
+    assert operator.process(message(whole).replace(ids=None)).ids is None
+    assert operator.summary() == {"persons": 4, "without a posture": 2}
 
 
 def test_other_names_are_refused() -> None:

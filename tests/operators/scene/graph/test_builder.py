@@ -17,6 +17,7 @@ from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import Played, play
 from operators.scene import SceneGraphBuilder
 from operators.scene.bodies import Body, footprint_share, gap
+from operators.scene.graph.layers import GraphSettings, LayeredGraph
 from operators.scene.relations import Hysteresis
 
 Builder = partial(SceneGraphBuilder, labels="simulator")
@@ -361,6 +362,45 @@ def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves() -> None:
         assert graph.moving[graph.names().index("car 2")] == np.float32(sure)
         acts[sure] = act.class_names[act.class_ids[0]]
     assert acts == {0.05: "resting", 0.5: "unknown", 0.95: "driving"}
+
+
+@pytest.mark.parametrize(("moving", "ago", "said"), [(0.98, 1, "driving"), (0.98, 2, "unknown"), (0.02, 2, "resting")])
+def test_a_vehicle_out_of_sight_may_have_stopped(moving: float, ago: float, said: str) -> None:
+    nodes = [
+        room(k, [(2, "car", (8, 3, 0.7), (4, 1.8, 1.5)), TABLE]).replace(
+            moving=np.array([moving, np.nan], np.float32),
+            last_seen=np.array([(k + 1) * STEP - round(ago * 1e9)] * 2),
+        )
+        for k in range(4)
+    ]
+    played = play(SceneGraphBuilder(), {"nodes": nodes})
+    graph, act = played["graph"][-1], played["activities"][-1]
+    assert isinstance(graph, SceneGraph)
+    assert isinstance(act, Activity)
+    assert act.class_names[act.class_ids[0]] == said
+    assert graph.moving is not None
+    unsure = said == "unknown"
+    assert graph.moving[graph.names().index("car 2")] == np.float32(0.5 if unsure else moving)
+
+
+@pytest.mark.parametrize(("moving", "speed"), [(0.05, 0.0), (0.5, 10.0), (np.nan, 10.0), (0.95, 10.0)])
+def test_an_agent_has_the_velocity_of_its_centre_unless_it_is_known_to_stand(moving: float, speed: float) -> None:
+    graph = LayeredGraph(GraphSettings())
+    for k in range(8):
+        center, size = np.array([40 + 2.0 * k, 3, 0.7]), np.array([4, 1.8, 1.5])
+        car = Body(2, "car", center, size, 0.0, np.zeros(3), frozenset({"agent"}), moving)
+        now = graph.update(k * STEP, [car], None)
+    velocity = next(b.velocity for b in now.bodies if b.id == 2)
+    np.testing.assert_allclose(velocity, [speed, 0, 0], atol=1e-9)
+
+
+def test_postures_without_ids_are_of_no_node() -> None:
+    sitting = Classification(
+        stamp=STEP, class_names=("sitting",), class_ids=np.array([0], np.int32), scores=np.array([0.9], np.float32)
+    )
+    act = play(Builder(), {"nodes": [room(0, [person(4, 2, id=1)])], "postures": [sitting]})["activities"][0]
+    assert isinstance(act, Activity)
+    assert act.class_names[act.class_ids[0]] == "unknown"
 
 
 def test_joints_say_who_sits_and_without_them_nobody_is_said_to_stand() -> None:

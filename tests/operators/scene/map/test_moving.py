@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dataflow.execution.snapshots import pack_state, unpack_state
 from operators.scene.map.cells import Cells
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.moving import RecentPlaces
@@ -37,16 +39,18 @@ def scanned(blocks: Sequence[Block], eye: Array) -> tuple[Array, NDArray[np.int6
     return eye + ways[there] * best[there, None], of[there]
 
 
-def judged(place: Callable[[float], Block], speed: float, ahead: float, again: int | None = None) -> MapObject:
+def judged(
+    place: Callable[[float], Block], speed: float, ahead: float, again: int | None = None, house: Block = HOUSE
+) -> MapObject:
     """Returns a vehicle as it is after two seconds, scanned ten times a second from a car that drives at a speed.
 
     Only what lies `ahead` of the scanner by its x is seen of it, as in a camera's image. `again`: the scan at which a
     snapshot takes the place of what was kept.
     """
-    recent, vehicle = RecentPlaces(SIDE, 0.1), None
+    recent, vehicle = RecentPlaces(0.1), None
     for k in range(21):
         eye = np.array([speed * k / 10, 0.0, 1.7])
-        points, of = scanned([HOUSE, place(k / 10)], eye)
+        points, of = scanned([house, place(k / 10)], eye)
         view = RangeView(points - eye, np.block([[np.eye(3), eye[:, None]], [np.zeros(3), 1.0]]), 0.012)
         cells = Cells.of(points[(of == 1) & (points[:, 0] > eye[0] + ahead)], SIDE)
         if vehicle is None:
@@ -54,7 +58,7 @@ def judged(place: Callable[[float], Block], speed: float, ahead: float, again: i
         vehicle.cells, vehicle.center = cells, cells.middle
         recent.judge(k * TENTH, [vehicle], view)
         if k == again:
-            kept, recent = recent.snapshot(), RecentPlaces(SIDE, 0.1)
+            kept, recent = recent.snapshot(), RecentPlaces(0.1)
             recent.restore(kept)
     assert vehicle is not None
     return vehicle
@@ -89,6 +93,52 @@ def test_nothing_tells_of_the_first_view_and_a_restored_memory_goes_on_the_same(
     points, of = scanned([HOUSE, beside(8)], eye)
     vehicle = MapObject(7, Cells.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
     assert np.isnan(vehicle.moving)
-    RecentPlaces(SIDE, 0.1).judge(0, [vehicle], RangeView(points - eye, np.eye(4), 0.012))
+    RecentPlaces(0.1).judge(0, [vehicle], RangeView(points - eye, np.eye(4), 0.012))
     assert vehicle.moving == 0.5
     assert judged(lambda t: beside(8 + t), 2.0, 0).moving == judged(lambda t: beside(8 + t), 2.0, 0, again=9).moving
+
+
+def test_voxels_that_are_added_later_are_of_no_moment_before() -> None:
+    eye = np.array([0.0, 0.0, 1.7])
+    points, of = scanned([HOUSE, beside(8)], eye)
+    vehicle = MapObject(7, Cells.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
+    recent = RecentPlaces(0.1)
+    view = RangeView(points - eye, np.block([[np.eye(3), eye[:, None]], [np.zeros(3), 1.0]]), 0.012)
+    recent.judge(0, [vehicle], view)
+    restored = RecentPlaces(0.1)
+    restored.restore(unpack_state(pack_state(recent.snapshot())))
+    vehicle.cells.add(Cells.of(points[of == 1] - [0, 6, 0], SIDE))
+    vehicle.cells = Cells.of(points[of == 1], SIDE)
+    again = replace(vehicle)
+    recent.judge(6 * TENTH, [vehicle], view)
+    restored.judge(6 * TENTH, [again], view)
+    assert vehicle.moving == again.moving
+
+
+def test_the_places_of_a_car_of_a_few_voxels_say_nothing_and_its_centre_counts() -> None:
+    far = ((200, 0, 10), (1, 400, 30))
+    car = judged(lambda t: ((90 + 10 * t, 3, 1), (4.5, 1.8, 1.5)), 0, 0, house=far)
+    assert 0 < len(car.cells) < 5
+    assert np.isnan(car.moving)
+
+
+def test_what_is_known_of_a_car_outlasts_a_view_that_says_nothing() -> None:
+    recent, car = RecentPlaces(0.1), MapObject(7, Cells.of(np.array([[8.0, 3, 1]]), SIDE), np.array([1.0]), 1.0, 0, 0)
+    empty = RangeView(np.zeros((0, 3)), np.eye(4), 0.012)
+    recent.judge(0, [car], empty)
+    car.moving = 0.04
+    kept = [recent.judge((6 + k) * TENTH, [car], empty) or car.moving for k in range(5)]
+    assert kept[:2] == [0.27, 0.385]
+    assert np.isnan(kept[-1])
+
+
+def test_whether_a_car_that_was_hidden_moves_is_open() -> None:
+    eye, T = np.array([0.0, 0.0, 1.7]), np.block([[np.eye(3), np.array([[0.0], [0.0], [1.7]])], [np.zeros(3), 1.0]])
+    wall: Block = ((8, 2, 1.5), (0.5, 6, 3))
+    before, _ = scanned([HOUSE, beside(20), wall], eye)
+    now, of = scanned([HOUSE, beside(20)], eye)
+    car, other = (MapObject(i, Cells.of(now[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0) for i in (7, 8))
+    recent = RecentPlaces(0.1)
+    recent.judge(0, [other], RangeView(before - eye, T, 0.012))
+    recent.judge(6 * TENTH, [car], RangeView(now - eye, T, 0.012))
+    assert car.moving == 0.5

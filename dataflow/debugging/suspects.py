@@ -1,0 +1,170 @@
+"""Lines that can have made a call other than recorded: those that differ from the recorded code, and that ran in it."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+import traceback
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import FrameType
+
+from dataflow.debugging.debugger import Debugger
+from dataflow.debugging.fired import Call, Fired
+from dataflow.debugging.lines import Lines, homes_of, is_own
+from dataflow.execution.failure import OperatorFailure
+from dataflow.graph.code import ReloadError, code_now, digest_of, other_texts, text_of
+from dataflow.graph.model import OperatorImportError
+from dataflow.recording import Recording
+from dataflow.records.cuts import code_in
+from dataflow.records.reading import FiringLog
+from dataflow.reexecution.recorded_run import ReplayError
+
+BEFORE = 8
+"""Calls in front of the one that is looked at, in which its lines are looked for."""
+MOST_TRIED = 32
+"""Changes that are undone, one at a time."""
+
+Place = tuple[str, int]
+"""A file, and the number of a line in it."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """Lines `first` to `last` of a file, which hold `here` and held `recorded`; `last` is before `first` where lines
+    are missing in front of `first`. `ran`: one of them ran in the call. `mends`: without this change alone the call
+    gives what was recorded; None where it was not tried, or cannot be without it."""
+
+    module: str
+    file: str
+    first: int
+    last: int
+    here: str
+    recorded: str
+    ran: bool
+    mends: bool | None = None
+
+
+@dataclass(frozen=True)
+class Suspects:
+    """Holds what can have made a call other than recorded. `raised`: where its error was raised, the innermost line of the
+    operator's source. `modules`: of each one that differs, where its recorded text was found; None where it was not.
+    `changes`: those that mend the call first, then those that ran. `ran`: the lines that ran in the call, and in
+    none of the `BEFORE` calls before it: `alone`."""
+
+    number: int
+    same: bool
+    raised: Place | None
+    modules: Mapping[str, str | None]
+    changes: tuple[Change, ...]
+    ran: frozenset[Place]
+    alone: frozenset[Place]
+
+
+def suspects(recording: Recording, debugger: Debugger, number: int) -> Suspects:
+    """Makes a call, and those before it, by the line, then the call again without each change of the code since it was
+    recorded. Raises as `Debugger.goto` does."""
+    homes = homes_of(debugger.node.operator.__module__)
+    ran: list[frozenset[Place]] = []
+    for each in range(max(0, number - BEFORE), number + 1):
+        places = set[Place]()
+
+        def at_line(frame: FrameType, _: int, places: set[Place] = places) -> None:
+            places.add((frame.f_code.co_filename, frame.f_lineno))
+
+        fired = debugger.goto(each, Lines(at_line, homes).through, touched=lambda: False)
+        ran.append(frozenset(places))
+    modules, texts, changes = _changes(recording, debugger, fired.call, ran[-1])
+    tried = [
+        replace(change, mends=_mends(recording, debugger, fired, undone) if k < MOST_TRIED else None)
+        for k, (change, undone) in enumerate(_undone(changes, texts))
+    ]
+    return Suspects(
+        number=fired.number,
+        same=fired.same,
+        raised=_raised(fired, homes),
+        modules=modules,
+        changes=tuple(sorted(tried, key=lambda c: (not c.mends, not c.ran))),
+        ran=ran[-1],
+        alone=ran[-1].difference(*ran[:-1]),
+    )
+
+
+def ranges(places: Iterable[Place]) -> dict[str, list[list[int]]]:
+    """Returns places as the first and last lines of what follows one another, by file."""
+    found: dict[str, list[list[int]]] = {}
+    for file, line in sorted(places):
+        spans = found.setdefault(file, [])
+        if spans and spans[-1][1] + 1 == line:
+            spans[-1][1] = line
+        else:
+            spans.append([line, line])
+    return found
+
+
+def _changes(
+    recording: Recording, debugger: Debugger, call: Call, ran: frozenset[Place]
+) -> tuple[dict[str, str | None], dict[str, list[str]], list[Change]]:
+    """Returns where the recorded text of each module that differs was found, the lines here, and what differs."""
+    then = _recorded_code(recording, debugger.node.name, call)
+    modules: dict[str, str | None] = {}
+    texts: dict[str, list[str]] = {}
+    changes: list[Change] = []
+    for name, text in code_now(debugger.node.operator, then).texts.items():
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if file is None or name not in then or then[name] == digest_of(text):
+            continue
+        found = text_of(then[name], Path(file))
+        modules[name] = None if found is None else found[1]
+        if found is not None:
+            texts[name] = text.decode().splitlines(keepends=True)
+            changes += _differing(name, file, found[0].decode().splitlines(keepends=True), texts[name], ran)
+    return modules, texts, changes
+
+
+def _recorded_code(recording: Recording, operator: str, call: Call) -> Mapping[str, str]:
+    """Returns the digests of the code that made a call, by module."""
+    found: Mapping[str, str] = {}
+    for record in FiringLog.read(recording).records(operator):
+        if (record.incarnation, record.index) > (call.incarnation, call.record):
+            break
+        found = code_in(record) or found
+    return found
+
+
+def _differing(name: str, file: str, then: list[str], here: list[str], ran: frozenset[Place]) -> Iterator[Change]:
+    for tag, i, j, first, last in difflib.SequenceMatcher(None, then, here, autojunk=False).get_opcodes():
+        if tag != "equal":
+            lines = range(first + 1, last + 1)
+            touched = any((file, line) in ran for line in lines)
+            yield Change(name, file, first + 1, last, "".join(here[first:last]), "".join(then[i:j]), touched)
+
+
+def _undone(changes: list[Change], texts: Mapping[str, list[str]]) -> Iterator[tuple[Change, dict[str, bytes]]]:
+    """Yields each change, those that ran first, with the text of its module without it."""
+    for change in sorted(changes, key=lambda each: not each.ran):
+        lines = texts[change.module]
+        kept = "".join([*lines[: change.first - 1], change.recorded, *lines[change.last :]])
+        yield change, {change.module: kept.encode()}
+
+
+def _mends(recording: Recording, debugger: Debugger, fired: Fired, texts: Mapping[str, bytes]) -> bool | None:
+    """Returns whether the call gives what was recorded with other texts of modules."""
+    try:
+        with (
+            other_texts(debugger.node, texts),
+            closing(Debugger(recording, debugger.node.name, debugger.graph)) as again,
+        ):
+            return again.goto(fired.number).same
+    except (ReloadError, OperatorImportError, ReplayError, OperatorFailure):  # it cannot be made with them
+        return None
+
+
+def _raised(fired: Fired, homes: tuple[Path, ...]) -> Place | None:
+    if fired.raised is None:
+        return None
+    frames = traceback.extract_tb(fired.raised.__traceback__)
+    own = [(f.filename, f.lineno) for f in frames if f.lineno is not None and is_own(f.filename, homes)]
+    return own[-1] if own else None
