@@ -186,11 +186,12 @@ class _Alone:
             books = Books(log, played)
             told = [each for each in played.nodes if accountable(recording, played, books, each)]
             incomplete = incomplete_streams(recording, played, books, told)
-            chosen = with_makers(recording.streams.keys() - incomplete, played, {name})
+            held = recording.streams.keys() - incomplete
+            chosen = with_makers(held, played, {name})
             self.changed = () if graph is None else _changes(graph_as_recorded(recording), graph, name)
         self.recorded = path.stat().st_mtime
         self._operators = tuple(each for each in played.nodes if each in chosen)
-        self._env, self._threads = env_of(played, self._operators), played.threads
+        self._env, self._threads = env_of(played, self._operators, held), played.threads
         at = 0 if found.first is None else found.first.index
         far = found.first is not None and at > FROM_THE_START
         self._request = {

@@ -10,6 +10,7 @@ import json
 import os
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distributions, version
@@ -26,6 +27,13 @@ _PROBE = (
     "print(json.dumps([sys.version_info[:2], own, engine and engine.origin]))"
 )
 _PROBE_WITHIN = 20.0
+_LIBRARIES = {sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")}
+_STANDARD = {
+    *_LIBRARIES,
+    *(os.path.join(path, "lib-dynload") for path in _LIBRARIES),
+    *(path for path in sys.path if os.path.basename(path) == f"python{sys.version_info[0]}{sys.version_info[1]}.zip"),
+}
+"""The folders of the standard library of this installation."""
 _ENGINE = str(Path(__file__).resolve().parent.parent / "__init__.py")
 
 
@@ -42,10 +50,12 @@ class Environment:
     path: tuple[str, ...]
 
     def variables(self, common: Mapping[str, str]) -> dict[str, str]:
-        """Returns the variables of a process in it; `common` are those of one in this installation."""
+        """Returns the variables of a process in it; `common` are those of one in this installation, whose standard
+        library stays out: the environment may be of another build of Python."""
+        here = [path for path in common["PYTHONPATH"].split(os.pathsep) if path not in _STANDARD]
         return {
             **common,
-            "PYTHONPATH": os.pathsep.join((*self.path, common["PYTHONPATH"], *_editable())),
+            "PYTHONPATH": os.pathsep.join((*self.path, *here, *_editable())),
             _MARK: os.pathsep.join((str(self.folder), *self.path)),
         }
 

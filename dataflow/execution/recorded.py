@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dataflow.environments import imported_packages, installed
+from dataflow.environments import imported_packages, installed, require_environment
 from dataflow.execution.align import align_spec
 from dataflow.execution.calls import Calls
 from dataflow.execution.effects.journal import RecordedJournal
@@ -324,6 +324,8 @@ class RecordedRunner(Runner):
 
 
 def _with_code(node: Node, digests: Mapping[str, str] | None) -> tuple[Operator, bool]:
-    """A new operator, of the code with these digests where a reload has stored it, and whether it is of that."""
+    """A new operator, of the code with these digests where a reload has stored it, and whether it is of that. Raises
+    `EnvError` in a process of another environment."""
+    require_environment(node.name, node.env)
     found = None if digests is None else stored_operator(node, digests)
     return (node.operator if found is None else found)(**node.params), found is not None

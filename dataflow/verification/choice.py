@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 
+from dataflow.environments import EnvError, environment_of
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.layout import CUT, OUTCOME
@@ -58,29 +60,54 @@ def with_makers(held: Collection[str], graph: Graph, chosen: set[str]) -> set[st
     return wanted
 
 
+def without_environments(graph: Graph) -> tuple[Graph, dict[str, str]]:
+    """Returns the graph, in which operators are external whose environment is not here, and why it is not, by operator.
+
+    Raises `EnvError` where no other operator is left to repeat.
+    """
+    able = {name: node.env for name, node in graph.nodes.items() if not (node.source or node.external)}
+    why: dict[str | None, str] = {}
+    for env in dict.fromkeys(able.values()):
+        try:
+            if env is not None:
+                environment_of(env)
+        except EnvError as error:
+            why[env] = str(error)
+    absent = {name: why[env] for name, env in able.items() if env in why}
+    if absent.keys() >= able.keys() and absent:
+        raise EnvError(next(iter(absent.values())))
+    nodes = {name: replace(node, external=name in absent or node.external) for name, node in graph.nodes.items()}
+    return replace(graph, nodes=nodes), absent
+
+
 def unfed_operators(
     recording: Recording, graph: Graph, operators: Collection[str], incomplete: Collection[str]
 ) -> dict[str, str]:
     """The operators whose inputs are not in the recording and cannot be made again, with the stream that is missing."""
-    found: dict[str, str] = {}
+    held, found = recording.streams.keys() - set(incomplete), dict[str, str]()
     for name in operators:
         try:
-            plan_feeding(recording, graph, [name], incomplete=incomplete)
+            makers = plan_feeding(recording, graph, [name], incomplete=incomplete).operators
+            env_of(graph, makers, held)
         except NotRecorded as error:
             found[name] = error.stream
     return found
 
 
-def env_of(graph: Graph, operators: Iterable[str]) -> str | None:
-    """Returns the environment of operators that one process repeats. Raises `ReplayError` where they have several."""
+def env_of(graph: Graph, operators: Iterable[str], held: Collection[str]) -> str | None:
+    """Returns the environment of operators that one process repeats. Raises `NotRecorded` where they have several, with
+    the stream between two of them that is not `held`."""
     found = {name: graph.nodes[name].env for name in operators}
     if len({*found.values()}) < 2:
         return next(iter(found.values()), None)
     for edge in graph.edges():
-        if found.keys() >= {edge.consumer, edge.producer} and found[edge.consumer] != found[edge.producer]:
-            raise ReplayError(
+        if edge.stream in held or not found.keys() >= {edge.consumer, edge.producer}:
+            continue
+        if found[edge.consumer] != found[edge.producer]:
+            raise NotRecorded(
                 f"{edge.producer!r} and {edge.consumer!r} run in two environments, so no process can repeat both, and "
-                f"the recording does not hold (all of) {edge.stream!r}: record it"
+                f"the recording does not hold (all of) {edge.stream!r}: record it",
+                edge.stream,
             )
     raise ReplayError(f"operators run in several environments, so no process can repeat all: {', '.join(found)}")
 

@@ -29,7 +29,7 @@ from dataflow.supervision.core.report import Watch
 from dataflow.supervision.replay import plan_replay
 from dataflow.sync import Entry
 from dataflow.verification.books import Books, Places
-from dataflow.verification.choice import env_of, require_records
+from dataflow.verification.choice import require_records
 from dataflow.verification.ledger import read_ledger
 from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.processes import Call, call_workers
@@ -91,8 +91,13 @@ def complete(
         feeding = _plan(recording, played)  # refuses here what would fail there
     part = out.with_name(f"{out.name}.part")
     request = {"path": str(path), "part": str(part), "graph": played.to_json()}
-    env = env_of(played, feeding.operators)
-    call = Call(f"{__name__}:{complete_part.__name__}", request, feeding.operators, env=env)
+    envs = dict.fromkeys(played.nodes[name].env for name in feeding.operators)
+    if len(envs) > 1:
+        raise ReplayError(
+            f"{path}: its operators run in several environments ({', '.join(env or 'no env' for env in envs)}), and a "
+            "recording is completed in one process: record all streams (`record: all`)"
+        )
+    call = Call(f"{__name__}:{complete_part.__name__}", request, feeding.operators, env=next(iter(envs), None))
     try:
         [found] = call_workers([call], threads=played.threads, watch=watch)
         made = Completion(

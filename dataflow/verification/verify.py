@@ -34,6 +34,7 @@ from dataflow.verification.choice import (
     stored_checks,
     unfed_operators,
     with_makers,
+    without_environments,
 )
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.facts import differing_facts
@@ -137,8 +138,10 @@ def verify(
 
     def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
         function = f"{part.__name__}:{part.verify_part.__name__}"
-        asked = [({**request, **more, "operators": list(names)}, names, env_of(played, names)) for more, names in calls]
-        return workers([Call(function, about, names, env=env) for about, names, env in asked], **options)
+        asked = [({**request, **more, "operators": list(names)}, names) for more, names in calls]
+        return workers(
+            [Call(function, about, names, env=env_of(played, names, task.held)) for about, names in asked], **options
+        )
 
     answers = attempt((one.request(), one.operators) for one in task.parts)
     divided, left = slices.answer(task.books, answers)
@@ -165,6 +168,9 @@ def _prepare(
 ) -> _Task:
     with Recording(path) as recording:
         played, absent = (graph, dict[str, str]()) if graph is not None else graph_that_is_here(recording)
+        if graph is None:
+            played, elsewhere = without_environments(played)
+            absent = {**absent, **elsewhere}
         if gone := [name for name in [first, *(only or ())] if name in absent]:
             raise ReplayError(f"{gone[0]!r} cannot be verified: it is not here: {absent[gone[0]]}")
         if early is not None:
@@ -179,6 +185,7 @@ def _prepare(
         unfed = {} if first or only else unfed_operators(recording, played, chosen, incomplete)
         if unfed.keys() >= chosen:
             plan_feeding(recording, played, sorted(chosen), incomplete=incomplete)  # raises, and names what is missing
+            env_of(played, chosen, held)
         chosen -= unfed.keys()
         operators = tuple(name for name in played.nodes if name in chosen)
         require_records(recording, books.operators, operators)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
+import sysconfig
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from made_environments import environment, install, packages
 
 from dataflow.debugging.debugger import Debugger
 from dataflow.environments import EnvError, environment_of, lock
+from dataflow.execution import threads
 from dataflow.graph import Graph, GraphError
 from dataflow.graph.load import load_text
 from dataflow.recording import Recording
@@ -61,6 +64,14 @@ def test_each_operator_runs_with_the_packages_of_its_environment(recorded: Path)
 
     assert values == [k * 2.0 * 5.0 for k in range(20)]
     assert packages == {"count": None, "first": {"tiny": "1.0"}, "second": {"tiny": "2.0"}}
+
+
+def test_the_standard_library_of_this_installation_is_not_that_of_an_environment(environments: Path) -> None:
+    path = environment_of(str(environments / "one")).variables(threads.environment(1))["PYTHONPATH"].split(os.pathsep)
+
+    assert path[0] == str(packages(environments / "one"))
+    assert [each for each in path if (Path(each) / "os.py").exists() or each.endswith(("lib-dynload", ".zip"))] == []
+    assert sysconfig.get_path("purelib") in path
 
 
 def test_a_verification_repeats_each_operator_in_its_environment_and_names_other_versions(
