@@ -8,20 +8,24 @@ import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("greenlet", reason="simulated runs need the package greenlet (pip install -e '.[dev]')")
 
 from simulation import bindings
+from simulation import check as checks
 from simulation.check import check
+from simulation.keeping import check_losses_of_files
 from simulation.mutants import MUTANTS, Mutant
 from simulation.pipes import journey_of, travel
-from simulation.run import Happening, Machine, simulate
+from simulation.run import Happening, Machine, Outcome, simulate
 from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
+from dataflow.supervision.core.report import RunReport
 from dataflow.supervision.plan import RunPlan
 
 PLAIN = Scenario(
@@ -306,3 +310,23 @@ def test_planting_a_fault_leaves_nothing_behind() -> None:
         with mutant.planted():
             pass
     assert all(cls.__dict__[name] is function for (cls, name), function in places.items())
+
+
+RUN = Path(__file__).resolve().parent.parent / "recordings_of" / "run.mcap"
+"""A whole recording."""
+
+
+def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checks themselves: of files, of a completed recording, and of a flight recorder."""
+    streams, files = {"robot/nothing/out": (5, "")}, {"@recorder": {"kept": []}}
+    report = RunReport("robot", streams, {}, {}, {}, {}, files, 0, 1, 0.0, interrupted=False, notes=())
+    with pytest.raises(Violation, match="of 5 messages of robot/nothing/out 0 are stored"):
+        check_losses_of_files(report, RUN)
+    monkeypatch.setattr("simulation.check.complete", lambda *_, **__: SimpleNamespace(whole=True))
+    with pytest.raises(Violation, match="lacks messages of robot/nothing/out"):
+        checks._check_completion(RUN, RUN, report)
+    assert checks._check_flight(Outcome(report)) == "nothing kept"
+    with pytest.raises(Violation, match="nothing is kept, though left failed"):
+        checks._check_flight(Outcome(replace(report, restarts={"left": 1})))

@@ -139,6 +139,8 @@ def _check_flight(outcome: Outcome) -> str:
     kept = kept_by_flight(outcome.report)
     for one in kept:
         _unchanged(Path(one["path"]), lacks=not _holds_all(outcome))
+    if outcome.report.restarts and not kept and _holds_all(outcome):
+        raise Violation(f"nothing is kept, though {', '.join(outcome.report.restarts)} failed and was started again")
     return "kept" if kept else "nothing kept"
 
 
@@ -161,11 +163,8 @@ def _check_completion(path: Path, out: Path, report: RunReport) -> None:
     if not made.whole:
         raise Violation(f"a thin recording cannot be completed: {made}")
     with Recording(out) as recording:
-        lacking = [
-            stream
-            for stream, (number, _) in report.streams.items()
-            if stream in recording.streams and recording.streams[stream].count != number
-        ]
+        stored = {name: stream.count for name, stream in recording.streams.items()}
+    lacking = [stream for stream, (number, _) in report.streams.items() if stored.get(stream, 0) != number]
     if lacking and not report.restarts:
         raise Violation(f"completed, a thin recording lacks messages of {', '.join(lacking)}")
 
