@@ -46,7 +46,7 @@ def merge(
     Parts of one run are joined: what several hold is taken once, and their firing records become one log. Of other
     recordings the run of the first one counts, with its graph and firing records; the others give their streams.
     `prefixes` are put before the names of the streams of each. Attachments and metadata of all go along
-    (`editing.extras`). What its writer began and stored nothing in is passed over. Raises `RecordingError` for names
+    (`editing.extras`). Files without a message whose writer died are passed over. Raises `RecordingError` for names
     that clash.
     """
     done = Edited(str(out))

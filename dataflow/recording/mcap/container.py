@@ -46,7 +46,7 @@ from dataflow.recording.parts import OWNER_ONLY, created
 CHUNK_BYTES = 4 * 1024 * 1024
 CHUNK_SECONDS = 1.0
 WRITE_BYTES = 64 * 1024
-"""What is smaller than this is written together."""
+"""Parts up to this size are joined for a write."""
 
 
 class ContainerWriter:
