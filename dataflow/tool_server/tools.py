@@ -42,7 +42,7 @@ def verify(
     values = _verified(_verify(file, only, _loaded(graph))[1])
     for each in values.get("operators", ()):
         if each.get("first"):
-            each["call"] = _call_of(file, each["operator"], each["first"])
+            each |= _call_of(file, each["operator"], each["first"])
     return values
 
 
@@ -364,8 +364,9 @@ def _verdict(file: Path, operator: str, graph: Graph | None) -> str:
     return next((report.verdict(v) for v in report.operators if v.operator == operator), "not re-executed")
 
 
-def _call_of(file: Path, operator: str, first: Mapping[str, Any]) -> int:
-    """Returns the number among an operator's calls of the firing record at which it first differs."""
+def _call_of(file: Path, operator: str, first: Mapping[str, Any]) -> dict[str, int]:
+    """Returns the number of the last of an operator's calls up to the firing record at which it first differs, as
+    `call`: a state lies behind the call that made it. Of a record before all calls, nothing."""
     from dataflow.recording import Recording
     from dataflow.records.firing import CALLS
     from dataflow.records.reading import FiringLog
@@ -375,7 +376,8 @@ def _call_of(file: Path, operator: str, first: Mapping[str, Any]) -> int:
         node = graph_that_is_here(opened)[0].nodes[operator]
         headings = FiringLog.read(opened).headings(node)
     place = first["incarnation"], first["index"]
-    return sum(h.kind in CALLS and (h.incarnation, h.record) < place for h in headings)
+    calls = sum(h.kind in CALLS and (h.incarnation, h.record) <= place for h in headings)
+    return {"call": calls - 1} if calls else {}
 
 
 def _verified(report: VerifyReport) -> dict[str, Any]:
