@@ -224,16 +224,23 @@ def _prepare(
 
 
 def _parts(
-    graph: Graph, log: FiringLog, books: Books, operators: Sequence[str], *, held: Collection[str], **options: Any
+    graph: Graph,
+    log: FiringLog,
+    books: Books,
+    operators: Sequence[str],
+    *,
+    held: Collection[str],
+    jobs: int | None,
+    divide: bool,
 ) -> list[partition.Job]:
-    """Returns the parts of the operators of each environment by itself."""
-    envs, cores = dict.fromkeys(graph.nodes[name].env for name in operators), len(os.sched_getaffinity(0))
+    """Returns the parts of the operators of each environment by itself: jobs and cores are divided among these."""
+    envs = dict.fromkeys(graph.nodes[name].env for name in operators)
+    options: dict[str, Any] = {"held": held, "divide": divide, "jobs": jobs and max(1, jobs // len(envs))}
+    options["cores"] = max(1, len(os.sched_getaffinity(0)) // len(envs))
     return [
         part
         for env in envs
-        for part in partition.planned(
-            graph, log, books, _in(env, graph, operators, operators, held), held=held, cores=cores, **options
-        )
+        for part in partition.planned(graph, log, books, _in(env, graph, operators, operators, held), **options)
     ]
 
 

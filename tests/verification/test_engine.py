@@ -88,3 +88,16 @@ def test_opening_a_recording_and_reading_its_records_are_steps_of_a_worker(kept:
     assert report.identical
     assert opening > 5
     assert steps[0] > opening  # and records, of chunks that are read but once
+
+
+def test_several_environments_share_the_jobs(kept: Path) -> None:
+    with Recording(kept) as recording:
+        graph = recorded_graph(recording)
+    envs = {"look": "one", "busy": "one", "smooth": "two", "tally": "two"}
+    graph = replace(graph, nodes={name: replace(node, env=envs.get(name)) for name, node in graph.nodes.items()})
+
+    def count(calls: Sequence[Call], **options: Any) -> list[Any]:
+        raise RunFailed(", ".join(sorted(str(call.env) for call in calls)))
+
+    with pytest.raises(RunFailed, match=r"^one, two$"):
+        verify(kept, graph=graph, jobs=2, workers=count)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
-from dataflow.environments import environment_of
+from dataflow.environments import Environment, environment_of
 from dataflow.execution.threads import environment
 from dataflow.process.channel import ChannelClosed, ready
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, Status, Watch
@@ -69,13 +69,16 @@ def call_workers(
     of them, and raise a `RunFailed` that is `interrupted`.
     """
     status = Status(phase="starting", started=time.time())
+    envs = {env: environment_of(env) for env in {call.env for call in calls} if env is not None}
     with ExitStack() as stack:
         interrupted = threading.Event()
         stack.enter_context(interrupts(interrupted.set))
         workers: list[_Worker] = []
         for number, call in enumerate(calls, start=1):
             started = None if early is None or call.env is not None else early.take(threads)
-            workers.append(stack.enter_context(_Worker(number, call, started, threads, locate)))
+            workers.append(
+                stack.enter_context(_Worker(number, call, started, threads, locate, envs.get(call.env or "")))
+            )
         shown = 0.0
         while left := [worker for worker in workers if not worker.answered]:
             for channel in ready([worker.channel for worker in left], LOOK_EVERY):
@@ -114,11 +117,18 @@ def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
 class _Worker:
     """One worker process, as its parent sees it."""
 
-    def __init__(self, number: int, call: Call, started: Started | None, threads: int, locate: Locate) -> None:
+    def __init__(
+        self,
+        number: int,
+        call: Call,
+        started: Started | None,
+        threads: int,
+        locate: Locate,
+        env: Environment | None,
+    ) -> None:
         """`started`: a process that waits already."""
         variables, python = {**environment(threads), **call.environment}, sys.executable
-        if call.env is not None:
-            env = environment_of(call.env)
+        if env is not None:
             variables, python = env.variables(variables), env.python
         if started is None:
             started = Started()
