@@ -139,14 +139,11 @@ def verify(
     def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
         function = f"{part.__name__}:{part.verify_part.__name__}"
         asked = [({**request, **more, "operators": list(names)}, names) for more, names in calls]
-        return workers(
-            [Call(function, about, names, env=env_of(played, names, task.held)) for about, names in asked], **options
-        )
+        return workers([Call(function, *each, env=env_of(played, each[1], task.held)) for each in asked], **options)
 
     answers = attempt((one.request(), one.operators) for one in task.parts)
     divided, left = slices.answer(task.books, answers)
-    if left:
-        envs = dict.fromkeys(played.nodes[name].env for name in task.operators if name in left)
+    if envs := dict.fromkeys(played.nodes[name].env for name in task.operators if name in left):
         answers += attempt([({}, _in(env, played, left, task.operators, task.held)) for env in envs])
     answers.append(divided)
     report = _report(task, answers, tolerance, start)
@@ -167,10 +164,7 @@ def _prepare(
     early: EarlyWorkers | None,
 ) -> _Task:
     with Recording(path) as recording:
-        played, absent = (graph, dict[str, str]()) if graph is not None else graph_that_is_here(recording)
-        if graph is None:
-            played, elsewhere = without_environments(played)
-            absent = {**absent, **elsewhere}
+        played, absent = (graph, dict[str, str]()) if graph is not None else _graph_here(recording)
         if gone := [name for name in [first, *(only or ())] if name in absent]:
             raise ReplayError(f"{gone[0]!r} cannot be verified: it is not here: {absent[gone[0]]}")
         if early is not None:
@@ -184,8 +178,7 @@ def _prepare(
         chosen = with_makers(held, played, chosen_operators(played, first, only))
         unfed = {} if first or only else unfed_operators(recording, played, chosen, incomplete)
         if unfed.keys() >= chosen:
-            plan_feeding(recording, played, sorted(chosen), incomplete=incomplete)  # raises, and names what is missing
-            env_of(played, chosen, held)
+            env_of(played, plan_feeding(recording, played, sorted(chosen), incomplete=incomplete).operators, held)
         chosen -= unfed.keys()
         operators = tuple(name for name in played.nodes if name in chosen)
         require_records(recording, books.operators, operators)
@@ -221,6 +214,13 @@ def _prepare(
             },
             absent=absent,
         )
+
+
+def _graph_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
+    """Returns the graph that made the recording, and why operators are not here: their code, or their environment."""
+    graph, absent = graph_that_is_here(recording)
+    graph, elsewhere = without_environments(graph)
+    return graph, {**absent, **elsewhere}
 
 
 def _parts(
