@@ -55,7 +55,7 @@ def _fill(requirements: Path, folder: Path, options: list[str], *, anew: bool) -
     """Makes the environment in a folder that is not there yet. Raises `EnvError`."""
     _run([sys.executable, "-m", "venv", "--without-pip", str(folder)], f"{folder} cannot be made")
     (folder / ".gitignore").write_text("*\n")
-    pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet"]
+    pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin/python"), "install", "--quiet"]
     if not anew and lock.is_locked(requirements):
         locked = str(lock.lock_of(requirements))
         _run([*pip, "--no-deps", "-r", locked], f"{locked} cannot be installed")

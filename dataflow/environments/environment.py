@@ -13,10 +13,13 @@ import sys
 import sysconfig
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import Distribution, PackageNotFoundError, distributions, version
 from pathlib import Path, PurePath
+from typing import TYPE_CHECKING
 
 from dataflow.environments import lock
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution
 
 _MARK = "DATAFLOW_ENV"
 """Variable of processes in an environment: its folder and the folders of its packages."""
@@ -68,7 +71,7 @@ def environment_of(env: str) -> Environment:
     folder = _folder(env)
     if lock.is_requirements(env) and (fault := lock.fault(Path(env))):
         raise EnvError(f"env {env!r}: {fault}: `dataflow env GRAPH` builds it")
-    python = folder / "bin" / "python"
+    python = folder / "bin/python"
     if not python.exists():
         raise EnvError(
             f"env {env!r} is no environment: {python} is missing; `{sys.executable} -m venv {env}` makes one"
@@ -106,6 +109,8 @@ def require_environment(operator: str, env: str | None) -> None:
 def imported_packages() -> dict[str, str]:
     """Returns the versions of the environment's packages of which this process has imported something, by name; none
     in a process that is in no environment."""
+    from importlib.metadata import distributions
+
     _, *path = os.environ.get(_MARK, "").split(os.pathsep)
     loaded = {name.partition(".")[0] for name in sys.modules}
     found: dict[str, str] = {}
@@ -117,6 +122,8 @@ def imported_packages() -> dict[str, str]:
 
 def installed(package: str) -> str:
     """Returns the version of a package that this process imports; "–" where it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(package)
     except PackageNotFoundError:

@@ -204,7 +204,12 @@ def test_keys_that_could_not_be_made_leave_nothing_in_the_way(keys: Path, tmp_pa
 
     issue(keys / "authority", tmp_path / "arm", "arm", serves=["192.168.1.3"])
 
-    assert {path.name for path in (tmp_path / "arm").iterdir()} == {"authority.pem", "certificate.pem", "key.pem"}
+    assert {path.name for path in (tmp_path / "arm").iterdir()} == {
+        "authority.pem",
+        "certificate.pem",
+        "key.pem",
+        "name",
+    }
 
 
 @pytest.mark.long

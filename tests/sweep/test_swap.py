@@ -12,7 +12,6 @@ import dataflow
 from dataflow.graph import Graph
 from dataflow.messages import FeatureVector
 from dataflow.operator import In, Operator, Out, Param, Source
-from dataflow.sweep.layers import draw, layered
 from dataflow.sweep.plan import SweepError
 from dataflow.sweep.swap import Both, between, both, parts, shares
 
@@ -95,6 +94,8 @@ def test_without_an_operator_to_swap_there_is_no_answer() -> None:
 
 
 def test_clouds_of_both_are_kept_in_view() -> None:
+    from dataflow.sweep.layers import layered
+
     one = graph()
     one = replace(one, view=replace(one.view, keep=("swapped/right/out", "swapped/left/out")))
     layers, _, _ = layered((one, one), frozenset({"swapped/right/out"}))
@@ -102,6 +103,8 @@ def test_clouds_of_both_are_kept_in_view() -> None:
 
 
 def test_a_and_b_are_layers_of_one_file(tmp_path: Path) -> None:
+    from dataflow.sweep.layers import draw
+
     one = compared(tmp_path, graph(right=1.0))
     assert one.different == {"swapped/right/out"}
     counts = draw(one, tmp_path / "layers.rrd").statistics()

@@ -100,7 +100,7 @@ def compare(
 
       dataflow compare perception --recordings runs --set b:detector=yolox_nano
       dataflow compare cloud --recordings runs --set b:cloud.stride=8 --json
-      dataflow compare perception --recordings runs --set b:detector=yolox_nano --explain recall --rerun worst.rrd
+      dataflow compare cloud --recordings runs --set b:cloud.stride=8 --explain f1
     """
     choices = _choices(settings or ())
     with friendly_errors():

@@ -35,7 +35,7 @@ def test_images_of_a_network_camera_come_in_order_and_again_after_the_connection
     assert shown[before:] == [number % 20 for number in range(1, len(shown) - before + 1)]
     assert before >= 28  # setup() took the first, the connection may have cost the last
     assert [image.stamp for image in images] == sorted({image.stamp for image in images})
-    assert source.summary() == {"clock": "machine", "unplugged": 1}
+    assert source.summary() == {"clock": "machine", "past": 0, "unplugged": 1}
 
 
 def test_a_network_camera_that_is_not_there_is_an_error() -> None:
