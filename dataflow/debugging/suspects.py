@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import subprocess
 import sys
+import time
 import traceback
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
@@ -15,7 +17,7 @@ from dataflow.debugging.debugger import Debugger
 from dataflow.debugging.fired import Call, Fired
 from dataflow.debugging.lines import Lines, homes_of, is_own
 from dataflow.execution.failure import OperatorFailure
-from dataflow.graph.code import ReloadError, code_now, digest_of, other_texts, text_of
+from dataflow.graph.code import ReloadError, code_now, digest_of, other_texts, stored
 from dataflow.graph.model import OperatorImportError
 from dataflow.recording import Recording
 from dataflow.records.cuts import code_in
@@ -26,6 +28,10 @@ BEFORE = 8
 """Calls in front of the one that is looked at, in which its lines are looked for."""
 MOST_TRIED = 32
 """Changes that are undone, one at a time."""
+REVISIONS = 200
+"""Commits of a file in which its recorded text is looked for."""
+GIT_WITHIN = 30.0
+"""Seconds after which the search of them is given up."""
 
 Place = tuple[str, int]
 """A file, and the number of a line in it."""
@@ -118,7 +124,7 @@ def _changes(
         file = getattr(sys.modules.get(name), "__file__", None)
         if file is None or name not in then or then[name] == digest_of(text):
             continue
-        found = text_of(then[name], Path(file))
+        found = _recorded_text(then[name], Path(file))
         modules[name] = None if found is None else found[1]
         if found is not None:
             texts[name] = text.decode().splitlines(keepends=True)
@@ -170,3 +176,25 @@ def _raised(fired: Fired, homes: tuple[Path, ...]) -> Place | None:
     frames = traceback.extract_tb(fired.raised.__traceback__)
     own = [(f.filename, f.lineno) for f in frames if f.lineno is not None and is_own(f.filename, homes)]
     return own[-1] if own else None
+
+
+def _recorded_text(digest: str, file: Path) -> tuple[bytes, str] | None:
+    """Returns the text with a digest, and where it was: the store of reloads, or a commit of the file; None where it
+    is in neither. Of the file's commits the newest `REVISIONS` are looked at."""
+    if (text := stored(digest)) is not None:
+        return text, "a reload"
+    deadline = time.monotonic() + GIT_WITHIN
+
+    def git(*words: str) -> bytes:
+        left = max(0.0, deadline - time.monotonic())
+        command = ["git", "-C", str(file.parent), *words]
+        return subprocess.run(command, capture_output=True, timeout=left, check=False).stdout
+
+    try:
+        for commit in git("log", f"-n{REVISIONS}", "--format=%H", "--", file.name).decode().split():
+            shown = git("show", f"{commit}:./{file.name}")
+            if digest_of(shown) == digest:
+                return shown, f"commit {commit[:12]}"
+    except (OSError, subprocess.TimeoutExpired):  # there is no git here, or it takes too long
+        return None
+    return None

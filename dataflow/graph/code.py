@@ -11,7 +11,6 @@ import importlib.abc
 import importlib.util
 import os
 import re
-import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping
@@ -30,8 +29,6 @@ from dataflow.messages.base import Message
 if TYPE_CHECKING:
     from dataflow.operator import Operator
 
-REVISIONS = 200
-"""Commits of a file in which its recorded text is looked for."""
 _ENGINE = __name__.partition(".")[0]
 _INSTALLED = ("/site-packages/", "/dist-packages/")
 _STANDARD = tuple(f"{sysconfig.get_path(kind)}/" for kind in ("stdlib", "platstdlib"))
@@ -120,7 +117,7 @@ def stored_operator(node: Node, digests: Mapping[str, str]) -> type[Operator] | 
         return node.operator
     texts = {}
     for name in differing:
-        text = _stored(digests[name])
+        text = stored(digests[name])
         if text is None or not _NAME.fullmatch(name) or (name in sys.modules and name not in now):
             return None
         texts[name] = text
@@ -149,37 +146,13 @@ def other_texts(node: Node, texts: Mapping[str, bytes]) -> Iterator[None]:
         swap.put_back()
 
 
-def text_of(digest: str, file: Path) -> tuple[bytes, str] | None:
-    """Returns the text with a digest, and where it was: the store of reloads, or a commit of the file; None where it
-    is in neither. Of the file's commits the newest `REVISIONS` are looked at."""
-    if (text := _stored(digest)) is not None:
-        return text, "a reload"
-    git = ["git", "-C", str(file.parent)]
-    try:
-        listed = subprocess.run(
-            [*git, "log", f"-n{REVISIONS}", "--format=%H", "--", file.name],
-            capture_output=True,
-            timeout=30,
-            check=False,
-        )
-        for commit in listed.stdout.decode().split():
-            shown = subprocess.run(
-                [*git, "show", f"{commit}:./{file.name}"], capture_output=True, timeout=30, check=False
-            )
-            if digest_of(shown.stdout) == digest:
-                return shown.stdout, f"commit {commit[:12]}"
-    except (OSError, subprocess.TimeoutExpired):  # there is no git here, or it hangs
-        return None
-    return None
-
-
 def store() -> Path:
     """The folder of this user's code that reloads have replaced: `$XDG_DATA_HOME/dataflow/code`."""
     home = os.environ.get("XDG_DATA_HOME")
     return (Path(home) if home else Path.home() / ".local" / "share") / "dataflow" / "code"
 
 
-def _stored(digest: str) -> bytes | None:
+def stored(digest: str) -> bytes | None:
     """Returns what is stored under a digest, which a recording of others may hold: it may be any text."""
     if not _DIGEST.fullmatch(digest):
         return None
