@@ -107,6 +107,7 @@ def thin(environments: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_an_operator_that_only_one_process_could_repeat_with_its_maker_is_unverifiable(thin: Path) -> None:
     report = verify(thin)
 
