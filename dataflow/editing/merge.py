@@ -55,8 +55,8 @@ def merge(
         done.notes += [f"{origin.path} {NOTHING_IN_IT}" for origin in bare]
         prefixes = [p for origin, p in zip(origins, prefixes, strict=True) if origin not in bare]
         origins = [origin for origin in origins if origin not in bare]
-        if not origins:
-            raise RecordingError("nothing is in any of these files")
+    if not origins:
+        raise RecordingError("nothing is in any of these files")
     one_run = not any(prefixes) and are_of_one_run(origins)
     with ExitStack() as stack:
         if one_run:
