@@ -17,7 +17,9 @@ from dataflow.machines.pipe import _FRAME, Pipe
 from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import ChannelClosed, QueuedChannel
 from dataflow.process.streams.losses import LossTold
+from dataflow.sinks.flight_recorder import FlightSink, Wanted
 from dataflow.sinks.parts import PartsSink
+from dataflow.sinks.triggers import Triggers
 from dataflow.sync import FOREVER, NEVER
 
 
@@ -254,6 +256,39 @@ class NotRestored(Mutant):
         return {(LiveRunner, "reload"): _unrecorded(LiveRunner.reload)}
 
 
+class ToldTwice(Mutant):
+    """A trigger of a flight recorder asks again with each message while its condition holds."""
+
+    said = "a trigger asks again while it holds"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        return {(Triggers, "_begins"): lambda self, trigger, name, holds: holds}
+
+
+class DeafToDrops(Mutant):
+    """A flight recorder is not triggered by what operators drop."""
+
+    said = "a trigger by drops does nothing"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        return {(Triggers, "diagnostics"): lambda self, message: ()}
+
+
+class ShortMemory(Mutant):
+    """A flight recorder keeps half of what was before a trigger."""
+
+    said = "a flight recorder keeps half of the time"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        right = FlightSink._keep
+
+        def keep(self: FlightSink, wanted: Wanted, outcome: str = "") -> None:
+            wanted.start += self.flight.keep // 2
+            right(self, wanted, outcome)
+
+        return {(FlightSink, "_keep"): keep}
+
+
 def _unrecorded(reload: Callable[[LiveRunner], Any]) -> Callable[[LiveRunner], Any]:
     def without(self: LiveRunner) -> Any:
         add = self.records.add
@@ -280,5 +315,8 @@ MUTANTS: Mapping[str, Mutant] = {
     "part": NotIntroduced(),
     "state": StateBefore(),
     "reload": NotRestored(),
+    "again": ToldTwice(),
+    "drops": DeafToDrops(),
+    "half": ShortMemory(),
     "link": GapTaken(),
 }
