@@ -11,6 +11,7 @@ from dataflow.execution.admission import AdmissionQueue, Patience
 from dataflow.execution.calls import Calls
 from dataflow.execution.feeds.window import Window
 from dataflow.execution.live import LiveRunner
+from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import OutputPorts
 from dataflow.execution.runner import OperatorRunner
 from dataflow.machines.pipe import _FRAME, Pipe
@@ -253,7 +254,13 @@ class NotRestored(Mutant):
     said = "a reload does not record the state that it keeps"
 
     def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
-        return {(LiveRunner, "reload"): _unrecorded(LiveRunner.reload)}
+        right = FiringLog.add
+
+        def add(self: FiringLog, kind: Any, *args: Any, **fields: Any) -> None:
+            if kind != "restore":
+                right(self, kind, *args, **fields)
+
+        return {(FiringLog, "add"): add}
 
 
 class ToldTwice(Mutant):
@@ -287,18 +294,6 @@ class ShortMemory(Mutant):
             right(self, wanted, outcome)
 
         return {(FlightSink, "_keep"): keep}
-
-
-def _unrecorded(reload: Callable[[LiveRunner], Any]) -> Callable[[LiveRunner], Any]:
-    def without(self: LiveRunner) -> Any:
-        add = self.records.add
-        self.records.add = lambda kind, *args, **fields: None if kind == "restore" else add(kind, *args, **fields)  # type: ignore[method-assign]
-        try:
-            return reload(self)
-        finally:
-            self.records.add = add  # type: ignore[method-assign]
-
-    return without
 
 
 MUTANTS: Mapping[str, Mutant] = {
