@@ -223,6 +223,11 @@ def test_links_between_machines(first: int) -> None:
         travel(journey_of(seed))
 
 
+def test_two_machines_that_say_nothing_are_given_the_time_to_measure_their_clocks() -> None:
+    """A beat and its answer take longer than a second here."""
+    travel(journey_of(25_002_417))
+
+
 # Planted faults
 
 FOUND_BY = {
