@@ -26,7 +26,7 @@ from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
-from dataflow.supervision.core.report import RunReport
+from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan
 
 PLAIN = Scenario(
@@ -352,9 +352,11 @@ def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     with pytest.raises(Violation, match="lacks messages of robot/nothing/out"):
         checks._check_completion(RUN, RUN, PLAIN.load(), report)
     graph = replace(PLAIN, keeping=Keeping(flight=True)).load()
-    assert checks._check_flight(Outcome(report), graph) == "nothing kept"
+    assert checks._check_flight(Outcome(report), graph, tmp_path) == "nothing kept"
     with pytest.raises(Violation, match="nothing is kept, though left failed"):
-        checks._check_flight(Outcome(replace(report, restarts={"left": 1})), graph)
+        checks._check_flight(Outcome(replace(report, restarts={"left": 1})), graph, tmp_path)
     asked = Flown(asked=[(("drops", "left", 7), 7)])
     with pytest.raises(Violation, match=r"was asked .*'drops', 'left', 7.* and kept \[\]"):
-        checks._check_flight(Outcome(report, flown=asked), graph)
+        checks._check_flight(Outcome(report, flown=asked), graph, tmp_path)
+    with pytest.raises(Violation, match="its end is not kept: a call failed"):
+        checks._check_flight(Outcome(failure=RunFailed("a call failed")), graph, tmp_path)

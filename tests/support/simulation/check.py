@@ -70,7 +70,7 @@ def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
     if scenario.only_paused:
         _check_pauses(outcome)
     if scenario.keeping.flight:
-        return Result(outcome, _check_flight(outcome, graph))
+        return Result(outcome, _check_flight(outcome, graph, folder / "flight"))
     path = _joined(scenario, folder, outcome)
     verdict = _verify(path, outcome, scenario)
     if scenario.keeping.states and verdict == "identical" and not scenario.keeping.topics:
@@ -135,10 +135,16 @@ def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
     return path
 
 
-def _check_flight(outcome: Outcome, graph: Graph) -> str:
+def _check_flight(outcome: Outcome, graph: Graph, folder: Path) -> str:
     """What a flight recorder has kept is what it was asked for, and re-executes as far as its states are known."""
-    if outcome.report is None:
-        return "no recording"
+    if outcome.failure is not None:
+        files = sorted(folder.glob("*.mcap"))
+        for file in files:
+            _unchanged(file, lacks=True)
+        if not files and not (outcome.failure.interrupted or outcome.disk_full or "@recorder" in outcome.killed):
+            raise Violation(f"the run failed, and its end is not kept: {outcome.failure}")
+        return "kept" if files else "nothing kept"
+    assert outcome.report is not None
     kept = kept_by_flight(outcome.report, full=outcome.disk_full)
     for one in kept:
         _unchanged(Path(one["path"]), lacks=not _holds_all(outcome))
