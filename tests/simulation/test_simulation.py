@@ -17,7 +17,8 @@ pytest.importorskip("greenlet", reason="simulated runs need the package greenlet
 from simulation import bindings
 from simulation import check as checks
 from simulation.check import check
-from simulation.keeping import check_losses_of_files
+from simulation.flights import Flown
+from simulation.keeping import Keeping, check_losses_of_files
 from simulation.mutants import MUTANTS, Mutant
 from simulation.pipes import journey_of, travel
 from simulation.run import Happening, Machine, Outcome, simulate
@@ -25,7 +26,7 @@ from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
-from dataflow.supervision.core.report import RunReport
+from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan
 
 PLAIN = Scenario(
@@ -222,6 +223,11 @@ def test_links_between_machines(first: int) -> None:
         travel(journey_of(seed))
 
 
+def test_two_machines_that_say_nothing_are_given_the_time_to_measure_their_clocks() -> None:
+    """A beat and its answer take longer than a second here."""
+    travel(journey_of(25_002_417))
+
+
 # Planted faults
 
 FOUND_BY = {
@@ -288,7 +294,9 @@ def test_a_planted_fault_is_found_and_its_plan_shrunk(name: str, memory: Path) -
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("name", "seed"), [("part", 36), ("state", 26), ("reload", 37)])
+@pytest.mark.parametrize(
+    ("name", "seed"), [("part", 36), ("state", 26), ("reload", 79), ("again", 4), ("drops", 173), ("half", 11)]
+)
 def test_a_fault_of_what_is_recorded_is_found(name: str, seed: int, memory: Path) -> None:
     check(scenario_of(seed), memory, replay=False)
 
@@ -301,6 +309,22 @@ def test_a_pipe_that_does_not_notice_what_its_link_lost_is_found() -> None:
 
     with MUTANTS["link"].planted(), pytest.raises(Violation, match="did not come"):
         travel(journey_of(3))
+
+
+def test_a_graph_is_shrunk_only_to_graphs(memory: Path) -> None:
+    """One that leaves out a stream by its name does not load without the operator that publishes it."""
+    relay = "relay: {use: simulation.operators:Relay, inputs: {x: right/fast}}"
+    parts = ("left: {SOURCE}", "right: {SOURCE}", relay)
+    scenario = replace(PLAIN, graph=DRAWN, parts=parts, keeping=Keeping("exclude: ['left/fast']"))
+
+    def run(tried: Scenario, folder: Path) -> None:
+        if "left/fast" not in tried.load().record.streams and tried.keeping.topics:
+            raise Violation("it is left out")
+
+    small, said = shrink(scenario, memory, Violation("broken"), run=run)
+
+    assert said == "it is left out"
+    assert small.count == 1
 
 
 def test_planting_a_fault_leaves_nothing_behind() -> None:
@@ -320,13 +344,19 @@ def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The checks themselves: of files, of a completed recording, and of a flight recorder."""
-    streams, files = {"robot/nothing/out": (5, "")}, {"@recorder": {"kept": []}}
+    streams, files = {"robot/nothing/out": (5, "")}, {"@recorder": {"kept": [], "not_kept": 0}}
     report = RunReport("robot", streams, {}, {}, {}, {}, files, 0, 1, 0.0, interrupted=False, notes=())
     with pytest.raises(Violation, match="of 5 messages of robot/nothing/out 0 are stored"):
         check_losses_of_files(report, RUN)
     monkeypatch.setattr("simulation.check.complete", lambda *_, **__: SimpleNamespace(whole=True))
     with pytest.raises(Violation, match="lacks messages of robot/nothing/out"):
-        checks._check_completion(RUN, RUN, report)
-    assert checks._check_flight(Outcome(report)) == "nothing kept"
+        checks._check_completion(RUN, RUN, PLAIN.load(), report)
+    graph = replace(PLAIN, keeping=Keeping(flight=True)).load()
+    assert checks._check_flight(Outcome(report), graph, tmp_path) == "nothing kept"
     with pytest.raises(Violation, match="nothing is kept, though left failed"):
-        checks._check_flight(Outcome(replace(report, restarts={"left": 1})))
+        checks._check_flight(Outcome(replace(report, restarts={"left": 1})), graph, tmp_path)
+    asked = Flown(asked=[(("drops", "left", 7), 7)])
+    with pytest.raises(Violation, match=r"was asked .*'drops', 'left', 7.* and kept \[\]"):
+        checks._check_flight(Outcome(report, flown=asked), graph, tmp_path)
+    with pytest.raises(Violation, match="its end is not kept: a call failed"):
+        checks._check_flight(Outcome(failure=RunFailed("a call failed")), graph, tmp_path)
