@@ -23,6 +23,7 @@ from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Feeding, plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, seeding_of
+from dataflow.sync import NEVER
 
 SECONDS = 60.0
 
@@ -182,9 +183,24 @@ class Drops:
                 losses += losses_of(node, self._records[name], sent, graph.static)
         losing = {loss.operator for loss in losses}
         between = [name for name in graph.nodes if name in above and losing & _above(graph, [name])]
+        for name in between:
+            self._refuse_restarts(name)
         inside = {s for name in between for s in graph.nodes[name].outputs.values()}
         outer = plan_feeding(self._recording, graph, between, incomplete=inside)
         return outer, sorted(losses), sent
+
+    def _refuse_restarts(self, name: str) -> None:
+        """Raises `DropsError` for an operator that went on anew: with other messages it might not have failed."""
+        last = NEVER
+        for record in self._records.get(name, ()):
+            if record.incarnation:
+                what = "its clock went back" if record.kind == "reset" else "it was restarted"
+                when = "before its first call" if last == NEVER else f"behind its call at stamp {last}"
+                raise DropsError(
+                    f"{name}: {what} {when}. What it would have done with the lost messages is not known, so losses of "
+                    "such a run are not undone; dataflow debug and dataflow blame go to its calls"
+                )
+            last = record.stamp if record.kind in CALLS else last
 
     def _branch(self, feeding: Feeding, losses: Sequence[Loss]) -> Branch:
         version = seeding_of(self._recording)
@@ -262,7 +278,7 @@ class Drops:
                 stamp = (there[k : k + 1] or here[k : k + 1])[0][0]
                 raise DropsError(
                     f"the replay with all losses is not the recorded run: {name} has other firings from stamp {stamp} "
-                    "on (a restart, a clock that went back, other code? dataflow verify shows the latter)"
+                    "on (other code? dataflow verify shows that)"
                 )
         recorded, found = self.worse.values(self._recorded), self.worse.values(figures)
         if recorded != found:

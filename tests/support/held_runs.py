@@ -139,6 +139,15 @@ class Count(Operator):
         return vector(step.stamp, self.state.value)
 
 
+class Brittle(Smooth):
+    """Raises at one message."""
+
+    def process(self, at: FeatureVector) -> FeatureVector:
+        if at.stamp == STAMP + 2000 * MS:
+            raise ValueError("not this one")
+        return super().process(at)
+
+
 class HalfSmooth(Smooth):
     """Another version, which gives something else."""
 
