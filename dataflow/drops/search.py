@@ -7,10 +7,11 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.capture.reduce import needed, shortest_end, smallest
+from dataflow.capture.reduce import needed, none_to_spare, shortest_end, smallest, thinned
 from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, Sent, bursts_of, losses_of, sent_by
 from dataflow.drops.player import Player
@@ -237,7 +238,7 @@ class Drops:
 
         named = _flat(needed(shortest_end(sorted(bursts, key=len), heal), heal))  # the longest of them at first
         if in_time and len(named) > 1:
-            named = list(smallest(needed(named, heals), heals))
+            named = _reduced(named, heals)
         undone = self._replay(branch, named)
         again = self._branch(feeding, losses)
         if self.worse.values(self._replay(again, named)) != self.worse.values(undone):
@@ -292,6 +293,20 @@ class Drops:
     def _close(self) -> None:
         for player in self._players:
             player.close()
+
+
+def _reduced(named: Sequence[Loss], heals: Callable[[Sequence[Loss]], bool]) -> list[Loss]:
+    """A smallest set of some losses. Of a stop every second, fourth... message may do."""
+    at_once = [list(group) for _, group in groupby(sorted(named), key=lambda loss: loss.stamp)]
+
+    def heal(part: Sequence[Sequence[Loss]]) -> bool:
+        return heals(_flat(part))
+
+    thin = thinned(at_once, heal)
+    if len(thin) == len(at_once):
+        return list(smallest(needed(named, heals), heals))
+    left = none_to_spare(thin, heal)
+    return _flat(left) if all(len(group) == 1 for group in left) else list(none_to_spare(_flat(left), heals))
 
 
 def _flat(bursts: Sequence[Sequence[Loss]]) -> list[Loss]:
