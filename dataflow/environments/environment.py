@@ -102,7 +102,7 @@ def require_environment(operator: str, env: str | None) -> None:
     if env is not None and str(_folder(env)) != here:
         raise EnvError(
             f"operator {operator!r} needs the environment {env!r}, and this process is in "
-            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay` and `verify` start processes in it"
+            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay`, `verify` and `debug` start processes in it"
         )
 
 

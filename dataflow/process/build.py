@@ -16,6 +16,7 @@ from dataflow.execution.live import LiveRunner
 from dataflow.execution.ports import Emitter
 from dataflow.execution.runner import OperatorRunner
 from dataflow.execution.source import SourceRunner
+from dataflow.execution.spacing import spacing_of
 from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.process.live_sources import LiveSources
@@ -89,7 +90,7 @@ def _make_runner(
         "static": graph.static,
         "seed": graph.seed,
         "paranoid": config.paranoid,
-        "snapshots": config.snapshots,
+        "snapshots": spacing_of(graph, node.name),
     }
     if config.live:
         live = LiveRunner(node, emitter, **common, event_clock=event_clock, on_failure=on_failure)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 import sys
 import sysconfig
 from pathlib import Path
@@ -144,6 +145,20 @@ def test_an_operator_is_not_made_in_a_process_of_another_environment(recorded: P
         graph(environments).nodes["first"].make()
     with Recording(recorded) as recording, pytest.raises(EnvError, match=wrong):
         Debugger(recording, "first").goto(0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("operator", ["first", "second"])
+def test_the_debugger_begins_in_the_environment_of_its_operator(operator: str, recorded: Path) -> None:
+    here = str(Path(__file__).resolve().parent)
+    words = ["debug", str(recorded), operator, "--do", "goto 1", "--path", here]
+    told = subprocess.run(
+        [sys.executable, "-m", "dataflow.cli.main", *words], capture_output=True, text=True, timeout=100
+    )
+
+    assert told.returncode == 0, told.stderr
+    assert f"{operator}  call 1 of " in told.stdout
+    assert "as recorded" in told.stdout
 
 
 def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from dataflow.api.runs import metadata_of
 from dataflow.execution.driver import Driver
 from dataflow.execution.live import LiveRunner
 from dataflow.execution.log import FiringLog
+from dataflow.execution.spacing import spacing_of
 from dataflow.graph import Graph, load_text
 from dataflow.graph.model import Node
 from dataflow.messages import FeatureVector, Message
@@ -138,6 +139,15 @@ class Count(Operator):
         return vector(step.stamp, self.state.value)
 
 
+class Brittle(Smooth):
+    """Raises at one message."""
+
+    def process(self, at: FeatureVector) -> FeatureVector:
+        if at.stamp == STAMP + 2000 * MS:
+            raise ValueError("not this one")
+        return super().process(at)
+
+
 class HalfSmooth(Smooth):
     """Another version, which gives something else."""
 
@@ -239,7 +249,7 @@ def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None 
                 emitter,
                 static=graph.static,
                 seed=graph.seed,
-                snapshots=graph.record.snapshots,
+                snapshots=spacing_of(graph, node.name),
                 clock=lambda: clock[0],
                 event_clock=lambda: STAMP + round(clock[0] * 1e9),
             )
