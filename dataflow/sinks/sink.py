@@ -33,7 +33,7 @@ from dataflow.transport.envelope import MAGIC
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.01
 ALIVE_EVERY = 1.0
-"""Seconds after which it says that it goes on to store things, though it is no further with one of the streams."""
+"""Seconds between two reports of one that stores things, though it is no further with one of the streams."""
 FLUSH_EVERY = 1.0
 DRAIN_WITHIN = 5.0
 

@@ -123,6 +123,14 @@ def test_nothing_reads_the_clock_past_the_simulation() -> None:
 # Runs
 
 
+def test_ticks_that_came_due_during_a_pause_are_given_the_time_of_those_of_a_freeze() -> None:
+    ticks = replace(PLAIN, graph=TICKING, live=True, work=0.05)
+    frozen, paused = (
+        replace(ticks, happenings=(Happening(0.1, kind, "left", {"span": 6.0}),)) for kind in ("freeze", "pause")
+    )
+    assert paused.limit >= frozen.limit
+
+
 def test_a_seed_gives_one_course(memory: Path) -> None:
     scenario = scenario_of(3)
     courses = []
