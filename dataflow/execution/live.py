@@ -24,11 +24,11 @@ from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
 from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
-from dataflow.execution.spacing import StateSpacing
 from dataflow.graph.code import ReloadError, Replaced, code_now
 from dataflow.graph.model import Node, OperatorImportError
 from dataflow.operator import Operator, OperatorSpec
 from dataflow.records.firing import MAX_STATE_BYTES
+from dataflow.records.spacing import StateSpacing
 from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
 from dataflow.sync.single import make_aligner
 

@@ -19,11 +19,11 @@ from dataflow.execution.log import FiringLog, unlisted
 from dataflow.execution.memory import WATCHED, MemoryGuard
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
-from dataflow.execution.spacing import StateSpacing
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import Operator
 from dataflow.records.firing import MAX_STATE_BYTES, Emission, Kind
+from dataflow.records.spacing import StateSpacing
 from dataflow.sync import FOREVER, NEVER, Drop, Entry, Firing, format_duration, format_stamp
 from dataflow.sync.single import make_aligner
 

@@ -16,12 +16,12 @@ from dataflow.execution.live import LiveRunner
 from dataflow.execution.ports import Emitter
 from dataflow.execution.runner import OperatorRunner
 from dataflow.execution.source import SourceRunner
-from dataflow.execution.spacing import spacing_of
 from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.process.live_sources import LiveSources
 from dataflow.recording import Recording
 from dataflow.records.black_box import BlackBox, Reached
+from dataflow.records.spacing import StateSpacing
 from dataflow.remote import Remote
 
 Outlived = Callable[[OperatorFailure, float], None]
@@ -86,11 +86,12 @@ def _make_runner(
     on_failure: Outlived,
 ) -> OperatorRunner:
     """Makes the runner of an operator that has inputs."""
+    snapshots = graph.record.snapshots
     common: dict[str, Any] = {
         "static": graph.static,
         "seed": graph.seed,
         "paranoid": config.paranoid,
-        "snapshots": spacing_of(graph, node.name),
+        "snapshots": None if snapshots is None else StateSpacing(snapshots, len(graph.repeated_for(node.name))),
     }
     if config.live:
         live = LiveRunner(node, emitter, **common, event_clock=event_clock, on_failure=on_failure)

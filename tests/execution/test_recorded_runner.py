@@ -18,10 +18,10 @@ from dataflow.execution.calls import Calls
 from dataflow.execution.live import LiveRunner
 from dataflow.execution.recorded import RecordedRunner
 from dataflow.execution.runner import OperatorRunner
-from dataflow.execution.spacing import StateSpacing
 from dataflow.graph.model import Live, Node, Restart
 from dataflow.records.firing import FiringRecord
 from dataflow.records.repetition import Repetition, look_at
+from dataflow.records.spacing import StateSpacing
 from dataflow.sync import Entry, Firing
 
 STREAM = "t/s/x"

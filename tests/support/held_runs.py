@@ -16,13 +16,13 @@ from dataflow.api.runs import metadata_of
 from dataflow.execution.driver import Driver
 from dataflow.execution.live import LiveRunner
 from dataflow.execution.log import FiringLog
-from dataflow.execution.spacing import spacing_of
 from dataflow.graph import Graph, load_text
 from dataflow.graph.model import Node
 from dataflow.messages import FeatureVector, Message
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 from dataflow.recording import Recording
 from dataflow.records.firing import Emission, FiringRecord
+from dataflow.records.spacing import StateSpacing
 from dataflow.sync import NEVER, Entry
 
 STAMP, MS = 10**18, 1_000_000
@@ -249,7 +249,7 @@ def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None 
                 emitter,
                 static=graph.static,
                 seed=graph.seed,
-                snapshots=spacing_of(graph, node.name),
+                snapshots=None if (apart := graph.record.snapshots) is None else StateSpacing(apart),
                 clock=lambda: clock[0],
                 event_clock=lambda: STAMP + round(clock[0] * 1e9),
             )

@@ -29,7 +29,7 @@ LIMIT = 200.0
 """Simulated seconds after which a run hangs: far above the sum of all timeouts, and of what work takes."""
 MEGABYTES = 50_000_000
 QUICKER = {
-    ("dataflow.execution.spacing", "CPU_SPACING"): 20_000_000,
+    ("dataflow.records.spacing", "CPU_SPACING"): 20_000_000,
     ("dataflow.sinks.flight_recorder", "SHORTEST"): 20_000_000,
     ("dataflow.sinks.outage", "FIRST_PAUSE"): 0.1,
 }

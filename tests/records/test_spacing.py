@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 
-from dataflow.execution.spacing import CPU_SPACING, LARGE, MOST_OFTEN, REPEATING, StateSpacing
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph
+from dataflow.records.spacing import CPU_SPACING, LARGE, MOST_OFTEN, REPEATING, StateSpacing
 
 CHAIN = """
 graph: chain

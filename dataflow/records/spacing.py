@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataflow.graph.model import Graph
-from dataflow.graph.sections import Snapshots
+from typing import Literal
 
 CPU_SPACING = 250_000_000
 """ns of CPU time between two states that are spaced by that: of an operator's calls, and of what repeating them takes
@@ -25,7 +24,7 @@ class StateSpacing:
     and those in front whose messages are not recorded.
     """
 
-    def __init__(self, snapshots: Snapshots, repeated: int = 1) -> None:
+    def __init__(self, snapshots: int | Literal["cpu"], repeated: int = 1) -> None:
         self._by_cpu = snapshots == "cpu"
         self._each = REPEATING * repeated
         self._spacing = CPU_SPACING // MOST_OFTEN if snapshots == "cpu" else snapshots
@@ -46,9 +45,3 @@ class StateSpacing:
         """Notes the size of the state that was recorded."""
         if self._by_cpu:
             self._spacing = CPU_SPACING * min(max(nbytes, LARGE // MOST_OFTEN), LARGE) // LARGE
-
-
-def spacing_of(graph: Graph, operator: str) -> StateSpacing | None:
-    """Returns how far apart the states of an operator are recorded; None where the graph asks for none."""
-    snapshots = graph.record.snapshots
-    return None if snapshots is None else StateSpacing(snapshots, len(graph.repeated_for(operator)))
