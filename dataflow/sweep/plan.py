@@ -52,7 +52,8 @@ class Task:
     """One recording with one choice of settings.
 
     `words`: those of the command, with `None` where the recording's path stands. `key`: a digest of the recording, the
-    graph, the code, the packages and the words; tasks of equal keys have equal outcomes.
+    graph, the code, the packages and the words; tasks of equal keys have equal outcomes. `modules`: those of the
+    operators, where the graph is known.
     """
 
     source: Source
@@ -60,6 +61,7 @@ class Task:
     settings: Choice
     words: tuple[str | None, ...]
     key: str
+    modules: tuple[str, ...] = ()
 
 
 def grid(words: Sequence[str]) -> list[Choice]:
@@ -195,9 +197,12 @@ def tasks_of(
         chosen = tuple(word for name, value in settings for word in ("--set", f"{name}={value}"))
         line = (verb, None, *given, *chosen, *where, *words, "--json", "--quiet")
         same = None if loaded is None else code.of(loaded)
+        used = () if loaded is None else (node.use.partition(":")[0] for node in loaded.nodes.values() if not node.env)
+        modules = tuple(sorted(set(used)))
         for source in sources:
             graph_digest = code.of_recorded(source) if same is None else same
-            made.append(Task(source, what, settings, line, _digest((source.digest, graph_digest, what, line[2:]))))
+            key = _digest((source.digest, graph_digest, what, line[2:]))
+            made.append(Task(source, what, settings, line, key, modules))
     return made
 
 

@@ -8,6 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Event
 from typing import Any
 
@@ -15,7 +16,8 @@ from dataflow.graph import Graph, load_graph
 from dataflow.graph.search import import_path
 from dataflow.sweep.plan import Choice, Digests, SweepError, Task, What, sources_in, tasks_of
 from dataflow.sweep.table import Store, summed_up, write_table
-from dataflow.sweep.work import Result, perform
+from dataflow.sweep.warm import Worker
+from dataflow.sweep.work import Result, commands_of, perform
 
 AHEAD = 4
 """Tasks handed to a cluster for each of its processors, so that none waits for this process."""
@@ -26,10 +28,22 @@ def local(tasks: Sequence[Task], jobs: int, timeout: float) -> Generator[tuple[T
     """Yields tasks with their results as they end, `jobs` at a time. Those running end with the iteration."""
     pool = ThreadPoolExecutor(jobs, thread_name_prefix="sweep")
     left, running, stop = iter(tasks), dict[Future[Result], Task](), Event()
+    workers = [Worker(commands_of(tasks)) for _ in range(jobs)]
+    idle = SimpleQueue[Worker]()
+    for worker in workers:
+        idle.put(worker)
+
+    def work(task: Task) -> Result:
+        worker = idle.get()
+        try:
+            return perform(task, timeout, worker, stop)
+        finally:
+            idle.put(worker)
+
     try:
         while True:
             for task in left:
-                running[pool.submit(perform, task, timeout, stop)] = task
+                running[pool.submit(work, task)] = task
                 if len(running) == jobs:
                     break
             if not running:
@@ -39,6 +53,8 @@ def local(tasks: Sequence[Task], jobs: int, timeout: float) -> Generator[tuple[T
     finally:
         stop.set()
         pool.shutdown(cancel_futures=True)
+        for worker in workers:
+            worker.close()
 
 
 def on_ray(
@@ -65,7 +81,7 @@ def on_ray(
             f"--ray {address}: {error}; 'local' begins a cluster here, 'auto' takes a running one"
         ) from error
     try:
-        remote = ray.remote(num_cpus=1, max_retries=1)(perform)
+        remote = ray.remote(num_cpus=1, max_retries=1)(_there)
         most = max(1, int(ray.cluster_resources().get("CPU", 1))) * AHEAD
         left, running = iter(tasks), dict[Any, Task]()
         while True:
@@ -83,6 +99,18 @@ def on_ray(
     finally:
         with suppress(Exception):  # an interrupted cluster that does not answer must not hide why it was left
             ray.shutdown()
+
+
+_worker: Worker | None = None
+"""That of a process of a cluster, which does one task after the other."""
+
+
+def _there(task: Task, timeout: float) -> Result:
+    """Does a task on a machine of a cluster."""
+    global _worker
+    if _worker is None:
+        _worker = Worker(commands_of([task]))
+    return perform(task, timeout, _worker)
 
 
 @dataclass(slots=True)
