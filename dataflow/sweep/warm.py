@@ -41,19 +41,19 @@ class Worker:
         self,
         kind: Literal["command", "fetch"],
         words: Sequence[str],
-        modules: Sequence[str],
+        operators: Sequence[str],
         output: tuple[Path, Path],
         timeout: float,
         stop: Event | None = None,
     ) -> int | None:
-        """Makes a call, with `modules` loaded before; returns its exit code, negative for a signal, None after
-        `timeout` seconds or where it was stopped. What it prints is in the two files. Nothing that it started outlives
-        this call.
+        """Makes a call, with `operators` (`module:name`) loaded before; returns its exit code, negative for a signal,
+        None after `timeout` seconds or where it was stopped. What it prints is in the two files. Nothing that it
+        started outlives this call.
         """
         deadline = time.monotonic() + timeout
         with output[0].open("wb") as out, output[1].open("wb") as err:
             while True:
-                loaded = [module for module in modules if module not in self._cold]
+                loaded = [use for use in operators if use not in self._cold]
                 connection = self._connected()
                 try:
                     socket.send_fds(connection, [msgpack.packb([kind, words, loaded])], [out.fileno(), err.fileno()])

@@ -26,19 +26,22 @@ from dataflow.supervision.nursery_process import adopt_orphans, end_orphans
 
 MOST_BYTES = 1 << 20
 """The longest request."""
+COMMON = ("dataflow.cli.app", "dataflow.cli.start", "dataflow.cli.support.progress", "dataflow.graph.load")
 COMMANDS = {
     "replay": (
+        *COMMON,
         *OPERATORS,
-        "dataflow.cli.app",
         "dataflow.cli.commands.replay",
         "dataflow.cli.support.report",
+        "dataflow.cli.support.viewers",
         "dataflow.interop.opening",
-        "dataflow.process.operator_process",
+        "dataflow.reexecution.warm_start",
+        "dataflow.shipped",
         "dataflow.supervision.early_nursery",
         "dataflow.supervision.run",
     ),
     "verify": (
-        "dataflow.cli.app",
+        *COMMON,
         "dataflow.cli.commands.verification",
         "dataflow.cli.support.verdicts",
         "dataflow.verification.gate",
@@ -74,21 +77,22 @@ CALLS = {"command": command, "fetch": fetch}
 def serve(connection: socket.socket) -> None:
     """Makes one call after the other, each in a fork, until the connection is closed.
 
-    A request holds the call, its words, and modules to load before; with it come the descriptors to which it prints.
-    Answers: the id of its process with a handle of it, then its exit code. Where a module cannot be shared by forks
-    (it has started a thread, or opened a file or device), the answer is its name, and this process ends.
+    A request holds the call, its words, and the operators to load before, as `module:name`; with it come the
+    descriptors to which it prints. Answers: the id of its process with a handle of it, then its exit code. Where an
+    operator cannot be shared by forks (what it imports has started a thread, or opened a file or device), the answer is
+    its name, and this process ends.
     """
     loaded = set[str]()
     while True:
         data, given, _, _ = socket.recv_fds(connection, MOST_BYTES, 2)
         if not data:
             return
-        call, words, modules = msgpack.unpackb(data)
-        for module in modules:
-            if module not in loaded and not _load(module):
-                connection.send(msgpack.packb(["cold", module]))
+        call, words, operators = msgpack.unpackb(data)
+        for use in operators:
+            if use not in loaded and not _load(use):
+                connection.send(msgpack.packb(["cold", use]))
                 return
-            loaded.add(module)
+            loaded.add(use)
         become_warm()
         out, err = given
         pid = fork(partial(CALLS[call], words), (), os.environ, (out, err))
@@ -106,11 +110,12 @@ def serve(connection: socket.socket) -> None:
         connection.send(msgpack.packb(["ended", code]))
 
 
-def _load(module: str) -> bool:
-    """Loads a module, and returns whether forks can share it. An error in it is reported by the run that needs it."""
+def _load(use: str) -> bool:
+    """Loads an operator, and returns whether forks can share it. An error is reported by the run that needs it."""
     before = _opened()
+    module, _, name = use.partition(":")
     with contextlib.suppress(Exception, SystemExit):
-        importlib.import_module(module)
+        getattr(importlib.import_module(module), name)  # packages load the modules of operators when these are named
     return threads() == 1 and _opened() == before
 
 

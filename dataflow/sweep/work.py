@@ -79,7 +79,7 @@ def _once(task: Task, timeout: float, worker: Worker, stop: Event | None) -> Res
         if got := code == 0:
             words = [where if word is None else word for word in task.words]
             left = timeout - (time.monotonic() - began)
-            code = worker.call("command", words, task.modules, output, left, stop)
+            code = worker.call("command", words, task.operators, output, left, stop)
         said = output[1].read_bytes()[-LOG_BYTES:].decode(errors="replace")
         report = _read(output[0])
     outcome: Outcome = (
