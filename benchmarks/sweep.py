@@ -23,6 +23,7 @@ from typing import Any
 import psutil
 import pyarrow.parquet as parquet
 
+from dataflow.recording import Recording, RecordingWriter
 from dataflow.sweep.table import TIMES
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -50,9 +51,12 @@ operators:
   score:
     use: operators.evaluation:TrajectoryMetrics
     inputs: {{estimate: wheels/odometry, ground_truth: robot/true_base}}
+record: {{exclude: [wheels/odometry, wheels/status]}}
 """
 LASTS = 2
 """Seconds of each of many recordings."""
+HUNDRED = 100
+"""Recordings in a folder; with those of the first, workers are killed, and Ray is tried."""
 KILL_EVERY = 8
 """Results between two kills: a run that is killed a second time is left to the next sweep."""
 LOOK_EVERY = 0.5
@@ -69,6 +73,25 @@ def apart(pieces: Path, runs: Path) -> None:
     for piece in sorted(pieces.glob("*.mcap")):
         (runs / piece.stem).mkdir(parents=True)
         piece.rename(runs / piece.stem / "run.mcap")
+
+
+def cut(long: Path, runs: Path, number: int) -> None:
+    """Writes recordings of `LASTS` seconds each: what the sensors of a long one gave then, and all that is static."""
+    with Recording(long) as opened:
+        first = min(info.first for info in opened.streams.values() if info.first is not None and not info.static)
+        static = [m for m in opened.messages() if opened.streams[m.stream].static]
+        for part in range(number):
+            begin = first + part * LASTS * 10**9
+            folder = runs / f"{part // HUNDRED:02}" / f"{part:04}"
+            folder.mkdir(parents=True)
+            with RecordingWriter(folder / "run.mcap", metadata={}, namespace="robot1") as written:
+                for name, info in opened.streams.items():
+                    assert info.message_type is not None
+                    extra = {key: info.metadata[key] for key in ("operator", "port")}
+                    written.add_stream(name, info.message_type, static=info.static, extra=extra)
+                moving = [name for name, info in opened.streams.items() if not info.static]
+                for m in (*static, *opened.messages(moving, begin, begin + LASTS * 10**9 - 1)):
+                    written.write(m.stream, m.message, seq=m.seq)
 
 
 class Swept:
@@ -113,10 +136,11 @@ class Swept:
         ran = self.told["ran"]
         return f"{ran} | {self.took:.1f} | " + (f"{self.cpu / ran:.2f} |" if ran else "– |")
 
-    def rows(self) -> list[dict[str, Any]]:
-        """The table without what a clock says."""
+    def rows(self, below: str = "") -> list[dict[str, Any]]:
+        """The table's rows of the recordings in a folder, without what a clock says."""
         found = parquet.read_table(self.out / "sweep.parquet").to_pylist()
-        return [{name: value for name, value in row.items() if name not in TIMES} for row in found]
+        kept = [{name: value for name, value in row.items() if name not in TIMES} for row in found]
+        return [row | {"recording": n[len(below) :]} for row in kept if (n := row["recording"]).startswith(below)]
 
 
 def parts(number: int, folder: Path) -> None:
@@ -136,17 +160,17 @@ def parts(number: int, folder: Path) -> None:
 
 def many(number: int, folder: Path, *, ray: bool) -> None:
     """Many short recordings: memory, a second sweep, killed workers; the same table by Ray."""
-    graph, runs, pieces = folder / "light.yaml", folder / "runs", folder / "pieces"
+    graph, runs = folder / "light.yaml", folder / "runs"
     graph.write_text(LIGHT.format(duration=number * LASTS))
     call("run", graph, "--record", folder / "long.mcap", "--quiet", "--one-process")
-    call("split", folder / "long.mcap", "--every", f"{LASTS}s", "--out", pieces)
-    apart(pieces, runs)
+    cut(folder / "long.mcap", runs, number)
     print("| sweep | runs | s | CPU s a run |\n| --- | ---: | ---: | ---: |")
     first = Swept(graph, runs, folder / "first", "--jobs", 2)
     print(f"| first | {first.row}")
     again = Swept(graph, runs, folder / "first", "--jobs", 2)
     print(f"| again | {again.row}")
-    killing = Swept(graph, runs, folder / "killed", "--jobs", 2, killing=min(20, number // 10))
+    few, same = runs / "00", first.rows("00/")
+    killing = Swept(graph, few, folder / "killed", "--jobs", 2, killing=10)
     print(f"| with {killing.killed} killed | {killing.row}")
     print(f"\na second sweep takes {again.took / first.took:.1%} of the first")
     quarter = len(first.memory) // 4
@@ -154,10 +178,10 @@ def many(number: int, folder: Path, *, ray: bool) -> None:
         early, late = max(sizes[quarter : 2 * quarter]), max(sizes[-quarter:])
         print(f"MB of the {name}: {early:.0f} in the second quarter, {late:.0f} in the last")
     print(f"outcomes with {killing.killed} killed: {killing.told['settings'][0]['outcomes']}")
-    print(f"its table is the same: {killing.rows() == first.rows()}")
+    print(f"its table is the same: {killing.rows() == same}")
     if ray:
-        cluster = Swept(graph, runs, folder / "ray", "--ray", "local", "--jobs", 2)
-        print(f"Ray: {cluster.row}\nits table is the same: {cluster.rows() == first.rows()}")
+        cluster = Swept(graph, few, folder / "ray", "--ray", "local", "--jobs", 2)
+        print(f"Ray: {cluster.row}\nits table is the same: {cluster.rows() == same}")
 
 
 def main() -> None:
