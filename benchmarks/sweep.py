@@ -137,7 +137,7 @@ class Swept:
         return f"{ran} | {self.took:.1f} | " + (f"{self.cpu / ran:.2f} |" if ran else "– |")
 
     def rows(self, below: str = "") -> list[dict[str, Any]]:
-        """The table's rows of the recordings in a folder, without what a clock says."""
+        """The table's rows of the recordings in a folder, without the columns of times."""
         found = parquet.read_table(self.out / "sweep.parquet").to_pylist()
         kept = [{name: value for name, value in row.items() if name not in TIMES} for row in found]
         return [row | {"recording": n[len(below) :]} for row in kept if (n := row["recording"]).startswith(below)]

@@ -23,7 +23,7 @@ _OTHER_FILE = re.compile(
     r"(?P<locked>(?:\s*(?:Expected|or) [^\n]*\n)+)\s*Got\s+(?P<got>\w+)",
     re.DOTALL,
 )
-"""What pip says of a file whose hash is not the one asked for."""
+"""The words of pip about a file with another hash than was asked for."""
 _OPTIONS = (
     *("--index-url", "--extra-index-url", "--no-index", "--find-links", "--trusted-host"),
     *("--pre", "--prefer-binary", "--only-binary", "--no-binary"),
@@ -114,7 +114,7 @@ def _listed(options: list[str], pins: lock.Pins) -> Iterator[str]:
 
 def _options(requirements: Path) -> list[str]:
     """Returns the lines that say where packages are looked for. Raises `EnvError` for options that a lock cannot hold:
-    other files, whose changes it would not show, and hashes, which it has of its own."""
+    other files, whose changes it would not show, and hashes, which it takes itself."""
     found = []
     for line in map(str.strip, requirements.read_text().splitlines()):
         option = re.split(r"[\s=]", line, maxsplit=1)[0]

@@ -24,7 +24,7 @@ _warm = False
 
 
 def become_warm() -> None:
-    """Lets this process fork what it starts. What is loaded by now is never collected: pages stay shared."""
+    """Lets this process fork what it starts. Modules loaded by now are never collected, so that pages stay shared."""
     global _warm
     _warm = True
     gc.collect()
@@ -137,7 +137,7 @@ def fork(
 
 
 def _take_streams(output: tuple[int, int] | None, handed: frozenset[int]) -> None:
-    """Gives this process standard streams of its own, and closes what else it has inherited."""
+    """Gives this process separate standard streams, and closes all else that it has inherited."""
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
     if output is not None:

@@ -47,7 +47,7 @@ class Worker:
         stop: Event | None = None,
     ) -> int | None:
         """Makes a call, with `operators` (`module:name`) loaded before; returns its exit code, negative for a signal,
-        None after `timeout` seconds or where it was stopped. What it prints is in the two files. Nothing that it
+        None after `timeout` seconds or where it was stopped. Its output goes to the two files. Nothing that it
         started outlives this call.
         """
         deadline = time.monotonic() + timeout
