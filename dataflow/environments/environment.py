@@ -97,7 +97,7 @@ def environment_of(env: str) -> Environment:
 
 @functools.lru_cache(maxsize=64)
 def _probed(python: str, state: tuple[tuple[int, int, int], ...]) -> tuple[Any, Any, Any]:
-    """Returns version, import path and engine of an interpreter: asked once, as long as the environment's `state` is the same."""
+    """Returns version, import path and engine of an interpreter: asked once while the `state` lasts."""
     probe = [python, "-I", "-c", _PROBE]
     answer = subprocess.run(probe, capture_output=True, text=True, timeout=_PROBE_WITHIN, check=True).stdout
     version, path, engine = json.loads(answer)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import closing, suppress
+from contextlib import closing, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -80,25 +81,31 @@ def on_ray(
         raise SweepError(
             f"--ray {address}: {error}; 'local' begins a cluster here, 'auto' takes a running one"
         ) from error
-    try:
-        remote = ray.remote(num_cpus=1, max_retries=1)(_there)
-        most = max(1, int(ray.cluster_resources().get("CPU", 1))) * AHEAD
-        left, running = iter(tasks), dict[Any, Task]()
-        while True:
-            while len(running) < most and (task := next(left, None)) is not None:
-                running[remote.remote(task, timeout)] = task
-            if not running:
-                return
-            for over in ray.wait(list(running))[0]:
-                task = running.pop(over)
-                try:
-                    yield task, ray.get(over)
-                except ray.exceptions.RayError as error:
-                    text = f"{type(error).__name__}: {error}"
-                    yield task, Result(task.key, "killed", -1, text.splitlines()[0], ({},), 0.0, text)
-    finally:
-        with suppress(Exception):  # an interrupted cluster that does not answer must not hide why it was left
-            ray.shutdown()
+    with redirect_stdout(sys.stderr):  # Ray's threads print there that a process was killed, and results go there, too
+        try:
+            yield from _awaited(ray, tasks, timeout)
+        finally:
+            with suppress(Exception):  # an interrupted cluster that does not answer must not hide why it was left
+                ray.shutdown()
+
+
+def _awaited(ray: Any, tasks: Sequence[Task], timeout: float) -> Generator[tuple[Task, Result]]:
+    """Yields tasks with their results as they end on the cluster to which this process is connected."""
+    remote = ray.remote(num_cpus=1, max_retries=1)(_there)
+    most = max(1, int(ray.cluster_resources().get("CPU", 1))) * AHEAD
+    left, running = iter(tasks), dict[Any, Task]()
+    while True:
+        while len(running) < most and (task := next(left, None)) is not None:
+            running[remote.remote(task, timeout)] = task
+        if not running:
+            return
+        for over in ray.wait(list(running))[0]:
+            task = running.pop(over)
+            try:
+                yield task, ray.get(over)
+            except ray.exceptions.RayError as error:
+                text = f"{type(error).__name__}: {error}"
+                yield task, Result(task.key, "killed", -1, text.splitlines()[0], ({},), 0.0, text)
 
 
 _worker: Worker | None = None
