@@ -24,6 +24,8 @@ STEP = 0.2
 LEAVE_WITHIN = 10.0
 """Seconds that a warm process gets to end, with what it has forked."""
 KILLED = -int(signal.SIGKILL)
+STANDARD_ERROR = 2
+"""Where modules print that are imported for all runs: standard output is for results."""
 
 
 class Worker:
@@ -94,6 +96,7 @@ class Worker:
                     pass_fds=(theirs.fileno(),),
                     env={**environment(1), "PYTHONUNBUFFERED": "1"},
                     stdin=subprocess.DEVNULL,
+                    stdout=STANDARD_ERROR,
                     process_group=0,
                 )
             self._socket = ours

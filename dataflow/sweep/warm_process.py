@@ -83,17 +83,18 @@ def serve(connection: socket.socket) -> None:
     its name, and this process ends.
     """
     loaded = set[str]()
+    become_warm()
     while True:
         data, given, _, _ = socket.recv_fds(connection, MOST_BYTES, 2)
         if not data:
             return
         call, words, operators = msgpack.unpackb(data)
-        for use in operators:
-            if use not in loaded and not _load(use):
+        for use in (use for use in operators if use not in loaded):
+            if not _load(use):
                 connection.send(msgpack.packb(["cold", use]))
                 return
             loaded.add(use)
-        become_warm()
+            become_warm()
         out, err = given
         pid = fork(partial(CALLS[call], words), (), os.environ, (out, err))
         for descriptor in given:

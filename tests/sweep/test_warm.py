@@ -15,6 +15,7 @@ from dataflow.sweep.warm import KILLED, Worker
 
 THREAD = """
 import threading
+print("imported")
 threading.Thread(target=threading.Event().wait, daemon=True).start()
 class Operator: pass
 """
@@ -52,7 +53,11 @@ def test_calls_are_forks_of_one_process(worker: Worker, output: tuple[Path, Path
 
 
 def test_what_starts_a_thread_when_it_is_imported_is_left_to_each_run(
-    worker: Worker, output: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    worker: Worker,
+    output: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "starts_a_thread.py").write_text(THREAD)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -61,6 +66,7 @@ def test_what_starts_a_thread_when_it_is_imported_is_left_to_each_run(
     first = warm(worker)
     assert worker.call("command", ["--version"], uses, output, 60) == 0
     assert warm(worker) == first
+    assert capfd.readouterr() == ("", "imported\n")
 
 
 @pytest.fixture
