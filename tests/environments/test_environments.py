@@ -170,6 +170,22 @@ def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_pat
         run(graph(tmp_path))
 
 
+def test_an_environment_is_asked_once_until_it_changes(tmp_path: Path) -> None:
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.write_text(f"#!/bin/sh\necho asked >> {tmp_path}/asked\necho '[{list(sys.version_info[:2])}, [], null]'\n")
+    python.chmod(0o755)
+    (packages := tmp_path / "lib" / "python3" / "site-packages").mkdir(parents=True)
+
+    def asked() -> int:
+        environment_of(str(tmp_path))
+        return len((tmp_path / "asked").read_text().splitlines())
+
+    assert [asked(), asked()] == [1, 1]
+    (packages / "other.pth").touch()
+    assert asked() == 2
+
+
 def test_an_environment_that_cannot_serve_is_refused_with_what_would_be_right(tmp_path: Path) -> None:
     with pytest.raises(EnvError, match=r"no environment: .*bin/python is missing; `.* -m venv .*none` makes one"):
         environment_of(str(tmp_path / "none"))
@@ -201,12 +217,12 @@ def test_requirements_without_their_lock_or_environment_are_refused(tmp_path: Pa
     assert "there is no file" in why()
     requirements.write_text("tiny\n")
     assert "gains.lock is missing" in why()
-    lock.write(requirements, ["tiny==1.0"])
+    lock.write(requirements, (), {"tiny==1.0": ()})
     assert "gains.env is not built" in why()
     environment(tmp_path / "gains.env", "1.0", 2.0)
     lock.note_built(requirements)
     assert environment_of(str(requirements)).folder == tmp_path / "gains.env"
-    lock.write(requirements, ["tiny==1.1"])
+    lock.write(requirements, (), {"tiny==1.1": ()})
     assert "gains.env was built from another lock" in why()
     requirements.write_text("tiny>1\n")
     assert "gains.lock is out of date" in why()
