@@ -264,7 +264,11 @@ class RgbdOdometry:
     # -- keyframes ---------------------------------------------------------------------------------------
 
     def _new_keyframe(self, frame: Frame, fit: Fit, sunk: Vector) -> bool:
-        """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest."""
+        """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest.
+
+        A recognised frame is due: the corners of the newest keyframe may lie elsewhere, and the next frames would be
+        held by their depth alone.
+        """
         newest, surface = self.state.map.newest, fit.movers.left_out_of(frame.surface)
         baseline = view_distance(newest.T_world_camera, fit.T_world_camera, surface.typical_depth)
         expected = newest.surface.coverage * fit.offered  # what meets a hole of the keyframe has not left its view
@@ -276,7 +280,8 @@ class RgbdOdometry:
             return False
         candidate = self._keyframe(frame, fit)
         richer = len(candidate.points) > 1.5 * fit.inliers + self.config.min_inliers
-        due = richer or ((moved or better) and len(candidate.points) >= fit.inliers)
+        found_again = fit.recognised and frame.depth_flaw is None and len(candidate.points) >= self.config.min_inliers
+        due = found_again or richer or ((moved or better) and len(candidate.points) >= fit.inliers)
         if due:
             self.state.map.add(replace(candidate, sunk=sunk))
         return due

@@ -412,6 +412,16 @@ def test_a_track_across_a_gap_is_believed_whatever_the_size_of_the_image(monkeyp
     assert np.linalg.norm((invert(truth) @ result.T_world_camera)[:3, 3]) < 0.02
 
 
+def test_a_view_that_is_found_again_is_remembered_for_the_corners_of_the_next() -> None:
+    frames, _ = sequence(60, 1.5)
+    odometry = RgbdOdometry(camera())
+    for i in range(20):
+        odometry.track(*frames[i], int(i * 1e9 / 30))
+    result = odometry.track(*frames[12], int(20e9 / 30) + 2_000_000_000)
+    assert result.status is Status.RELOCALISED
+    assert result.keyframe
+
+
 def at_a_wrong_place(state: RgbdState, since: int, T_wrong: NDArray[np.float64]) -> RgbdState:
     """The state of an odometry that was found again at stamp `since`, and placed wrong by a motion in the world."""
     assert state.motion is not None
