@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 SAMPLES = 200  # triples of features
 BEST = 5  # poses of these that are fitted to all features that agree
 ROUNDS = 3
+FEWEST = 4  # features that a pose is fitted to
 APART = 10.0  # working pixels between features of one triple
 PIXEL = 0.5  # working pixels by which recognised features err, where tracks err less
 BEYOND = 11.3  # squared sigmas, 99 % of three degrees of freedom: a feature beyond is of another body
@@ -63,51 +64,56 @@ def _count(sighting: Sighting, chosen: NDArray[np.bool_]) -> int:
 def _body(sighting: Sighting, seen: Points, fitter: Fitter) -> tuple[Matrix, NDArray[np.bool_]] | None:
     """Returns the pose on which the most surface agrees, and which features (N,) do."""
     poses = _drawn(sighting, fitter)
-    if not poses:
+    if not len(poses):
         return None
-    area = seen[:, 2] ** 2
-
-    def cost(T: Matrix) -> float:
-        return float(area @ np.minimum(_squared(T, sighting, seen, fitter), BEYOND))
-
-    fitted = []
-    for T in sorted(poses, key=cost)[:BEST]:
-        for _ in range(ROUNDS):
-            agree = _squared(T, sighting, seen, fitter) < BEYOND
-            if np.count_nonzero(agree) < 4:
-                break
-            T = align(T, [_term(_part(sighting, agree), fitter)], PriorTerm(T, WEAK), 5).T_world_camera
-        fitted.append(T)
-    best = min(fitted, key=cost)
-    return best, _squared(best, sighting, seen, fitter) < BEYOND
+    best = poses[np.argsort(_cost(poses, sighting, seen, fitter), kind="stable")[:BEST]]
+    for _ in range(ROUNDS):
+        agree = _squared(best, sighting, seen, fitter) < BEYOND
+        best = np.stack([_fitted(T, _part(sighting, on), fitter) for T, on in zip(best, agree, strict=True)])
+    T = best[int(np.argmin(_cost(best, sighting, seen, fitter)))]
+    return T, _squared(T[None], sighting, seen, fitter)[0] < BEYOND
 
 
-def _drawn(sighting: Sighting, fitter: Fitter) -> list[Matrix]:
-    """Returns the poses of triples of features, drawn alike at every call."""
+def _drawn(sighting: Sighting, fitter: Fitter) -> Array:
+    """Returns the poses (M, 4, 4) of triples of features, drawn alike at every call."""
     n, poses = len(sighting.pixels), list[Matrix]()
     rng = np.random.default_rng(n)
-    for _ in range(SAMPLES if n >= 4 else 0):
-        chosen = rng.choice(n, 3, replace=False)
+    for chosen in rng.random((SAMPLES, n)).argsort(axis=1)[:, :3] if n >= FEWEST else ():
         points, pixels = sighting.points_world[chosen], sighting.pixels[chosen]
-        if min(np.linalg.norm(pixels - np.roll(pixels, 1, axis=0), axis=1)) < APART:
+        if np.square(pixels - pixels[[1, 2, 0]]).sum(axis=1).min() < APART**2:
             continue
         _, turns, shifts = cv2.solveP3P(points, pixels, fitter.camera.K_color, None, flags=cv2.SOLVEPNP_AP3P)
         for turn, shift in zip(turns, shifts, strict=True):
             T_color_world = np.eye(4)
             T_color_world[:3, :3], T_color_world[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
             poses.append(invert(T_color_world) @ fitter.camera.T_color_depth)
-    return [T for T in poses if np.isfinite(T).all()]
+    found = np.array(poses).reshape(-1, 4, 4)
+    return found[np.isfinite(found).all(axis=(1, 2))]
 
 
-def _squared(T_world_camera: Matrix, sighting: Sighting, seen: Points, fitter: Fitter) -> Array:
-    """Returns by how many squared sigmas (N,) features are off a pose, by their pixels and their depths together."""
-    points = transform_points(invert(T_world_camera), sighting.points_world)
-    color = transform_points(fitter.camera.T_color_depth, points)
+def _fitted(T_world_camera: Matrix, sighting: Sighting, fitter: Fitter) -> Matrix:
+    """Returns a pose fitted to the pixels of all features, if these are enough."""
+    if len(sighting.pixels) < FEWEST:
+        return T_world_camera
+    return align(T_world_camera, [_term(sighting, fitter)], PriorTerm(T_world_camera, WEAK), 5).T_world_camera
+
+
+def _cost(poses: Array, sighting: Sighting, seen: Points, fitter: Fitter) -> Array:
+    """Returns what poses (M, 4, 4) leave unexplained (M,): each feature stands for a surface, by its depth squared."""
+    return np.asarray(np.minimum(_squared(poses, sighting, seen, fitter), BEYOND) @ seen[:, 2] ** 2, np.float64)
+
+
+def _squared(poses: Array, sighting: Sighting, seen: Points, fitter: Fitter) -> Array:
+    """Returns by how many squared sigmas (M, N) features are off poses (M, 4, 4), by pixels and depths together."""
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    points = np.einsum("mji,mnj->mni", R, sighting.points_world - t[:, None])
+    color = transform_points(fitter.camera.T_color_depth, points.reshape(-1, 3))
     ahead = color[:, 2] > 0.05
-    off = project(np.where(ahead[:, None], color, 1.0), fitter.camera.K_color) - sighting.pixels
+    pixels = project(np.where(ahead[:, None], color, 1.0), fitter.camera.K_color).reshape(len(poses), -1, 2)
+    off = pixels - sighting.pixels
     sigma = np.sqrt(2.0) * fitter.noise.depth * fitter.config.depth_noise.sigma(seen[:, 2])
-    squared = np.einsum("ij,ij->i", off, off) / _pixel(fitter) ** 2 + ((points[:, 2] - seen[:, 2]) / sigma) ** 2
-    return np.where(ahead, squared, np.inf)
+    squared = np.square(off).sum(axis=2) / _pixel(fitter) ** 2 + ((points[:, :, 2] - seen[:, 2]) / sigma) ** 2
+    return np.where(ahead.reshape(squared.shape), squared, np.inf)
 
 
 def _term(sighting: Sighting, fitter: Fitter) -> PixelTerm:
