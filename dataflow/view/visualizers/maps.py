@@ -1,11 +1,11 @@
-"""Maps: occupancy grids, meshes, planes."""
+"""Maps: occupancy grids, rooms, meshes, planes."""
 
 from __future__ import annotations
 
 import numpy as np
 import rerun as rr
 
-from dataflow.messages import Mesh, OccupancyGrid, Planes
+from dataflow.messages import Mesh, OccupancyGrid, Planes, Rooms
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
@@ -13,6 +13,7 @@ from dataflow.view.visualizers.clouds import finite_rows
 
 _UNBOUNDED = 2.0  # metres: side of the square that stands for a plane without an extent
 _NORMAL = 0.3  # metres
+_DOOR = (255, 205, 70)
 _SHEER = 90  # opacity of planes, of 255
 
 
@@ -35,6 +36,43 @@ def occupancy_grid(canvas: Canvas, message: OccupancyGrid) -> None:
             quaternion=rr.Quaternion(xyzw=(0.0, 0.0, 0.0, 1.0) if message.orientation is None else message.orientation),
             colormap=rr.components.Colormap.RvizMap,
             opacity=0.45,
+        ),
+    )
+
+
+@visualizer(Rooms, "space")
+def rooms(canvas: Canvas, message: Rooms) -> None:
+    """The floor of each room in its own colour, with its area; doors as points with their widths."""
+    height, width = message.cells.shape
+    if not message.count or not height or not width:
+        canvas.clear("space")
+        canvas.clear("space/places")
+        return
+    shades = np.zeros((message.count + 1, 4), np.uint8)
+    shades[:-1, :3], shades[:-1, 3] = colors.of_identities(message.ids.tolist()), 110
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.GridMap(
+            data=shades[message.cells[::-1]].tobytes(),  # -1, none, is the last row of the table: clear
+            format=rr.components.ImageFormat(width=width, height=height, color_model="RGBA", channel_datatype="U8"),
+            cell_size=message.resolution,
+            translation=message.position,
+            quaternion=rr.Quaternion(xyzw=(0.0, 0.0, 0.0, 1.0) if message.orientation is None else message.orientation),
+        ),
+    )
+    names = [f"room {i}: {area:.1f} m²" for i, area in zip(message.ids.tolist(), message.areas.tolist(), strict=True)]
+    doors = [f"door {width:.2f} m" for width in message.door_widths.tolist()]
+    paint = np.concatenate([colors.of_identities(message.ids.tolist()), np.tile(_DOOR, (len(doors), 1))])
+    canvas.draw(
+        "space/places",
+        message.frame,
+        rr.Points3D(
+            np.concatenate([message.centers, message.door_positions]),
+            colors=paint.astype(np.uint8),
+            labels=[*names, *doors],
+            radii=rr.Radius.ui_points(3.0),
+            show_labels=True,
         ),
     )
 
