@@ -33,7 +33,7 @@ class RoomSegmenter(Operator):
     A door is a passage between `narrowest` and `widest` that is narrower than the rooms on both sides of it; wider
     openings do not part rooms, and robots do not pass narrower ones. Unknown space is no wall: the shadow of a table
     does not part a room. Desks leave passages as narrow as doors, so the map should be of what stands higher than
-    furniture (`OccupancyMapper` with `lower` at 1.2 m, say). What stands free and is small is left out anyway.
+    furniture (`OccupancyMapper` with `lower` at 1.2 m, say). Small things that stand free are left out anyway.
 
     Method: distance transform and watershed, as compared by Bormann et al., "Room segmentation: survey, implementation,
     and analysis", 2016.

@@ -24,7 +24,7 @@ class RoomSettings:
     """Lengths in metres, areas in square metres.
 
     Passages between `narrowest` and `widest` may be doors; one is where it is at most `narrowing` times as wide as both
-    rooms. Smaller rooms than `area` are parts of others. What stands free and measures less than `island` is no wall.
+    rooms. Smaller rooms than `area` are parts of others. Free-standing things shorter than `island` are no walls.
     """
 
     widest: float = 1.2
@@ -91,8 +91,11 @@ def _widths(walls: Mask, resolution: float) -> NDArray[np.float32]:
     """Returns how wide a circle around each cell meets no wall; beyond the grid there is none."""
     if not walls.any():
         return np.full(walls.shape, np.inf, np.float32)
-    away = cv2.distanceTransform((~walls).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray((2 * away - 1) * np.float32(resolution), np.float32)
+    height, width = walls.shape
+    halves = np.repeat(np.repeat(~walls, 2, axis=0), 2, axis=1)  # the middle of an even number of cells is between two
+    away = cv2.distanceTransform(halves.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    most = away.reshape(height, 2, width, 2).max(axis=(1, 3))
+    return np.asarray(most * np.float32(resolution), np.float32)
 
 
 def _bridged(floor: Mask, walls: Mask, cells: float) -> Mask:
