@@ -15,7 +15,7 @@ from dataflow.messages.images import (
     RelativeDepth,
 )
 from dataflow.messages.inertial import Imu, MagneticField
-from dataflow.messages.mapping import Mesh, OccupancyGrid, Planes
+from dataflow.messages.mapping import Mesh, OccupancyGrid, Planes, Rooms
 from dataflow.messages.poses import NavSatFix, Odometry, ParticleSet, Path, Point, Pose, Transforms, Twist
 from dataflow.messages.ranging import LaserScan, RadarScan, RangeReading
 from dataflow.messages.scene import Activity, Classification, FeatureVector, SceneGraph
@@ -65,6 +65,7 @@ __all__ = [
     "RadarScan",
     "RangeReading",
     "RelativeDepth",
+    "Rooms",
     "SceneGraph",
     "SegmentationMap",
     "Switch",

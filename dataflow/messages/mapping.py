@@ -1,4 +1,4 @@
-"""Maps of the surroundings: occupancy grids, meshes, planes."""
+"""Maps of the surroundings: occupancy grids, rooms, meshes, planes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import (
     positive,
     together,
+    unique,
     unit_quaternions,
     unit_vectors,
     within,
@@ -43,6 +44,48 @@ class OccupancyGrid(Message):
 
     def _picture(self) -> Picture | None:
         return pictures.of_occupancy(self.cells)
+
+
+class Rooms(Message):
+    """A floor divided into rooms, and the doors between them. Cells lie as those of an `OccupancyGrid`."""
+
+    frame: str = scalar("str", "frame in which the origin is expressed")
+    resolution: float = scalar("float", "side of a cell, metres")
+    cells: I32 = array("int32", "H W", "room of each cell, an index into `ids`, -1 for none")
+    position: F64 = array("float64", "3", "outer corner of cell (0, 0) in `frame`", unit="m")
+    orientation: F64 | None = array(
+        "float64",
+        "4",
+        "unit quaternion (x, y, z, w) of the grid's axes in `frame`; None for parallel axes",
+        default=None,
+    )
+    ids: I64 = array("int64", "N", "identity of each room over time, unique")
+    areas: F64 = array("float64", "N", "floor of each room that was seen", unit="m²")
+    centers: F64 = array("float64", "N 3", "place in each room that is farthest from its walls, in `frame`", unit="m")
+    doors: I32 = array("int32", "D 2", "the two rooms that each door joins, indices into `ids`")
+    door_positions: F64 = array("float64", "D 3", "middle of each door, in `frame`", unit="m")
+    door_widths: F64 = array("float64", "D", "clear width of each door", unit="m")
+
+    def validate(self) -> None:
+        rooms = len(self.ids)
+        positive(self, "resolution")
+        unit_quaternions(self, "orientation")
+        unique(self, "ids")
+        within_length(self, "cells", rooms, f"be -1 or index the {rooms} rooms of ids", none=-1)
+        within_length(self, "doors", rooms, f"index the {rooms} rooms of ids")
+        within(self, 0.0, float("inf"), "areas", "door_widths")
+
+    @property
+    def count(self) -> int:
+        """Number of rooms."""
+        return len(self.ids)
+
+    def matrix(self) -> F64:
+        """`T_frame_grid` (4, 4)."""
+        return transform_matrix(self.position, (0.0, 0.0, 0.0, 1.0) if self.orientation is None else self.orientation)
+
+    def _picture(self) -> Picture | None:
+        return pictures.of_classes(self.cells[::-1])
 
 
 class Mesh(Message):

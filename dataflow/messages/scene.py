@@ -37,6 +37,14 @@ class SceneGraph(Message):
         default=None,
         added=True,
     )
+    areas: F32 | None = array(
+        "float32",
+        "N",
+        "floor of each node that is a room, as far as it was seen; NaN for other nodes",
+        unit="m²",
+        default=None,
+        added=True,
+    )
     tracks: I64 | None = array(
         "int64", "T", "ids of tracks in images that are of nodes, by node, latest last", default=None, added=True
     )
@@ -57,6 +65,7 @@ class SceneGraph(Message):
         within(self, 0.0, float("inf"), "sizes")
         within(self, 0.0, 1.0, "scores", "relation_scores")
         within(self, 0.0, 1.0, "moving", nan=True)
+        within(self, 0.0, float("inf"), "areas", nan=True)
         unit_quaternions(self, "orientations")
 
     @property

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dataflow.messages.scene import Activity, SceneGraph
 
@@ -29,6 +29,9 @@ SURROUNDINGS = frozenset(("near", "left_of", "right_of", "in_front_of", "behind"
 
 FLOOR = 0
 """The id of the floor; places and the robot itself have lower ones."""
+
+ROOMS = -1_000_000
+"""Ids below this are rooms."""
 
 LEAST = 0.5
 """Score from which a relation is told; of an intention any."""
@@ -55,6 +58,7 @@ class SceneSummary:
     - `agents`: the nodes that have an activity or are the subject of an `ACTING` predicate.
     - `places`: the nodes that others are in, or that only part them: room, floor, walls; not a top that carries things.
     - `tops`: surfaces that are part of a thing, which is told in their place.
+    - `rooms`: by node of a room where there are several, the nodes that are in it.
     """
 
     carriers: Mapping[int, Told]
@@ -64,6 +68,7 @@ class SceneSummary:
     agents: frozenset[int] = frozenset()
     places: frozenset[int] = frozenset()
     tops: frozenset[int] = frozenset()
+    rooms: Mapping[int, Sequence[int]] = field(default_factory=dict)
 
     def carried(self, node: int) -> tuple[int, ...]:
         """The nodes that `node` carries, by index."""
@@ -90,8 +95,12 @@ def summarize(graph: SceneGraph, activities: Activity | None = None, most: int =
     every = [
         Told(s, p, o, score)
         for (s, p, o), score in zip(graph.relations(), scores, strict=True)
-        if s != o and p not in SURROUNDINGS
+        if s != o and p not in SURROUNDINGS and ids[o] >= ROOMS
     ]
+    rooms: dict[int, list[int]] = {k: [] for k, i in enumerate(ids) if i < ROOMS}
+    for s, p, o in graph.relations():
+        if p == "in" and o in rooms:
+            rooms[o].append(s)
     carrying = [r for r in every if r.predicate in CARRYING and r.score >= LEAST]
     carriers = _carriers(carrying, tops)
     intentions = sorted((r for r in every if r.predicate == HEADS_FOR), key=lambda r: (r.subject, -r.score))
@@ -112,7 +121,7 @@ def summarize(graph: SceneGraph, activities: Activity | None = None, most: int =
         children.setdefault(relation.object, []).append(child)
     bearing = {o for o, carried in children.items() if ids[o] < FLOOR and any(ids[c] > 0 for c in carried)}
     places = frozenset(k for k, i in enumerate(ids) if i <= FLOOR) - tops - bearing
-    return SceneSummary(carriers, children, tuple(told[:most]), tuple(intentions), agents, places, tops)
+    return SceneSummary(carriers, children, tuple(told[:most]), tuple(intentions), agents, places, tops, rooms)
 
 
 def _carriers(relations: Sequence[Told], tops: Collection[int]) -> dict[int, Told]:
@@ -201,6 +210,21 @@ def carriers_in_words(graph: SceneGraph, summary: SceneSummary) -> list[Row]:
                 words.append(f"{spaced(way)} it {grouped([names[c] for c in part], [classes[c] for c in part])}")
             rows.append(Row(names[node], "; ".join(words)))
     return rows + bare
+
+
+def rooms_in_words(graph: SceneGraph, summary: SceneSummary) -> list[Row]:
+    """A row for each room where there are several: its area, the rooms behind its doors, and what is in it."""
+    names, classes, ids = graph.names(), class_names(graph), graph.ids.tolist()
+    doors = [(s, o) for s, p, o in graph.relations() if p == "connected_to"]
+    rows = []
+    for room in sorted(summary.rooms, key=lambda k: -ids[k]):
+        words = [] if graph.areas is None else [f"{graph.areas[room]:.1f} m²"]
+        beyond = sorted({o if s == room else s for s, o in doors if room in (s, o)}, key=lambda k: -ids[k])
+        words += [f"connected to {', '.join(names[k] for k in beyond)}"] if beyond else []
+        inside = summary.rooms[room]
+        words += [f"in it {grouped([names[k] for k in inside], [classes[k] for k in inside])}"] if inside else []
+        rows.append(Row(names[room], "; ".join(words)))
+    return rows
 
 
 def grouped(names: Sequence[str], classes: Sequence[str]) -> str:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from dataflow.messages import Odometry, Transforms
-from dataflow.messages.geometry import invert
+from dataflow.messages import Message, Odometry, Path, Transforms
+from dataflow.messages.geometry import invert, matrix_to_quaternion, quaternion_to_matrix
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
+
+
+@dataclass(kw_only=True)
+class State(Counts):
+    """Holds the stamp of the last path that was given."""
+
+    path: int = -1
 
 
 class BaseOdometry(Operator):
@@ -24,30 +33,49 @@ class BaseOdometry(Operator):
 
     sensor: In[Odometry] = In(doc="pose of a sensor in the frame where that sensor began")
     extrinsics: Sampled[Transforms] = Sampled(doc="holds the transform between the sensor's frame and the base's")
+    path: Sampled[Path] = Sampled(
+        required=False, doc="keyframes of the sensor as SLAM has them, in the frame of its poses"
+    )
     odometry: Out[Odometry] = Out(doc="the base in `frame`, with covariance where the sensor's has one")
+    keyframes: Out[Path] = Out(doc="the base at those keyframes, in `frame`; where a new `path` came")
 
     base_frame: str = Param("base_link", min_length=1, doc="frame of the robot's base")
     frame: str = Param("odom_base", min_length=1, doc="name of the frame in which the base began")
 
-    state: Counts
+    state: State
 
-    def process(self, sensor: Odometry, extrinsics: Transforms) -> Odometry | None:
-        """Raises ValueError where the extrinsics do not hold the sensor."""
+    def process(self, sensor: Odometry, extrinsics: Transforms, path: Path | None = None) -> dict[str, Message]:
+        """Raises ValueError where the extrinsics do not hold the sensor, or the path is in another frame."""
         T_base_sensor = transform_between(extrinsics, sensor.child_frame, self.base_frame)
         if _without_scale(sensor) and T_base_sensor[:3, 3].any():
             self.state.counts["poses without scale"] += 1
-            return None
+            return {}
         if not (np.isfinite(sensor.position).all() and np.isfinite(sensor.orientation).all()):
             self.state.counts["poses not finite"] += 1
-            return None
+            return {}
         T = T_base_sensor @ sensor.matrix() @ invert(T_base_sensor)
-        return Odometry.from_matrix(
+        odometry = Odometry.from_matrix(
             T,
             stamp=sensor.stamp,
             frame=self.frame,
             child_frame=self.base_frame,
             pose_covariance=_carried(sensor, T_base_sensor, T),
         )
+        if path is None or path.stamp == self.state.path:
+            return {"odometry": odometry}
+        if path.frame != sensor.frame:
+            raise ValueError(f"the path is in {path.frame!r}, the sensor's poses are in {sensor.frame!r}")
+        self.state.path = path.stamp
+        return {"odometry": odometry, "keyframes": self._of_base(path, T_base_sensor)}
+
+    def _of_base(self, path: Path, T_base_sensor: np.ndarray) -> Path:
+        T = np.tile(np.eye(4), (path.count, 1, 1))
+        T[:, :3, 3] = path.positions
+        if path.orientations is not None:
+            T[:, :3, :3] = [quaternion_to_matrix(q) for q in path.orientations]
+        T = T_base_sensor @ T @ invert(T_base_sensor)
+        turned = None if path.orientations is None else matrix_to_quaternion(T[:, :3, :3]).reshape(-1, 4)
+        return path.replace(frame=self.frame, positions=T[:, :3, 3], orientations=turned)
 
 
 def _without_scale(sensor: Odometry) -> bool:

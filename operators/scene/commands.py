@@ -16,6 +16,7 @@ from dataflow.messages.scene_summary import (
     agents_in_words,
     carriers_in_words,
     movers_in_words,
+    rooms_in_words,
     spaced,
     summarize,
 )
@@ -209,6 +210,7 @@ def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since
     )
     who = [(row.name, row.text) for row in agents_in_words(graph, told, activities)]
     moving = [(row.name, row.text) for row in movers_in_words(graph, told, activities)]
+    rooms = [(row.name, row.text) for row in rooms_in_words(graph, told)]
     what = [(row.name, row.text) for row in carriers_in_words(graph, told)]
     others = [
         (names[r.subject], f"{spaced(r.predicate)} {names[r.object]} {r.score:.2f}")
@@ -216,6 +218,7 @@ def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since
         if r.subject not in told.agents
     ]
     for title, rows in (
+        ("rooms", rooms),
         ("who does what", who),
         ("what moves", moving),
         ("what carries what", what),

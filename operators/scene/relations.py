@@ -34,7 +34,11 @@ PREDICATES = (
     "approaching",
     "reaching_for",
     "heads_for",
+    "connected_to",
 )
+SYMMETRIC = frozenset({"near", "connected_to"})
+"""Predicates that hold both ways, and are stored once."""
+
 FLOOR, ROBOT, ROOM = 0, -1, -2
 """Ids of nodes that are not objects."""
 
@@ -47,7 +51,7 @@ TABLETOP = "tabletop"
 """Class of the surfaces above the floor on which things stand."""
 
 SURFACE = -10
-"""Ids below this are surfaces other than the floor: walls, table tops, ceilings."""
+"""Ids below this are surfaces other than the floor: walls, table tops, ceilings; or rooms, far below it."""
 
 
 @dataclass(frozen=True)

@@ -46,15 +46,21 @@ def corrections(
     }
 
 
-def path_of(poses: list[Matrix], map_frame: str, stamp: int) -> Path:
-    """Returns keyframes as the map has them."""
-    T = np.array(poses)
-    return Path(stamp=stamp, frame=map_frame, positions=T[:, :3, 3], orientations=matrix_to_quaternion(T))
+def path_of(poses: list[tuple[int, Matrix]], map_frame: str, stamp: int) -> Path:
+    """Returns keyframes, by time, as the map has them; without times where these do not rise (a map of another run)."""
+    T, times = np.array([pose for _, pose in poses]), np.array([each for each, _ in poses], np.int64)
+    return Path(
+        stamp=stamp,
+        frame=map_frame,
+        positions=T[:, :3, 3],
+        orientations=matrix_to_quaternion(T),
+        stamps=times if (np.diff(times) > 0).all() else None,
+    )
 
 
-def map_poses(graph: PlaceGraph[Any]) -> list[Matrix]:
-    """Returns the poses of the nodes whose place in the map is known."""
-    return [node.T for node in graph.nodes.values() if node.island in graph.tied]
+def map_poses(graph: PlaceGraph[Any]) -> list[tuple[int, Matrix]]:
+    """Returns times and poses of the nodes whose place in the map is known."""
+    return [(node.stamp, node.T) for node in graph.nodes.values() if node.island in graph.tied]
 
 
 def sizes(graph: PlaceGraph[Any]) -> dict[str, int]:

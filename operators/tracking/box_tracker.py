@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,7 +47,8 @@ class BoxTrackerSettings:
 class BoxTrack:
     """One object that is followed. Times in nanoseconds; `evidence` in log odds.
 
-    `row` is that of the detection that it was matched with now, -1 for none.
+    `row` is that of the detection that it was matched with now, -1 for none. `twins` are the ids of tracks that it was
+    never seen apart from: they may be of the same object.
     """
 
     id: int
@@ -59,6 +61,7 @@ class BoxTrack:
     hits: int = 1
     feature: Array | None = None
     row: int = -1
+    twins: set[int] = field(default_factory=set)
 
     @property
     def score(self) -> float:
@@ -73,6 +76,11 @@ class BoxTracker(Remembered):
     vectors, their cosine. Confirmed tracks that are left are matched with strong detections that are left, by the
     overlap of enlarged boxes (Yang et al., "Hard to track objects with irregular motions", 2023), then with weak ones
     (Zhang et al., "ByteTrack", 2022). Boxes of different classes never match.
+
+    Detectors give some objects two strong boxes in one image, and weak ones beside a strong one. So a track that begins
+    over another of its class is its twin until both have strong detections that overlap too little to be of one track.
+    Until then weak boxes are not evidence for the one while the other has a strong detection; if the evidence for it
+    is used up, they are one track, which keeps the older id.
     """
 
     tracks: list[BoxTrack]
@@ -111,6 +119,9 @@ class BoxTracker(Remembered):
         known = {i for i in free if self.tracks[i].state != TrackState.TENTATIVE}
         left = [k for k in strong if k not in taken.values()]
         self._match(taken, known, left, boxes, class_ids, s.reach_overlap, s.reach, features)
+        self._part(taken, boxes)
+        strongly = {self.tracks[i].id for i in taken}
+        known = {i for i in known if not self.tracks[i].twins & strongly}
         self._match(taken, known, weak, boxes, class_ids, s.weak_overlap, 0.0, None)
         for i, k in taken.items():
             self._see(self.tracks[i], stamp, boxes[k], float(scores[k]), None if features is None else features[k])
@@ -123,8 +134,12 @@ class BoxTracker(Remembered):
             if k not in matched and scores[k] >= s.birth:
                 feature = None if features is None else features[k]
                 self._begin(stamp, boxes[k], float(scores[k]), int(class_ids[k]), feature, k)
-        result = list(self.tracks)
+        self._join_twins(strongly)
+        result = sorted(self.tracks, key=lambda t: t.id)
         self.tracks = [t for t in result if t.state != TrackState.ENDED]
+        alive = {t.id for t in self.tracks}
+        for track in self.tracks:
+            track.twins &= alive
         return result
 
     def forget(self) -> None:
@@ -158,6 +173,36 @@ class BoxTracker(Remembered):
             taken[rows[a]] = detections[b]
             free.discard(rows[a])
 
+    def _part(self, taken: Mapping[int, int], boxes: Array) -> None:
+        """Parts twins whose strong detections, by index of track, overlap too little to be of one track."""
+        by_id = {self.tracks[i].id: i for i in taken}
+        for i, k in taken.items():
+            track = self.tracks[i]
+            for twin in sorted(track.twins & by_id.keys()):
+                j = by_id[twin]
+                if overlap(boxes[[k]], boxes[[taken[j]]])[0, 0] < self._settings.strong_overlap:
+                    track.twins.discard(twin)
+                    self.tracks[j].twins.discard(track.id)
+
+    def _join_twins(self, strongly: Collection[int]) -> None:
+        """Makes one of each track whose evidence is used up and a twin that has a strong detection now."""
+        for track in self.tracks:
+            seen = [t for t in self.tracks if t.id in track.twins and t.id in strongly]
+            if seen and track.row < 0 and track.evidence < 0:
+                self._join(track, seen[0])
+
+    def _join(self, lost: BoxTrack, kept: BoxTrack) -> None:
+        """Ends one of two twins; the other one has the older id and what either was never seen apart from."""
+        older, younger = sorted((lost, kept), key=lambda t: t.id)
+        if lost.state == TrackState.COASTING:  # it was confirmed
+            kept.state = TrackState.CONFIRMED
+        others = (lost.twins | kept.twins) - {lost.id, kept.id}
+        (kept.id, kept.born), (lost.id, lost.born) = (older.id, older.born), (younger.id, younger.born)
+        kept.twins, lost.twins, lost.state = others, set(), TrackState.ENDED
+        for track in self.tracks:
+            if track.id in others:
+                track.twins.add(kept.id)
+
     def _see(self, track: BoxTrack, stamp: int, box: Array, score: float, feature: Array | None) -> None:
         track.filter.update(box, score)
         track.evidence = min(max(track.evidence, 0.0) + _log_odds(score), _MOST)
@@ -186,6 +231,11 @@ class BoxTracker(Remembered):
         state = TrackState.CONFIRMED if evidence >= self._settings.confirm else TrackState.TENTATIVE
         filter = self._settings.filter(box, score, self._settings.noise)
         track = BoxTrack(self._next, filter, class_id, evidence, stamp, stamp, state, feature=feature, row=row)
+        known = [t for t in self.tracks if t.class_id == class_id and t.state != TrackState.ENDED]
+        over = overlap(box[None], boxes_of([t.filter for t in known]))[0] >= self._settings.strong_overlap
+        for twin in [t for t, near in zip(known, over.tolist(), strict=True) if near]:
+            twin.twins.add(track.id)
+            track.twins.add(twin.id)
         self.tracks.append(track)
         self._next += 1
 

@@ -34,7 +34,8 @@ class MultiObjectTracker(Operator):
 
     A track is tentative until its detections make it probable, confirmed while it is matched, coasting on its predicted
     box while it is not, and listed once as ended. Its score is the probability that the object is there and visible.
-    Boxes match only within their class. Detections may have any score: give the weak ones too.
+    Boxes match only within their class. Detections may have any score: give the weak ones too. A detector may give one
+    object two boxes: tracks that were never seen apart become one when only one of them still has strong detections.
 
     Method: Zhang et al., "ByteTrack: multi-object tracking by associating every detection box", 2022.
     """

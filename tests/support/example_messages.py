@@ -33,7 +33,7 @@ AWKWARD = (0x7FC00000, 0xFFC00123, 0x80000000, 0x00000001, 0x7F800000, 0xFF80000
 """float32 bits: NaN, a negative NaN with a payload, -0.0, the smallest denormal, +inf, -inf."""
 
 SHARES = {"scores", "visible", "relation_scores", "probabilities"}
-NONNEGATIVE = {"sizes", "ages", "unseen", "extents", "weights"}
+NONNEGATIVE = {"sizes", "ages", "unseen", "extents", "weights", "areas", "door_widths"}
 QUATERNIONS = {"orientation", "orientations", "rotations"}
 ALWAYS_SOME = {"H", "W", "D", "C"}
 """Extents that are never 0."""
@@ -356,6 +356,16 @@ def _planes(values: Values, rng: Rng) -> None:
         values["labels"] = rng.integers(-1, count, values["labels"].shape, dtype=np.int32)
 
 
+def _rooms(values: Values, rng: Rng) -> None:
+    _unique_ids(values, rng)
+    count = len(values["ids"])
+    values["cells"] = rng.integers(-1, count, values["cells"].shape, dtype=np.int32)
+    values["doors"] = rng.integers(0, max(count, 1), values["doors"].shape, dtype=np.int32)
+    if not count:
+        values.update(doors=values["doors"][:0], door_positions=values["door_positions"][:0])
+        values.update(door_widths=values["door_widths"][:0])
+
+
 def _diagnostics(values: Values, rng: Rng) -> None:
     count = len(values["levels"])
     values["levels"] = rng.integers(0, 4, count, dtype=np.uint8)
@@ -395,6 +405,7 @@ _REPAIRS: dict[str, Callable[[Values, Rng], None]] = {
     "PointCloud": _organised,
     "Path": _path,
     "Planes": _planes,
+    "Rooms": _rooms,
     "SceneGraph": _scene_graph,
     "SegmentationMap": _segmentation_map,
     "Tracks": _tracks,

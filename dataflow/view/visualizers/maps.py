@@ -1,18 +1,20 @@
-"""Maps: occupancy grids, meshes, planes."""
+"""Maps: occupancy grids, rooms, meshes, planes."""
 
 from __future__ import annotations
 
 import numpy as np
 import rerun as rr
 
-from dataflow.messages import Mesh, OccupancyGrid, Planes
-from dataflow.messages.geometry import matrix_to_quaternion
+from dataflow.messages import Mesh, OccupancyGrid, Planes, Rooms
+from dataflow.messages.geometry import matrix_to_quaternion, transform_points
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 from dataflow.view.visualizers.clouds import finite_rows
 
 _UNBOUNDED = 2.0  # metres: side of the square that stands for a plane without an extent
 _NORMAL = 0.3  # metres
+_DOOR = (255, 205, 70)
+_LIFT = 0.02  # metres: rooms are drawn above the floor that they lie on
 _SHEER = 90  # opacity of planes, of 255
 
 
@@ -35,6 +37,41 @@ def occupancy_grid(canvas: Canvas, message: OccupancyGrid) -> None:
             quaternion=rr.Quaternion(xyzw=(0.0, 0.0, 0.0, 1.0) if message.orientation is None else message.orientation),
             colormap=rr.components.Colormap.RvizMap,
             opacity=0.45,
+        ),
+    )
+
+
+@visualizer(Rooms, "space")
+def rooms(canvas: Canvas, message: Rooms) -> None:
+    """The floor of each room in its own colour, with its area; doors as points with their widths."""
+    if not message.count or not (message.cells >= 0).any():
+        canvas.clear("space")
+        canvas.clear("space/places")
+        return
+    corners, own = _runs(message.cells)
+    flat = np.column_stack([corners * message.resolution, np.full(len(corners), _LIFT)])
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.Mesh3D(
+            vertex_positions=transform_points(message.matrix(), flat),
+            triangle_indices=(np.arange(0, len(corners), 4)[:, None, None] + [[0, 1, 2], [0, 2, 3]]).reshape(-1, 3),
+            vertex_colors=np.repeat(colors.of_identities(message.ids[own].tolist()), 4, axis=0),
+            albedo_factor=(255, 255, 255, _SHEER),  # the opacity of single corners is not drawn
+        ),
+    )
+    names = [f"room {i}: {area:.1f} m²" for i, area in zip(message.ids.tolist(), message.areas.tolist(), strict=True)]
+    doors = [f"door {width:.2f} m" for width in message.door_widths.tolist()]
+    paint = np.concatenate([colors.of_identities(message.ids.tolist()), np.tile(_DOOR, (len(doors), 1))])
+    canvas.draw(
+        "space/places",
+        message.frame,
+        rr.Points3D(
+            np.concatenate([message.centers, message.door_positions]),
+            colors=paint.astype(np.uint8),
+            labels=[*names, *doors],
+            radii=rr.Radius.ui_points(3.0),
+            show_labels=True,
         ),
     )
 
@@ -93,6 +130,17 @@ def planes(canvas: Canvas, message: Planes) -> None:
         message.frame,
         rr.Arrows3D(origins=centers, vectors=normals[shown] * _NORMAL, colors=paint[shown]),
     )
+
+
+def _runs(cells: np.typing.NDArray[np.int32]) -> tuple[np.typing.NDArray[np.float64], np.typing.NDArray[np.intp]]:
+    """Returns the rectangles of cells of one room that lie side by side in a row: corners (4 N, 2), x and y in cells,
+    and the room (N,) of each."""
+    edges = np.diff(np.pad(cells, ((0, 0), (1, 1)), constant_values=-1), axis=1) != 0
+    rows, begins = np.nonzero(edges & np.pad(cells >= 0, ((0, 0), (0, 1))))
+    _, ends = np.nonzero(edges & np.pad(cells >= 0, ((0, 0), (1, 0))))
+    low, high = np.stack([begins, rows], axis=1), np.stack([ends, rows + 1], axis=1)
+    around = [low, np.stack([high[:, 0], low[:, 1]], axis=1), high, np.stack([low[:, 0], high[:, 1]], axis=1)]
+    return np.stack(around, axis=1).reshape(-1, 2).astype(np.float64), cells[rows, begins].astype(np.intp)
 
 
 def _hulls(canvas: Canvas, message: Planes, paint: np.typing.NDArray[np.uint8]) -> None:

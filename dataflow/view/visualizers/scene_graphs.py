@@ -20,6 +20,7 @@ from dataflow.messages.scene_summary import (
     doing,
     movers_in_words,
     percent,
+    rooms_in_words,
     spaced,
     summarize,
 )
@@ -84,6 +85,7 @@ def _words(canvas: Canvas, message: SceneGraph, told: SceneSummary, activities: 
     tables = (
         _table("who", "does", agents_in_words(message, told, activities)),
         _table("what", "moves", movers_in_words(message, told, activities)),
+        _table("room", "has", rooms_in_words(message, told)),
         _table("what", "carries", carriers_in_words(message, told)),
     )
     counted = f"{message.count} nodes, {len(message.subjects)} relations"

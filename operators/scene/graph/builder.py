@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Activity, Classification, Diagnostics, Odometry, Pose, SceneGraph, Transforms
+from dataflow.messages import Activity, Classification, Diagnostics, Odometry, Pose, Rooms, SceneGraph, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
+from dataflow.messages.scene_summary import ROOMS
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.labels import LabelSpace, labels_file
 from operators.scene.bodies import Body, BodyMemory
 from operators.scene.graph.agents import ACTIVITIES, UNKNOWN
-from operators.scene.graph.layers import Act, GraphSettings, LayeredGraph, Snapshot
+from operators.scene.graph.layers import BUILDING, Act, GraphSettings, LayeredGraph, Snapshot
+from operators.scene.graph.rooms import RoomPlan
 from operators.scene.known_classes import warn_of_unknown
 from operators.scene.map.map_surface import SURFACES
 from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
@@ -44,7 +46,9 @@ class SceneGraphBuilder(Operator):
     in_front_of (of things near each other, as the robot sees them at that moment), part_of, sitting_on, holding,
     facing, approaching, and heads_for, whose score is the probability that the agent is going there. supports, right_of
     and behind are inverses and asked for as such. Activities come from a recogniser or, if it is absent or gives no
-    answer, from motion and contact.
+    answer, from motion and contact. With `rooms` each room is a node (ids below -1,000,000, named from `room 1` on)
+    with the area of its floor; things, agents and the robot are in the room they stand in, rooms with a door between
+    them are connected_to each other, and the room of id -2 is the building.
 
     Method: layers after Armeni et al., "3D scene graph", 2019, and Hughes et al., "Hydra", 2022; goals after Ramirez
     and Geffner, "Probabilistic plan recognition using off-the-shelf classical planners", 2010.
@@ -64,6 +68,9 @@ class SceneGraphBuilder(Operator):
         doc="whether people stand or sit, by SkeletonPosture, by ids of nodes; with it, what one in sight does who "
         "does neither by it, nor anything else, is unknown; without ids they are of none",
     )
+    rooms: Sampled[Rooms] = Sampled(
+        required=False, doc="rooms of the floor and the doors between them, by RoomSegmenter, in the map's frame"
+    )
     graph: Out[SceneGraph] = Out(doc="all nodes and the relations that hold, with their scores")
     activities: Out[Activity] = Out(doc="what agents do, to what, since when, and their likeliest goal")
     changes: Out[Diagnostics] = Out(
@@ -82,6 +89,7 @@ class SceneGraphBuilder(Operator):
     fresh: float = Param(0.5, ge=0, doc="age up to which a recognised activity counts", unit="s")
 
     state: State
+    _plan: RoomPlan | None = None
 
     def setup(self) -> None:
         """Raises ValueError for an end that is not below the beginning, or a bad label space; FileNotFoundError."""
@@ -98,7 +106,7 @@ class SceneGraphBuilder(Operator):
     def on_reset(self, input: str) -> None:
         """The clock behind an input began anew: so does the graph."""
         super().on_reset(input)
-        self._bodies = BodyMemory(self._labels)
+        self._bodies, self._plan = BodyMemory(self._labels), None
 
     def process(
         self,
@@ -107,8 +115,9 @@ class SceneGraphBuilder(Operator):
         extrinsics: Transforms | None = None,
         recognized: Activity | None = None,
         postures: Classification | None = None,
+        rooms: Rooms | None = None,
     ) -> dict[str, Any]:
-        """Raises ValueError where the robot is in another frame than the map, or no transform relates its frames."""
+        """Raises ValueError where robot or rooms are in another frame than the map, or no transform relates frames."""
         T = None
         if robot is not None:
             if robot.frame != nodes.frame:
@@ -126,7 +135,7 @@ class SceneGraphBuilder(Operator):
         bodies, unusable = self._bodies_of(nodes, usable), nodes.count - len(usable)
         fresh = postures is not None and nodes.stamp - postures.stamp <= self.fresh * 1e9
         shown = _postures_of(nodes, postures) if postures is not None and fresh else {}
-        now = self.state.graph.update(nodes.stamp, bodies, T, shown)
+        now = self.state.graph.update(nodes.stamp, bodies, T, shown, self._plan_of(rooms, nodes.frame))
         self.state.names |= {b.id: _name(b) for b in now.bodies}
         self.state.counts.update({"graphs": 1, "unusable nodes": unusable, "relations begun": len(now.began)})
         self.state.counts["nodes"], self.state.counts["relations"] = len(now.bodies), len(now.relations)
@@ -137,6 +146,15 @@ class SceneGraphBuilder(Operator):
         if now.began or now.ended or now.appeared or now.vanished:
             out["changes"] = self._changes(nodes.stamp, now)
         return out
+
+    def _plan_of(self, rooms: Rooms | None, frame: str) -> RoomPlan | None:
+        if rooms is None:
+            return None
+        if rooms.frame != frame:
+            raise ValueError(f"the rooms are in {rooms.frame!r}, the map in {frame!r}")
+        if self._plan is None or self._plan.stamp != rooms.stamp:
+            self._plan = RoomPlan(rooms)
+        return self._plan
 
     def _bodies_of(self, nodes: SceneGraph, rows: NDArray[np.intp]) -> list[Body]:
         """Returns the nodes in some rows as upright bodies."""
@@ -152,7 +170,9 @@ class SceneGraphBuilder(Operator):
         return [replace(b, moving=p) if p == p else b for b, p in zip(bodies, moving, strict=True)]
 
     def _message(self, nodes: SceneGraph, now: Snapshot) -> SceneGraph:
-        classes = (*nodes.class_names, *(n for n in EXTRA.values() if n not in nodes.class_names))
+        areas = {} if self._plan is None else self._plan.areas
+        more = (*EXTRA.values(), *([BUILDING] if self._plan is not None else []))
+        classes = (*nodes.class_names, *(n for n in more if n not in nodes.class_names))
         row = {i: k for k, i in enumerate(nodes.ids.tolist())}
         at = {b.id: k for k, b in enumerate(now.bodies)}
         place = {name: k for k, name in reversed([*enumerate(classes)])}
@@ -180,6 +200,7 @@ class SceneGraphBuilder(Operator):
             objects=np.array([at[o] for (_, _, o), _ in held], np.int32),
             relation_scores=np.array([min(score, 1.0) for _, score in held], np.float32),
             moving=None if nodes.moving is None else np.array(given(nodes.moving, np.nan), np.float32),
+            areas=np.array([areas.get(b.id, np.nan) for b in now.bodies], np.float32) if areas else None,
             tracks=None if nodes.tracks is None else np.array([track for track, _ in tracks], np.int64),
             track_nodes=None if nodes.tracks is None else np.array([node for _, node in tracks], np.int32),
         )
@@ -252,7 +273,10 @@ def _recognized(act: Act, recognized: Activity, *, in_sight: bool) -> Act:
 
 
 def _name(body: Body) -> str:
-    return EXTRA.get(body.id, f"{body.label} {SURFACE - body.id if body.id < SURFACE else body.id}")
+    if body.id == ROOM:
+        return body.label
+    first = ROOMS if body.id < ROOMS else SURFACE
+    return EXTRA.get(body.id, f"{body.label} {first - body.id if body.id < first else body.id}")
 
 
 def _usable(nodes: SceneGraph) -> NDArray[np.intp]:

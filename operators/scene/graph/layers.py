@@ -13,9 +13,12 @@ from dataflow.operator import Remembered
 from operators.scene.bodies import Body, BoxPairs
 from operators.scene.graph.agents import Motion, activity_of
 from operators.scene.graph.goals import GoalInference
+from operators.scene.graph.rooms import RoomPlan
 from operators.scene.relations import FLOOR, ROBOT, ROOM, Hysteresis, Relation, RelationRules, relations_of
 
 Array = NDArray[np.float64]
+BUILDING = "building"
+"""Class of the node around everything where there are several rooms."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +93,12 @@ class LayeredGraph(Remembered):
         things: Sequence[Body],
         T_world_robot: Array | None,
         postures: Mapping[int, tuple[str, float]] | None = None,
+        rooms: RoomPlan | None = None,
     ) -> Snapshot:
         """Takes the objects of one time, which may have surfaces among them, and the robot's pose.
 
-        `postures` has, by id, what the joints of people show, with its probability.
+        `postures` has, by id, what the joints of people show, with its probability. With `rooms` the room around
+        everything is the building.
         """
         s, time = self._settings, stamp * 1e-9
         bodies = list(things)
@@ -102,11 +107,12 @@ class LayeredGraph(Remembered):
                 motion = self._motions.setdefault(body.id, Motion())
                 motion.add(time, body)
                 bodies[k] = replace(body, velocity=np.zeros(3) if body.moving < 0.5 else motion.velocity())
-        bodies = _with_room(bodies, T_world_robot)
+        bodies = _with_room(bodies, T_world_robot, rooms)
         ids = {b.id for b in bodies}
         vanished = self._known - ids
         self._forget(vanished)
         now = relations_of(bodies, T_world_robot, s.rules, self._pairs)
+        now |= {} if rooms is None else rooms.relations(bodies)
         people = [b for b in bodies if b.person]
         wanted = [b for b in bodies if "goal" in b.roles]
         goals = {b.id: self._goals_of(time, b, wanted, now) for b in people}
@@ -155,8 +161,8 @@ def _ground(bodies: Sequence[Body]) -> float:
     return min(0.0, float(np.quantile([b.bottom for b in bodies], 0.25)))
 
 
-def _with_room(bodies: Sequence[Body], T_world_robot: Array | None) -> list[Body]:
-    """Adds the floor where there is none, the room around everything, and the robot; by rising id."""
+def _with_room(bodies: Sequence[Body], T_world_robot: Array | None, rooms: RoomPlan | None) -> list[Body]:
+    """Adds the floor where there is none, the room around everything, those in it, and the robot; by rising id."""
     made = list(bodies)
     still = np.zeros(3)
     if made:
@@ -169,7 +175,17 @@ def _with_room(bodies: Sequence[Body], T_world_robot: Array | None) -> list[Body
         if not floors:
             made.append(Body(FLOOR, "floor", np.array([*middle, ground]), np.array([*(high - low), 0.0]), 0.0, still))
         center = np.array([*middle, (ground + height) / 2])
-        made.append(Body(ROOM, "room", center, np.array([*(high - low), height - ground]), 0.0, still))
+        made += [] if rooms is None else rooms.bodies(ground, height)
+        made.append(
+            Body(
+                ROOM,
+                "room" if rooms is None else BUILDING,
+                center,
+                np.array([*(high - low), height - ground]),
+                0.0,
+                still,
+            )
+        )
     if T_world_robot is not None:
         yaw = float(np.arctan2(T_world_robot[1, 0], T_world_robot[0, 0]))
         made.append(Body(ROBOT, "self", T_world_robot[:3, 3].copy(), np.zeros(3), yaw, still))

@@ -8,10 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from dataflow.messages import Activity, SceneGraph
-from dataflow.messages.scene_summary import summarize
+from dataflow.messages.scene_summary import ROOMS, summarize
 from operators.scene.map.map_surface import SURFACES
-from operators.scene.relations import FLOOR, INVERSES, PREDICATES, ROBOT, ROOM
+from operators.scene.relations import FLOOR, INVERSES, PREDICATES, ROBOT, ROOM, SYMMETRIC
 
 _ANY = ("anything", "something", "thing", "*")
 _PHRASES = {p.replace("_", " "): p for p in (*PREDICATES, *INVERSES)}
@@ -158,7 +160,7 @@ def _fits(graph: SceneGraph, row: tuple[int, str, int, float], node: int, clause
         o == node and turned and _named(graph, s, clause.object)
     ):
         return True
-    return p == "near" and o == node and _named(graph, s, clause.object)
+    return p in SYMMETRIC and o == node and _named(graph, s, clause.object)
 
 
 def _named(graph: SceneGraph, node: int, name: str) -> bool:
@@ -177,7 +179,8 @@ def as_json(graph: SceneGraph, activities: Activity | None = None) -> dict[str, 
     nodes = []
     for k in range(graph.count):
         id, label = int(graph.ids[k]), graph.class_names[graph.class_ids[k]] if graph.class_names else ""
-        layer = _LAYERS.get(id) or ("surface" if label in SURFACES else "agent" if k in agents else "object")
+        layer = "building" if label == "building" else "room" if id < ROOMS else _LAYERS.get(id)
+        layer = layer or ("surface" if label in SURFACES else "agent" if k in agents else "object")
         nodes.append(
             {
                 "id": id,
@@ -191,6 +194,7 @@ def as_json(graph: SceneGraph, activities: Activity | None = None) -> dict[str, 
                 "last_seen": None if graph.last_seen is None else int(graph.last_seen[k]),
                 "tracks": list(graph.tracks_of(k)),
             }
+            | ({} if graph.areas is None or np.isnan(graph.areas[k]) else {"area": round(float(graph.areas[k]), 2)})
         )
     relations = [
         {

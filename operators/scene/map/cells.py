@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from operators.scene.map.trajectory import Correction
+
 Array = NDArray[np.float64]
 Keys = NDArray[np.int64]
 
@@ -30,7 +32,7 @@ class Cells:
     """A set of voxels with the mean of the points in each, and counts of views.
 
     `hits` are the views in which it was the object's, `other` those in which the object was seen and this surface too,
-    as something else, `free` those that saw through it.
+    as something else, `free` those that saw through it; `times` are the mean times of the hits, nanoseconds.
     """
 
     def __init__(self, side: float) -> None:
@@ -40,17 +42,18 @@ class Cells:
         self.hits: Array = np.zeros(0)
         self.free: Array = np.zeros(0)
         self.other: Array = np.zeros(0)
+        self.times: Array = np.zeros(0)
         self._tree: cKDTree | None = None
         self._bounds: tuple[Array, Array] | None = None
         self._middle: Array | None = None
 
     @classmethod
-    def of(cls, points: Array, side: float) -> Cells:
+    def of(cls, points: Array, side: float, stamp: int = 0) -> Cells:
         """Returns the voxels of one view's points (N, 3)."""
-        return cls.of_each([points], side)[0]
+        return cls.of_each([points], side, stamp)[0]
 
     @classmethod
-    def of_each(cls, sets: Sequence[Array], side: float) -> list[Cells]:
+    def of_each(cls, sets: Sequence[Array], side: float, stamp: int = 0) -> list[Cells]:
         """Returns the voxels of each of several sets of one view's points: together they take a third of the time."""
         if not sets:
             return []
@@ -67,13 +70,14 @@ class Cells:
         means = np.stack([np.bincount(of, column) for column in points.T], axis=1) / counts[:, None]
         ends = np.cumsum(np.bincount(of_set[first], minlength=len(sets)))[:-1]
         parts = zip(np.split(ranked[first], ends), np.split(means, ends), strict=True)
-        return [cls._made(side, own_keys, own_means) for own_keys, own_means in parts]
+        return [cls._made(side, own_keys, own_means, stamp) for own_keys, own_means in parts]
 
     @classmethod
-    def _made(cls, side: float, keys: Keys, points: Array) -> Cells:
+    def _made(cls, side: float, keys: Keys, points: Array, stamp: int) -> Cells:
         made = cls(side)
         made._keys, made.points = keys, points
         made.hits, made.free, made.other = np.ones(len(keys)), np.zeros(len(keys)), np.zeros(len(keys))
+        made.times = np.full(len(keys), float(stamp))
         return made
 
     def __len__(self) -> int:
@@ -82,15 +86,29 @@ class Cells:
     def add(self, other: Cells) -> None:
         """Takes in the voxels of another view, or of another object that is the same."""
         keys, own, new = _merged(self._keys, other._keys)
-        values = np.zeros((6, len(keys)))  # weighted coordinates, hits, free, other
+        values = np.zeros((7, len(keys)))  # weighted coordinates, hits, free, other, weighted times
         values[:3, own], values[3, own] = (self.points * self.hits[:, None]).T, self.hits
-        values[4, own], values[5, own] = self.free, self.other
+        values[4, own], values[5, own], values[6, own] = self.free, self.other, self.times * self.hits
         values[:3, new] += (other.points * other.hits[:, None]).T
         values[3, new] += other.hits
         values[4, new] -= other.hits  # a voxel that is seen again was not free after all
         values[5, new] += other.other
+        values[6, new] += other.times * other.hits
         self.hits, self.free, self.other = values[3], values[4].clip(min=0), values[5]
+        self.times = values[6] / np.maximum(self.hits, 1e-9)
         self.points = np.ascontiguousarray((values[:3] / np.maximum(self.hits, 1e-9)).T)
+        self._keys, self._tree, self._bounds, self._middle = keys, None, None, None
+
+    def correct(self, correction: Correction) -> None:
+        """Moves each voxel with the place from which it was seen; those that fall into one are one."""
+        points = correction.moved(self.points, self.times)
+        keys, of = np.unique(keys_of(points, self.side), return_inverse=True)
+        count, weights = len(keys), np.maximum(self.hits, 1e-9)
+        total = np.bincount(of, weights, count)
+        means = [np.bincount(of, weights * each, count) / total for each in (*points.T, self.times)]
+        counts = (np.bincount(of, each, count) for each in (self.hits, self.free, self.other))
+        self.hits, self.free, self.other = (np.asarray(each, np.float64) for each in counts)
+        self.points, self.times = np.stack(means[:3], axis=1), means[3]
         self._keys, self._tree, self._bounds, self._middle = keys, None, None, None
 
     def carve(self, free: NDArray[np.bool_]) -> None:
@@ -102,6 +120,7 @@ class Cells:
         if gone.any():
             self._keys, self.points = self._keys[~gone], self.points[~gone]
             self.hits, self.free, self.other = self.hits[~gone], self.free[~gone], self.other[~gone]
+            self.times = self.times[~gone]
             self._tree = self._bounds = self._middle = None
 
     def doubt(self, confirmed: NDArray[np.bool_], shown: Cells, weight: int) -> None:
@@ -194,13 +213,15 @@ class Cells:
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
 
     def snapshot(self) -> dict[str, Any]:
-        return {"keys": self._keys, "points": self.points, "hits": self.hits, "free": self.free, "other": self.other}
+        named = ("points", "hits", "free", "other", "times")
+        return {"keys": self._keys} | {name: getattr(self, name) for name in named}
 
     def restore(self, state: dict[str, Any]) -> None:
         self._keys = np.array(state["keys"], np.int64)
         self.points = np.array(state["points"], np.float64).reshape(-1, 3)
         self.hits, self.free = np.array(state["hits"], np.float64), np.array(state["free"], np.float64)
         self.other = np.array(state["other"], np.float64)
+        self.times = np.array(state.get("times", np.zeros(len(self.hits))), np.float64)  # earlier versions have none
         self._tree = self._bounds = self._middle = None
 
 

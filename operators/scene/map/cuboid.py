@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -38,7 +38,7 @@ class ImageView:
     """One view of an object: `P` (3, 4) maps the world to pixels; `box` (4,) is the object's in the image.
 
     `edges` (4,) are those of the box, left, upper, right, lower, that are the object's and not the image's; `eye` (3,)
-    is where the camera was. `points` (N, 3) are some of those that the view shows of it.
+    is where the camera was at `stamp` (ns). `points` (N, 3) are some of those that the view shows of it.
     """
 
     P: Array
@@ -46,6 +46,14 @@ class ImageView:
     edges: NDArray[np.bool_]
     eye: Array
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    stamp: int = 0
+
+    def moved(self, T: Array) -> ImageView:
+        """Returns the view after a rigid motion (4, 4) of the camera and what it shows."""
+        R, t = T[:3, :3], T[:3, 3]
+        back = np.eye(4)
+        back[:3, :3], back[:3, 3] = R.T, -R.T @ t
+        return replace(self, P=self.P @ back, eye=R @ self.eye + t, points=self.points @ R.T + t)
 
 
 def fit_cuboid(

@@ -139,7 +139,16 @@ def together(*groups: Sequence[LearnedFile]) -> tuple[LearnedFile, ...]:
 
 
 def _before(entry: Mapping[str, Any], stamp: int) -> dict[str, Any]:
-    return {**entry, "born": min(entry["born"], stamp - 1), "seen": min(entry["seen"], stamp - 1)}
+    before = stamp - 1
+    times: dict[str, Any] = {
+        "born": min(entry["born"], before),
+        "seen": min(entry["seen"], before),
+        "cells": {**entry["cells"]},
+    }
+    times["cells"]["times"] = np.full(len(entry["cells"]["hits"]), float(before))
+    if "image_stamps" in entry:
+        times["image_stamps"] = [before] * len(entry["image_stamps"])
+    return {**entry, **times}
 
 
 def _is_map(path: Path) -> bool:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from operators.labels import SizePrior
 from operators.scene.map.cells import Cells, standing_box
 from operators.scene.map.cuboid import ImageView, fit_cuboid
+from operators.scene.map.trajectory import Correction
 
 Array = NDArray[np.float64]
 
@@ -40,9 +41,10 @@ _ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
 class MapObject:
     """One object of the map, in an upright box. Times in nanoseconds.
 
-    `told` sums for its views the time since the one before, `WHOLE` at most. `votes` (C,) sums scores by class,
-    `view` (2,) the horizontal directions of the views; `most` is the largest number of voxels that it had; `images` are
-    the views that its box is fitted to, `form` which of the ways in which its class stands, -1 while that is open,
+    `told` sums for its views the time since the one before, `WHOLE` at most.
+    `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views; `most` is the largest number
+    of voxels that it had; `images` are the views that its box is fitted to, `form` which of the ways in which its class
+    stands, -1 while that is open,
     `fresh` how many of them are new since the last fit; `held` whether it was last seen in a hand. `beside` counts by
     id the views in which another object was seen too, in a separate place in the image. `tracks` are the ids of the
     last tracks in images that were of it, the latest last. `moving` is the probability that it moves, NaN where that
@@ -185,6 +187,18 @@ class MapObject:
             self.center, self.size = self.center.copy(), self.size.copy()
             self.center[2], self.size[2] = (top + floor) / 2, top - floor
 
+    def correct(self, correction: Correction) -> None:
+        """Moves each voxel and each image with the place from which it was seen; the box is to be fitted then."""
+        weights = self.cells.hits.sum()
+        T = correction.at(round(float(self.cells.hits @ self.cells.times / weights)) if weights else self.seen)
+        turn = T[:2, :2] @ np.array([math.cos(self.yaw), math.sin(self.yaw)])
+        self.cells.correct(correction)
+        self.yaw = math.atan2(float(turn[1]), float(turn[0]))
+        self.center = T[:3, :3] @ self.center + T[:3, 3]
+        self.velocity, self.view = T[:3, :3] @ self.velocity, T[:2, :2] @ self.view
+        self.images = [image.moved(correction.at(image.stamp)) for image in self.images]
+        self.most = min(self.most, len(self.cells))
+
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
 
     def snapshot(self) -> dict[str, Any]:
@@ -194,9 +208,11 @@ class MapObject:
         beside = sorted(self.beside.items())
         rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
         points = [np.concatenate([v.points for v in rows]), np.array([len(v.points) for v in rows])] if rows else []
+        times = {"image_stamps": [v.stamp for v in rows]}
         return (
             plain
             | rest
+            | times
             | {"held": self.held, "fresh": self.fresh, "points": points, "tracks": self.tracks, "moving": self.moving}
         )
 
@@ -215,6 +231,9 @@ class MapObject:
         if len(state.get("points", ())):  # earlier versions have none
             parts = np.split(np.array(state["points"][0]), np.cumsum(state["points"][1])[:-1])
             made.images = [replace(v, points=own) for v, own in zip(made.images, parts, strict=True)]
+        if len(state.get("image_stamps", ())):  # and these
+            rows = zip(made.images, state["image_stamps"], strict=True)
+            made.images = [replace(v, stamp=int(stamp)) for v, stamp in rows]
         made.fresh = int(state.get("fresh", 0))
         made.moving = float(state.get("moving", math.nan))
         made.tracks = [int(track) for track in state.get("tracks", ())]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.map.cells import Cells, standing_box
+from operators.scene.map.trajectory import Correction
 from operators.scene.relations import TABLETOP
 
 Array = NDArray[np.float64]
@@ -33,8 +34,9 @@ _ARRAYS = ("facing", "center", "size")
 class MapSurface:
     """A level or upright surface. Times in nanoseconds; `facing` (3,) is the side that it was seen from.
 
-    `most` is the largest number of voxels that it had, `middle` (3,) and `normal` (3,) are those of its plane; centre,
-    full size (3,) and heading are of the thin upright box of what was seen of it, as `settle` left them.
+    `most` is the largest number of voxels that it had, `middle` (3,) and `normal` (3,) are those
+    of its plane; centre, full size (3,) and heading are of the thin upright box of what was seen of it, as `settle`
+    left them.
     """
 
     id: int
@@ -126,6 +128,15 @@ class MapSurface:
         self.born, self.seen = min(self.born, other.born), max(self.seen, other.seen)
         self.views += other.views
         self.most = max(self.most, len(self.cells))
+        self.fit()
+
+    def correct(self, correction: Correction) -> None:
+        """Moves each voxel with the place from which it was seen."""
+        if not len(self.cells):
+            return
+        self.facing = correction.at(round(float(self.cells.times.mean())))[:3, :3] @ self.facing
+        self.cells.correct(correction)
+        self.most = min(self.most, len(self.cells))
         self.fit()
 
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read

@@ -61,6 +61,10 @@ class RecentPlaces:
         if movers and (not kept or stamp - kept[-1].stamp >= _EVERY * 1e9):
             self._moments.append(_Moment(stamp, view, {o.id: o.cells.points for o in movers}))
 
+    def forget(self) -> None:
+        """Forgets the views: they are not where they were any more."""
+        self._moments = []
+
     def snapshot(self) -> list[Any]:
         return [[m.stamp, m.view.snapshot(), [[i, points] for i, points in m.places.items()]] for m in self._moments]
 

@@ -29,6 +29,7 @@ from operators.scene.map.merging import are_one, may_be_one, merge, smaller_in_p
 from operators.scene.map.moving import RecentPlaces
 from operators.scene.map.presence import has_left, look_at
 from operators.scene.map.range_view import RangeView
+from operators.scene.map.trajectory import Correction
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
@@ -77,7 +78,7 @@ class ObjectMap:
         self._updates += 1
         self._heading = self._room.angle
         seen = [self._alone(each, view) for each in seen]
-        cells = Cells.of_each([each.points for each in seen], s.voxel)
+        cells = Cells.of_each([each.points for each in seen], s.voxel, stamp)
         joined = self._joined(seen, cells, stamp, view)
         ids: dict[int, int] = {}
         in_hands = carried(seen, cells, joined, view, self.objects, self._kinds, s.views)
@@ -100,6 +101,17 @@ class ObjectMap:
         self._drop(stamp)
         self._forget(before - self.objects.keys() - self.gone.keys())
         return [joined[k] if k in joined else ids[k] for k in range(len(seen))]
+
+    def correct(self, correction: Correction) -> None:
+        """Moves all objects with the places from which they were seen; those that come to share their place are one."""
+        for object in (*self.objects.values(), *(old for _, old in self.gone.values())):
+            object.correct(correction)
+        self._recent.forget()
+        before = set(self.objects)
+        for object in self.objects.values():
+            self._fit(object)
+        self._join_doubles(sorted(self.objects))
+        self._forget(before - self.objects.keys())
 
     @property
     def heading(self) -> float | None:

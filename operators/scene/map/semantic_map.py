@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from dataflow.messages import (
     Detections2D,
     Diagnostics,
     Odometry,
+    Path,
     PointCloud,
     Pose,
     SceneGraph,
@@ -38,6 +39,7 @@ from operators.scene.map.nodes import nodes_of, seen_surfaces
 from operators.scene.map.object_map import ObjectMap
 from operators.scene.map.range_view import RangeView
 from operators.scene.map.surface_map import SurfaceMap
+from operators.scene.map.trajectory import Trajectory
 from operators.status import counted_status
 
 _BORDER = 3.0  # pixels; boxes that end nearer to the image's edge may go on beyond it
@@ -51,6 +53,8 @@ class State(Counts):
     frame: str = ""
     classes: tuple[str, ...] = ()  # before the map, which is made anew with them
     map: ObjectMap | None = None
+    trajectory: Trajectory = field(default_factory=Trajectory)
+    corrected: int = -1  # stamp of the last keyframes that the map moved with
 
 
 class SemanticMap(Operator):
@@ -64,6 +68,10 @@ class SemanticMap(Operator):
     often enough is given, whatever its size: if its class is never so large, or if it is of a small class and seldom
     surely detected, it is doubted, which halves its score or lowers it by what the label lacks. Surfaces are joined by
     their planes and by where they lie; there is one floor, and people stand on it.
+
+    With `keyframes` the map deforms with loop closures: each voxel and each image of an object or surface moves with
+    the place from which it was seen, boxes are fitted again, and entries of one thing, seen before and after the drift,
+    become one.
 
     With `save` the map is written at the end, and with it the classes that were learned for it; `map_file` begins with
     such a map, in whose frame the pose must be. Objects that move by themselves are not taken over.
@@ -88,6 +96,11 @@ class SemanticMap(Operator):
     image_info: Sampled[CameraInfo] = Sampled(required=False, doc="calibration of that image")
     surfaces: Sampled[Boxes3D] = Sampled(
         required=False, doc="the cloud's surfaces, as PlaneSegmenter finds them; not used where of another stamp"
+    )
+    keyframes: Sampled[Path] = Sampled(
+        required=False,
+        doc="all keyframes as SLAM has them at a loop, with stamps: poses of what `pose` poses, in the map's frame; "
+        "nodes move with those from which they were seen",
     )
     objects: Out[Boxes3D] = Out(
         doc="the objects that were seen often enough, in the map's frame; scores are probabilities of existence, "
@@ -129,10 +142,10 @@ class SemanticMap(Operator):
     def setup(self) -> None:
         """Raises FileNotFoundError or ValueError for a bad label space or map, or a map with voxels of another size."""
         self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
-        self._known = None if self.map_file is None else SavedMap.read(Path(self.use_file(self.map_file)))
+        self._known = None if self.map_file is None else SavedMap.read(FilePath(self.use_file(self.map_file)))
         if self._known is not None and self._known.voxel != self.voxel:
             raise ValueError(f"{self.map_file} has voxels of {self._known.voxel} m, but voxel is {self.voxel}")
-        given = [learned_files(Path(self.use_file(name))) for name in self.learned]
+        given = [learned_files(FilePath(self.use_file(name))) for name in self.learned]
         self._learned: tuple[LearnedFile, ...] = together(() if self._known is None else self._known.learned, *given)
 
     def initial_state(self) -> State:
@@ -148,7 +161,7 @@ class SemanticMap(Operator):
             saved = SavedMap(
                 self.state.classes, self.state.frame, self.voxel, objects, self.state.surfaces.snapshot(), self._learned
             )
-            saved.write(Path(self.save).expanduser())
+            saved.write(FilePath(self.save).expanduser())
 
     def process(
         self,
@@ -160,14 +173,18 @@ class SemanticMap(Operator):
         images: Detections2D | None = None,
         image_info: CameraInfo | None = None,
         surfaces: Boxes3D | None = None,
+        keyframes: Path | None = None,
     ) -> dict[str, Any]:
-        """Raises ValueError where boxes, clusters and cloud do not belong together or the pose's frame changes."""
+        """Raises ValueError where boxes, clusters and cloud do not belong together, where the pose's frame changes, and
+        for keyframes in another frame or without stamps."""
         if clusters.count != boxes.count or len(clusters.labels) != cloud.count:
             raise ValueError(
                 f"{boxes.count} boxes, {clusters.count} clusters and labels for {len(clusters.labels)} of "
                 f"{cloud.count} points do not belong together"
             )
         known = self._opened(boxes, pose)
+        self._correct(known, keyframes)
+        self.state.trajectory.add(cloud.stamp, pose.matrix())
         sensor = pose.child_frame or cloud.frame
         T = pose.matrix() @ transform_between(extrinsics, cloud.frame, sensor)
         usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
@@ -236,6 +253,19 @@ class SemanticMap(Operator):
             self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, self.state.classes)
             self.state.map.widen(len(self.state.classes), Kinds.of(self._labels, self.state.classes))
         return self.state.map
+
+    def _correct(self, known: ObjectMap, keyframes: Path | None) -> None:
+        """Moves the map with keyframes that it has not moved with yet."""
+        if keyframes is None or keyframes.stamp == self.state.corrected:
+            return
+        if keyframes.frame != self.state.frame:
+            raise ValueError(f"the keyframes are in {keyframes.frame!r}, the map in {self.state.frame!r}")
+        self.state.corrected = keyframes.stamp
+        correction = self.state.trajectory.corrected(keyframes)
+        if correction is not None:
+            known.correct(correction)
+            self.state.surfaces.correct(correction, known.heading)
+            self.state.counts["corrections"] += 1
 
     def _take_up(self, saved: SavedMap, stamp: int) -> None:
         """Goes on from a saved map. Raises ValueError where its frame or its classes are others."""
@@ -327,7 +357,7 @@ def _images(
     size = np.array([images.width, images.height, images.width, images.height])
     rows = images.boxes.astype(np.float64)
     whole = np.where(np.arange(4) < 2, rows > _BORDER, rows < size - _BORDER)
-    return [ImageView(P, box - 0.5, edges, eye) for box, edges in zip(rows, whole, strict=True)]
+    return [ImageView(P, box - 0.5, edges, eye, stamp=boxes.stamp) for box, edges in zip(rows, whole, strict=True)]
 
 
 def _of_nodes(images: Detections2D, joined: Mapping[int, int], given: Collection[int]) -> Detections2D:

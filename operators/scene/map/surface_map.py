@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from operators.scene.map.cells import Cells
 from operators.scene.map.map_surface import FLOOR, SIDE, MapSurface
 from operators.scene.map.range_view import RangeView
+from operators.scene.map.trajectory import Correction
 
 Array = NDArray[np.float64]
 
@@ -58,7 +59,9 @@ class SurfaceMap:
         """
         shown: list[int] = []
         for each in seen:
-            part = MapSurface(self._next, each.label, Cells.of(each.points, SIDE), each.facing, _GAIN, stamp, stamp)
+            part = MapSurface(
+                self._next, each.label, Cells.of(each.points, SIDE, stamp), each.facing, _GAIN, stamp, stamp
+            )
             part.most = len(part.cells)
             known = self._best(part)
             if known is None:
@@ -78,6 +81,15 @@ class SurfaceMap:
                 del self.surfaces[i]
         rows = [s for _, s in sorted(self.surfaces.items()) if s.views >= self._views]
         self.confirmed = [s for s in rows if s.area >= self._min_area]
+        for surface in self.confirmed:
+            surface.settle(heading)
+
+    def correct(self, correction: Correction, heading: float | None = None) -> None:
+        """Moves all surfaces with the places from which they were seen; those that come to be the same are one."""
+        for surface in self.surfaces.values():
+            surface.correct(correction)
+        self._join(sorted(self.surfaces))
+        self.confirmed = [s for s in self.confirmed if self.surfaces.get(s.id) is s]
         for surface in self.confirmed:
             surface.settle(heading)
 

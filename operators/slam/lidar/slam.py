@@ -52,7 +52,7 @@ class LidarSlam(LidarOdometry):
 
     correction: Out[Transforms] = Out(doc="the odometry frame in the map frame (REP 105), while it is known")
     pose: Out[Odometry] = Out(doc="the body in the map frame, with covariance, while it is known")
-    path: Out[Path] = Out(doc="all keyframes as the map has them now; at every loop")
+    path: Out[Path] = Out(doc="all keyframes as the map has them now, with their times; at every loop")
     map: Out[PointCloud] = Out(doc="points of all keyframes, at every loop and every `period` keyframes")
     status: Out[Diagnostics] = Out(doc="mapped, corrected, searching or adrift, with the reason; then the odometry's")
 
@@ -104,7 +104,7 @@ class LidarSlam(LidarOdometry):
                 self.map_frame,
             )
         if mapped.added.loops:
-            poses = [T_body_lidar @ T @ back for T in map_poses(graph)]
+            poses = [(each, T_body_lidar @ T @ back) for each, T in map_poses(graph)]
             messages["path"] = path_of(poses, self.map_frame, cloud.stamp)
         if graph.located and self._map_due(mapped):
             messages["map"] = self._map(T_body_lidar, cloud.stamp)

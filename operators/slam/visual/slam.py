@@ -92,7 +92,7 @@ class VisualSlam(Operator):
     odometry: Out[Odometry] = Out(doc="the depth camera in the odometry frame, never corrected; at every frame")
     correction: Out[Transforms] = Out(doc="the odometry frame in the map frame (REP 105), while it is known")
     pose: Out[Odometry] = Out(doc="the depth camera in the map frame, with covariance, while it is known")
-    path: Out[Path] = Out(doc="all keyframes as the map has them now; at every loop")
+    path: Out[Path] = Out(doc="all keyframes as the map has them now, with their times; at every loop")
     map: Out[PointCloud] = Out(doc="points of all views, at every loop and every `period` keyframes")
     status: Out[Diagnostics] = Out(doc="mapped, corrected, searching or adrift, with the reason; then the odometry's")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import Odometry, Transforms
-from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix
+from dataflow.messages import Odometry, Path, Transforms
+from dataflow.messages.geometry import invert, matrix_to_quaternion, quaternion_from_yaw, transform_matrix, yaw_of
 from dataflow.testing import play
 from operators.geometry.se3 import about_fixed_axes, exp
 from operators.odometry import BaseOdometry
@@ -36,6 +36,35 @@ def test_the_bases_pose_is_that_of_the_base() -> None:
     assert (made.frame, made.child_frame) == ("odom_base", "base_link")
 
 
+def keyframes(frame: str = "odom", stamp: int = 1) -> Path:
+    """The camera where the base stood at (0, 0), and turned at (1.5, -0.4)."""
+    there = transform_matrix([1.5, -0.4, 0.0], quaternion_from_yaw(0.7))
+    T = np.stack([invert(T_BASE_CAMERA) @ base @ T_BASE_CAMERA for base in (np.eye(4), there)])
+    return Path(
+        stamp=stamp, frame=frame, positions=T[:, :3, 3], orientations=matrix_to_quaternion(T[:, :3, :3]), stamps=[0, 1]
+    )
+
+
+def test_keyframes_of_the_sensor_become_those_of_the_base_and_are_given_once() -> None:
+    sensor = [seen(np.eye(4)).replace(stamp=k) for k in (1, 2, 3)]
+    given = {"sensor": sensor, "extrinsics": [MOUNT], "path": [keyframes()]}
+    played = play(BaseOdometry(), given, static=["extrinsics"])
+    (made,) = played["keyframes"]
+    assert isinstance(made, Path)
+    assert (made.frame, len(played["odometry"])) == ("odom_base", 3)
+    np.testing.assert_allclose(made.positions, [[0, 0, 0], [1.5, -0.4, 0]], atol=1e-9)
+    assert made.orientations is not None
+    np.testing.assert_allclose(yaw_of(made.orientations), [0, 0.7], atol=1e-9)
+    assert made.stamps is not None
+    assert made.stamps.tolist() == [0, 1]
+
+
+def test_keyframes_in_another_frame_than_the_poses_are_refused() -> None:
+    given = {"sensor": [seen(np.eye(4))], "extrinsics": [MOUNT], "path": [keyframes("map")]}
+    with pytest.raises(OperatorFailure, match="the path is in 'map', the sensor's poses are in 'odom'"):
+        play(BaseOdometry(), given, static=["extrinsics"])
+
+
 @pytest.mark.long
 def test_covariance_is_that_of_the_base_by_sampling() -> None:
     rng = np.random.default_rng(0)
@@ -62,15 +91,15 @@ def test_a_pose_without_scale_turns_and_gives_none_beside_the_base() -> None:
     here = Transforms.from_matrix(turned, stamp=0, frame="base_link", child_frame="camera")
     operator = BaseOdometry()
     operator.setup()
-    posed = operator.process(sensor, here)
-    assert posed is not None
+    posed = operator.process(sensor, here)["odometry"]
+    assert isinstance(posed, Odometry)
     covariance = posed.pose_covariance
     assert covariance is not None
     assert np.isinf(np.diag(covariance)[:3]).all()
     np.testing.assert_allclose(np.diag(covariance)[3:], [9e-4, 1e-4, 4e-4])
     turned[0, 3] = 0.1
     beside = Transforms.from_matrix(turned, stamp=0, frame="base_link", child_frame="camera")
-    assert operator.process(sensor, beside) is None
+    assert operator.process(sensor, beside) == {}
     assert operator.summary() == {"poses without scale": 1}
 
 

@@ -75,6 +75,34 @@ def test_weak_detections_continue_a_track_and_begin_none() -> None:
     assert all(ids(m) == [1] for m in messages)
 
 
+def shifted(x: float, score: float) -> list[float]:
+    """A walker's box that a detector gives a second time: IoU 0.5 to 0.6 with the first."""
+    return [x + 14, 110, x + 78, 262, score]
+
+
+def test_two_boxes_of_one_thing_that_enters_are_one_track_with_the_older_id() -> None:
+    """The detector sees it twice at first; then the second box is weak, and lies beside the first one."""
+    entering = [image(0, [walker(0, 0.6), shifted(0, 0.64)]), image(1, [walker(6, 0.58), shifted(6, 0.71)])]
+    walking = [image(k, [walker(6 * k, 0.76), shifted(6 * k, 0.2)]) for k in range(2, 12)]
+    messages = tracked([*entering, *walking])
+    assert [ids(m, TrackState.CONFIRMED, TrackState.COASTING) for m in messages[5:]] == [[1]] * 7
+    assert [i for m in messages for i in ids(m, TrackState.ENDED)] == [2]
+
+
+@pytest.mark.parametrize("younger", [False, True])
+def test_the_joined_track_has_the_older_id_whichever_of_the_two_goes_on(younger: bool) -> None:
+    both = [image(k, [walker(100, 0.8), walker(118, 0.8)]) for k in range(2)]
+    one = [image(k, [walker(118 if younger else 100, 0.8)]) for k in range(2, 8)]
+    assert ids(tracked([*both, *one])[-1], TrackState.CONFIRMED, TrackState.COASTING) == [1]
+
+
+def test_what_was_seen_apart_goes_on_by_weak_boxes_beside_another() -> None:
+    """Two enter together, one before the other, part, and meet again: the hidden one has weak boxes then."""
+    images = [image(k, [walker(100), walker(118 + 12 * k)]) for k in range(5)]
+    images += [image(k, [walker(100), walker(166 - 12 * (k - 4), 0.8 if k < 7 else 0.2)]) for k in range(5, 12)]
+    assert ids(tracked(images)[-1]) == [1, 2]
+
+
 def test_one_false_box_confirms_no_track() -> None:
     messages = tracked([image(0, [[10, 10, 80, 90, 0.6]]), *(image(k, []) for k in range(1, 6))])
     assert all(not ids(m, TrackState.CONFIRMED, TrackState.COASTING) for m in messages)

@@ -86,7 +86,7 @@ def test_relations_of_several_words_are_understood() -> None:
         ("mug below table", "did you mean 'under'"),
         ("mug undr table", "did you mean 'under'"),
         ("mug left table", "did you mean 'left of'"),
-        ("mug nearr table", "there are above, approaching, behind, facing, heads for"),
+        ("mug nearr table", "there are above, approaching, behind, connected to, facing, heads for"),
         ("mug xyzzy table", "'xyzzy' is no relation; there are above"),
         ("mug not", "ends where a relation should be named; there are above"),
         ("mug on", "ends where a thing should be named"),

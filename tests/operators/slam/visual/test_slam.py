@@ -128,6 +128,11 @@ def test_a_loop_takes_drift_away() -> None:
     assert drifted[ROUND] > 0.03
     assert corrected[ROUND + 5] < 0.5 * drifted[ROUND + 5]
     assert len(played["path"]) > 0
+    stamps = {pose.stamp for pose in played["pose"]}
+    for path in played["path"]:
+        assert path.stamps is not None
+        assert set(path.stamps.tolist()) <= stamps
+        assert path.stamps[-1] <= path.stamp
     assert len(played["map"]) > 0
 
 
