@@ -50,7 +50,7 @@ class Forked:
     def wait(self, timeout: float | None = None) -> int:
         """Waits for its end and returns the exit code. Raises `subprocess.TimeoutExpired`."""
         if self.returncode is None and not readable([self._handle], timeout):
-            raise subprocess.TimeoutExpired(["fork"], timeout or 0.0)
+            raise subprocess.TimeoutExpired([f"process {self.pid}"], timeout or 0.0)
         code = self.poll()
         assert code is not None
         return code
