@@ -218,6 +218,19 @@ def test_seeds(first: int, memory: Path) -> None:
             pytest.fail(f"{scenario.describe()}\n{violation}")
 
 
+def test_a_recording_without_what_only_the_outside_world_took_is_completed_and_not_replayed(memory: Path) -> None:
+    parts = (
+        "left: {SOURCE}",
+        "arm: {use: simulation.operators:Arm, inputs: {x: left/fast}}",
+        "relay: {use: simulation.operators:Relay, inputs: {x: left/slow}}",
+    )
+    scenario = replace(PLAIN, graph=DRAWN, parts=parts, keeping=Keeping("exclude: ['left/fast']"))
+
+    result = check(scenario, memory)
+
+    assert (result.verdict, result.replayed) == ("identical", False)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [23_000_041, 23_000_109, 23_000_334, 23_000_461, 23_000_570, 23_000_869])
 def test_seeds_that_broke_a_promise_once(seed: int, memory: Path) -> None:
@@ -333,6 +346,13 @@ def test_a_graph_is_shrunk_only_to_graphs(memory: Path) -> None:
 
     assert said == "it is left out"
     assert small.count == 1
+
+
+def test_what_fails_otherwise_is_a_broken_promise_of_its_seed(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("simulation.check._verify", lambda *_: 1 // 0)
+
+    with pytest.raises(Violation, match="ZeroDivisionError"):
+        check(PLAIN, memory)
 
 
 def test_planting_a_fault_leaves_nothing_behind() -> None:
