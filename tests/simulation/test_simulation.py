@@ -26,6 +26,7 @@ from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
+from dataflow.recording.parts import Storage
 from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan
 
@@ -163,6 +164,17 @@ def test_a_full_disk_ends_the_run_and_leaves_a_readable_recording(memory: Path) 
 
     assert result.outcome.disk_full
     assert "No space left on device" in str(result.outcome.failure)
+
+
+def test_a_disk_that_is_full_at_the_beginning_refuses_the_run(memory: Path) -> None:
+    keeping = Keeping(storage=Storage(on_failure="go_on"), flight=True)
+    scenario = replace(PLAIN, live=True, keeping=keeping, machine=Machine(1, room=2_000))
+
+    result = check(scenario, memory)
+
+    told = str(result.outcome.failure)
+    assert told.startswith("not ready within 20 s: process '@recorder', which failed")
+    assert "No space left on device" in told
 
 
 def test_a_frozen_process_is_not_waited_for_without_end(memory: Path) -> None:
