@@ -26,6 +26,7 @@ from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
+from dataflow.recording.parts import Storage
 from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan
 
@@ -165,6 +166,17 @@ def test_a_full_disk_ends_the_run_and_leaves_a_readable_recording(memory: Path) 
     assert "No space left on device" in str(result.outcome.failure)
 
 
+def test_a_disk_that_is_full_at_the_beginning_refuses_the_run(memory: Path) -> None:
+    keeping = Keeping(storage=Storage(on_failure="go_on"), flight=True)
+    scenario = replace(PLAIN, live=True, keeping=keeping, machine=Machine(1, room=2_000))
+
+    result = check(scenario, memory)
+
+    told = str(result.outcome.failure)
+    assert told.startswith("not ready within 20 s: process '@recorder', which failed")
+    assert "No space left on device" in told
+
+
 def test_a_frozen_process_is_not_waited_for_without_end(memory: Path) -> None:
     frozen = (Happening(0.001, "freeze", "relay", {"span": 1e6}),)
 
@@ -216,6 +228,19 @@ def test_seeds(first: int, memory: Path) -> None:
             check(scenario, memory, replay=seed % 4 == 0)
         except Violation as violation:
             pytest.fail(f"{scenario.describe()}\n{violation}")
+
+
+def test_a_recording_without_what_only_the_outside_world_took_is_completed_and_not_replayed(memory: Path) -> None:
+    parts = (
+        "left: {SOURCE}",
+        "arm: {use: simulation.operators:Arm, inputs: {x: left/fast}}",
+        "relay: {use: simulation.operators:Relay, inputs: {x: left/slow}}",
+    )
+    scenario = replace(PLAIN, graph=DRAWN, parts=parts, keeping=Keeping("exclude: ['left/fast']"))
+
+    result = check(scenario, memory)
+
+    assert (result.verdict, result.replayed) == ("identical", False)
 
 
 @pytest.mark.long
@@ -333,6 +358,13 @@ def test_a_graph_is_shrunk_only_to_graphs(memory: Path) -> None:
 
     assert said == "it is left out"
     assert small.count == 1
+
+
+def test_what_fails_otherwise_is_a_broken_promise_of_its_seed(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("simulation.check._verify", lambda *_: 1 // 0)
+
+    with pytest.raises(Violation, match="ZeroDivisionError"):
+        check(PLAIN, memory)
 
 
 def test_planting_a_fault_leaves_nothing_behind() -> None:

@@ -57,7 +57,12 @@ def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
     for old in folder.rglob("*.mcap"):
         old.unlink()
     with reloading.fresh_files():
-        return _check(scenario, folder, replay=replay)
+        try:
+            return _check(scenario, folder, replay=replay)
+        except Violation:
+            raise
+        except Exception as error:
+            raise Violation(f"{type(error).__name__}: {error}") from error
 
 
 def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
@@ -65,7 +70,8 @@ def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
     plan = _plan(scenario, graph, folder)
     outcome = simulate(plan, scenario.machine, scenario.happenings, limit=scenario.limit)
     report = outcome.report
-    if outcome.failure is not None and not scenario.may_fail:
+    refused = outcome.disk_full and "not ready within" in str(outcome.failure)  # a disk that was full at the beginning
+    if outcome.failure is not None and not (scenario.may_fail or refused):
         raise Violation(f"the run failed: {outcome.failure}\n{outcome.failure.details}")
     if scenario.only_paused:
         _check_pauses(outcome)
@@ -177,7 +183,7 @@ def _check_completion(path: Path, out: Path, graph: Graph, report: RunReport) ->
         raise Violation(f"a thin recording cannot be completed: {made}")
     with Recording(out) as recording:
         stored = {name: stream.count for name, stream in recording.streams.items()}
-    left_out = {s for s, made in graph.streams.items() if graph.nodes[made.node].source} - set(graph.record.streams)
+    left_out = _sourced(graph) - set(graph.record.streams)
     expected = {stream: number for stream, (number, _) in report.streams.items() if stream not in left_out}
     lacking = [stream for stream, number in expected.items() if stored.get(stream, 0) != number]
     if lacking and not report.restarts:
@@ -229,8 +235,11 @@ def _verify(path: Path, outcome: Outcome, scenario: Scenario) -> str:
 
 def _has_sources(graph: Graph) -> bool:
     """Whether a recording has all that cannot be made again."""
-    given = {s for s, made in graph.streams.items() if graph.nodes[made.node].source}
-    return given <= set(graph.record.streams)
+    return _sourced(graph) <= set(graph.record.streams)
+
+
+def _sourced(graph: Graph) -> set[str]:
+    return {stream for stream, made in graph.streams.items() if graph.nodes[made.node].source}
 
 
 def _missed_by_recorder(report: RunReport | None) -> int:
@@ -415,13 +424,17 @@ MOST_OF_A_STEP = 2
 
 
 def _may_replay(scenario: Scenario, report: RunReport) -> bool:
-    """Whether a replay is to give the same: not of a run that was stopped, of one whose clock went back, nor of one of
-    which parameters were set.
+    """Whether a replay is to give the same: not of a run that was stopped, of one whose clock went back, or of which
+    parameters were set, nor of a recording without a source's stream that an operator takes, if only an external one.
 
     Nor is one run whose timer would make up for a long silence: it makes more ticks than a simulated run has time for.
     """
     silent = any(happening.fields.get("span", 0) > PATIENCE for happening in scenario.happenings)
     if scenario.graph == TICKING and silent:
+        return False
+    graph = scenario.load()
+    taken = {stream for node in graph.nodes.values() for stream in node.taken}
+    if not taken & _sourced(graph) <= set(graph.record.streams):
         return False
     changed = any(happening.kind == "set" for happening in scenario.happenings)
     went_back = any(fault.kind == "jump" for fault in scenario.faults) or any("PAIR" in p for p in scenario.parts)
