@@ -535,7 +535,7 @@ class Blame:
         return ()
 
     def _given(self, call: Call) -> list[Taken]:
-        """What a call whose inputs are held took, in the order of its inputs."""
+        """The messages of a call whose inputs are held, in the order of its inputs."""
         inputs = self._lines[call.operator].shots[call.number].firing.inputs
         return [Taken(call, name, entry) for name, given in inputs.items() for entry in entries_of(given)]
 
@@ -566,12 +566,9 @@ class Blame:
             again: dict[Call, Other] = {Call(operator, n): None for n in range(begin, call.number)}
             if self._changed("call left out", again, anew=Call(operator, begin)) is not None:
                 return False
-        return (
-            isinstance(self._value, Message)
-            or is_measured(self._value)
-            or agreed > FURTHER
-            or self._line(operator).has_forgotten(begin, call.number)
-        )
+        if isinstance(self._value, Message) or is_measured(self._value) or agreed > FURTHER:
+            return True
+        return self._line(operator).has_forgotten(begin, call.number)
 
     def _look_at_beginning(self, first: Call) -> None:
         """Names the state that an operator was given before its first call, where that decides."""
@@ -616,8 +613,8 @@ class Blame:
             self._chain.loose += [maker for maker in makers if maker is not None][:1]
 
     def _sensed_behind(self, joint: Sequence[Taken]) -> list[Taken]:
-        """What no call made of all that some messages come from, with the calls that took it; the calls behind them are
-        held then."""
+        """Returns the messages at the beginning of all that some come from, with the calls that took them; the inputs
+        of the calls between are held then."""
         sensed: dict[Place, Taken] = {}
         makers: dict[str, set[int]] = defaultdict(set)
         done: set[str] = set()

@@ -112,9 +112,12 @@ class Chain:
         return [link for link in self.links if link.input and link.maker is None]
 
     def weight(self, link: Link) -> tuple[float, float]:
-        """Returns by how much the value is another at most: where a message itself, or a call, is missing or nudged (a
-        nudge of a floating-point value counts as `1 / SIZE` of them), and with the content of another in its place, which
-        may count more than its own."""
+        """Returns by how much the value is another at most, to two digits.
+
+        First where a message itself, or a call, is left out or nudged (the effect of a nudge on floating-point values
+        counts `1 / SIZE` times), then with the content of another message in its place, which may count more than its
+        own.
+        """
         own, others = 0.0, 0.0
         for effect in link.effects:
             size = change(self.value, effect.value)
@@ -122,7 +125,7 @@ class Chain:
                 others = max(others, size)
             else:
                 own = max(own, size / SIZE if effect.way == "nudged" and is_measured(self.value) else size)
-        return own, others
+        return float(f"{own:.1e}"), float(f"{others:.1e}")
 
     def is_loose(self, call: Call) -> bool:
         """Returns whether no link leads on from a call: neither its own, nor one that was found for a later call."""

@@ -46,7 +46,7 @@ def is_finite(message: Message) -> bool:
 
 
 def made_finite(message: M, beside: Message | None) -> M:
-    """Returns the message with a finite neighbour in place of each number that is not finite: of its own array, or,
+    """Returns the message with a finite neighbour in place of each number that is not finite: from the same array, or,
     where that has none, from the same place of the message `beside`. Returns the same message where there is none."""
     for name, value in [(field.name, getattr(message, field.name)) for field in type(message).FIELDS]:
         if value is None or isinstance(value, str | bytes):

@@ -67,8 +67,8 @@ def blame(
 
     Each call on the chain is made again from its state with an input nudged, replaced by the message before, or left
     out, and so are all later calls that this reaches: an input that changes the value is on the chain, and so is the
-    call that made it. Earlier calls of an operator are tried where the value depends on its state. What changes the
-    value most is named first.
+    call that made it. Earlier calls of an operator are tried where the value depends on its state. The largest effect
+    is named first.
 
     Exit codes:
       0   the chain is whole: it leads to what was sensed, or to a state that an operator was given
