@@ -81,7 +81,7 @@ class Line:
         self._graph, self._seeding, self._made, self._was_read = graph, seeding_of(recording), made, read
         self._journal = RecordedJournal()
         self.error = ""
-        """What the last call raised that did."""
+        """The error of the last call that raised."""
         self._calls: Calls | None = None
         self._at = -1
         """The number of the call that `_calls` is just before, as it was then; -1: it was given other inputs."""

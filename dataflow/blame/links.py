@@ -13,7 +13,7 @@ from dataflow.blame.line import Call
 from dataflow.blame.nudge import SIZE
 
 Way = Literal["nudged", "made finite", "the one before", "left out", "another", "call left out", "a new operator"]
-"""How an input, or the calls before, were others."""
+"""The change of an input, or of the calls before."""
 
 
 @dataclass(frozen=True, slots=True)
