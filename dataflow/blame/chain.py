@@ -14,13 +14,15 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 from dataflow.blame.again import AS_IT_WAS, RAISED, Effects, Other, Place, Slot, place_of, with_messages
 from dataflow.blame.field import Field, differ, is_measured
 from dataflow.blame.line import Call, Line
 from dataflow.blame.links import Chain, Effect, Link, Way
-from dataflow.blame.nudge import is_finite, made_finite, nudged
+from dataflow.blame.nudge import nudged
+from dataflow.blame.others import ANOTHER, Others, Taken, without
+from dataflow.blame.split import split
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
@@ -32,9 +34,6 @@ from dataflow.sync.entries import entries_of
 TOLERANCE = 1e-4
 """Of floating-point values: a hundredth of the size of a nudge."""
 SECONDS = 60.0
-ANOTHER = 8
-"""Other messages of a stream, from its whole length, that are put in place of one of which nothing else shows an
-effect: a number on the same side of a threshold, nudged, shows none."""
 MOST_BYTES = 2**31
 """Of the inputs of all calls that are held: beyond it no others are read."""
 HISTORY = 0.5
@@ -42,19 +41,10 @@ HISTORY = 0.5
 FURTHER = 3
 """Blocks of earlier calls that are tried behind the first new operator that gives the same value, where that is no
 floating-point number: the same truth value, or the same class, may come of another state."""
-T = TypeVar("T")
 
 
 class BlameError(ReplayError):
     """Raised for a value whose origin cannot be found; the message has the reason."""
-
-
-class Taken(NamedTuple):
-    """A message that a call took in an input."""
-
-    call: Call
-    input: str
-    entry: Entry
 
 
 class _OutOfTime(Exception):
@@ -95,8 +85,7 @@ class Blame:
         """By operator, from which call on it is known which ones left a mark."""
         self._joint: list[list[Taken]] = []
         """Messages of which none changes the value alone, though all of them together do."""
-        self._spread: dict[str, list[Message]] = {}
-        """Of recorded streams, some messages of the whole length."""
+        self._messages = Others(recording, self._taken)
         self._raised = ""
         self.made = 0
         self._open: list[tuple[tuple[int, int, int], Call]] = []
@@ -336,7 +325,7 @@ class Blame:
         for effect in effects:
             yield replace(effect, fields=self._fields(call, firing, slot)) if effect.way == "nudged" else effect
         entry = entries_of(firing.inputs[slot[0]])[slot[1]]
-        for message in () if effects else self._elsewhere(call, slot[0], entry):
+        for message in () if effects else self._messages.elsewhere(call, slot[0], entry):
             if (found := self._changed("another", {call: with_messages(firing, {slot: message})})) is not None:
                 yield Effect("another", (), found[0])
                 return
@@ -361,75 +350,11 @@ class Blame:
     ) -> Iterator[tuple[Way, Mapping[str, InputValue]]]:
         """Yields the inputs with these messages nudged, taken from the message before, left out."""
         taken = [Taken(call, name, entries_of(firing.inputs[name])[k]) for name, k in slots]
-        for way, messages in self._instead(taken):
+        for way, messages in self._messages.instead(taken):
             yield way, with_messages(firing, dict(zip(slots, messages, strict=True)))
-        lacking = self._without(call.operator, firing, slots)
+        lacking = without(self.graph.nodes[call.operator], firing, slots)
         if lacking is not None:
             yield "left out", lacking
-
-    # --------------------------------------------------------------------------------------------- other messages
-
-    def _instead(self, taken: Sequence[Taken]) -> Iterator[tuple[Way, Sequence[Message]]]:
-        """Yields other messages in place of some (`_alternatives`), where one is another indeed."""
-        for way, messages in self._alternatives(taken):
-            if any(message != each.entry.value for message, each in zip(messages, taken, strict=True)):
-                yield way, messages
-
-    def _alternatives(self, taken: Sequence[Taken]) -> Iterator[tuple[Way, Sequence[Message]]]:
-        """Yields messages nudged to either side; made finite and nudged, where some are not; of each stream the message
-        before the first of them."""
-        values = [each.entry.value for each in taken]
-        for sign in (1, -1):
-            yield "nudged", [nudged(value, sign=sign)[0] for value in values]
-        finite = [each.entry.value if is_finite(each.entry.value) else self._finite(each) for each in taken]
-        if any(other is not value for other, value in zip(finite, values, strict=True)):
-            for sign in (1, -1):
-                yield "made finite", [nudged(value, sign=sign)[0] for value in finite]
-        before: dict[tuple[str, str], Message | None] = {}
-        for call, name, entry in taken:
-            if (name, entry.stream) not in before:
-                before[name, entry.stream] = self._before(call, name, entry)
-        if any(message is not None for message in before.values()):
-            held = [(before[name, entry.stream], entry) for _, name, entry in taken]
-            yield "the one before", [e.value if m is None else m.replace(stamp=e.stamp) for m, e in held]
-
-    def _finite(self, taken: Taken) -> Message:
-        """A message with finite neighbours in place of infinities, if there are any; else itself."""
-        value: Message = taken.entry.value
-        earlier = self._before(*taken)
-        for beside in (*(() if earlier is None else (earlier,)), *self._spread_of(taken.entry.stream)):
-            if (made := made_finite(value, beside)) is not value:
-                return made
-        return made_finite(value, None)
-
-    def _before(self, call: Call, name: str, entry: Entry) -> Message | None:
-        """The content of the message before one on its stream, as if it had come at the same time; of a stream that is
-        not recorded, of one that a call before took."""
-        info = self._recording.streams.get(entry.stream)
-        if info is not None and info.static:
-            return None
-        if info is None:
-            earlier = [each for each in self._taken(call, name, entry.stream) if each.stamp < entry.stamp]
-            return max(earlier, key=lambda each: each.stamp).replace(stamp=entry.stamp) if earlier else None
-        index = self._recording.index(entry.stream, end=entry.stamp - 1)
-        return index.read(len(index) - 1).message.replace(stamp=entry.stamp) if len(index) else None
-
-    def _elsewhere(self, call: Call, name: str, entry: Entry) -> Iterator[Message]:
-        """The contents of other messages of a stream, spread over its length; of one that is not recorded, of those
-        that calls before took."""
-        recorded = entry.stream in self._recording.streams
-        others = self._spread_of(entry.stream) if recorded else self._taken(call, name, entry.stream)[-ANOTHER:]
-        at_its_time = (message.replace(stamp=entry.stamp) for message in others)
-        yield from (message for message in at_its_time if message != entry.value)
-
-    def _spread_of(self, stream: str) -> list[Message]:
-        """Some messages of a recorded stream, spread over its length; none of one that is static, or not recorded."""
-        if stream not in self._spread:
-            info = self._recording.streams.get(stream)
-            index = self._recording.index(stream) if info is not None and not info.static else ()
-            rows = sorted({round(k * (len(index) - 1) / (ANOTHER - 1)) for k in range(ANOTHER)}) if index else []
-            self._spread[stream] = [index.read(row).message for row in rows] if index else []
-        return self._spread[stream]
 
     def _taken(self, call: Call, name: str, stream: str) -> list[Message]:
         """What calls before took of a stream in an input."""
@@ -438,26 +363,6 @@ class Blame:
         shots = self._lines[call.operator].shots
         given = [shots[n].firing.inputs.get(name) for n in range(first, call.number) if n in shots]
         return [entry.value for each in given for entry in entries_of(each) if entry.stream == stream]
-
-    def _without(self, operator: str, firing: Firing, slots: Sequence[Slot]) -> Mapping[str, InputValue] | None:
-        """The inputs without these messages, where a firing may lack them."""
-        spec = self.graph.nodes[operator].operator.spec
-        inputs = dict(firing.inputs)
-        for name in {name for name, _ in slots}:
-            port, given = spec.inputs[name], inputs[name]
-            out = {k for each, k in slots if each == name}
-            if isinstance(given, tuple):
-                inputs[name] = tuple(entry for k, entry in enumerate(given) if k not in out)
-            elif port.kind == "in" and not spec.merge:
-                return None
-            elif isinstance(given, Mapping) and len(out) < len(given):
-                inputs[name] = {s: entry for k, (s, entry) in enumerate(given.items()) if k not in out}
-            elif port.kind == "in" or not port.required:
-                inputs[name] = None
-            else:
-                return None
-        triggered = firing.tick or any(inputs[p.name] for p in spec.triggers if p.name in inputs)
-        return inputs if triggered or not spec.triggers else None
 
     # ------------------------------------------------------------------------------------------------- the state
 
@@ -518,7 +423,7 @@ class Blame:
         def tries() -> Iterator[tuple[Way, Mapping[Call, Other]]]:
             yield "call left out", {Call(operator, n): None for n in numbers}
             taken = {n: self._given(Call(operator, n)) for n in numbers}
-            for way, messages in self._instead([each for n in numbers for each in taken[n]]):
+            for way, messages in self._messages.instead([each for n in numbers for each in taken[n]]):
                 left, others = iter(messages), dict[Call, Other]()
                 for n in numbers:
                     firing = line.shots[n].firing
@@ -650,7 +555,7 @@ class Blame:
     def _sensed(self, taken: Sequence[Taken]) -> tuple[Effect, ...]:
         """The effects of sensors' messages that are others for all calls that take them; of several, one."""
         effects: dict[Way, Effect] = {}
-        for way, messages in self._instead(taken):
+        for way, messages in self._messages.instead(taken):
             others = {place_of(each.entry): message for each, message in zip(taken, messages, strict=True)}
             if way not in effects and (found := self._changed(way, {}, messages=others)) is not None:
                 effects[way] = Effect(way, (), found[0], len(taken))
@@ -701,38 +606,6 @@ def _goes_on(link: Link, taken: Taken, effects: tuple[Effect, ...]) -> bool:
     same = link.effects is effects and (link.call, link.input) == (taken.call, taken.input)
     stream, incarnation, number = place_of(taken.entry)
     return same and (stream, incarnation, number - 1) == link.messages[-1]
-
-
-def split(
-    items: Sequence[T], shows: Callable[[Sequence[T]], tuple[Effect, ...]]
-) -> Iterator[tuple[Sequence[T], tuple[Effect, ...]]]:
-    """Yields those of some items, the last ones first, that have effects alone, by halving; where none does, the
-    shortest run of them that has, if all together have."""
-    if not items or not (effects := shows(items)):
-        return
-    if len(items) == 1:
-        yield items, effects
-        return
-    half, found = len(items) // 2, False
-    for part in (items[half:], items[:half]):
-        for each in split(part, shows):
-            found = True
-            yield each
-    if not found:
-        begin = _furthest(half, lambda n: bool(shows(items[n:])))
-        items = items[begin:]
-        left_out = _furthest(len(items) - 1, lambda n: bool(shows(items[: len(items) - n])))
-        items = items[: len(items) - left_out]
-        yield items, shows(items)
-
-
-def _furthest(most: int, holds: Callable[[int], bool]) -> int:
-    """The largest number up to `most` for which it holds, by bisection; it does for 0."""
-    low, high = 0, most + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low
 
 
 def _above(graph: Graph, operator: str) -> set[str]:
