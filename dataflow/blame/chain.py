@@ -350,7 +350,7 @@ class Blame:
     ) -> Iterator[tuple[Way, Mapping[str, InputValue]]]:
         """Yields the inputs with these messages nudged, taken from the message before, left out."""
         taken = [Taken(call, name, entries_of(firing.inputs[name])[k]) for name, k in slots]
-        for way, messages in self._messages.instead(taken):
+        for way, messages in self._messages.instead(taken, hold=False):
             yield way, with_messages(firing, dict(zip(slots, messages, strict=True)))
         lacking = without(self.graph.nodes[call.operator], firing, slots)
         if lacking is not None:
@@ -423,7 +423,7 @@ class Blame:
         def tries() -> Iterator[tuple[Way, Mapping[Call, Other]]]:
             yield "call left out", {Call(operator, n): None for n in numbers}
             taken = {n: self._given(Call(operator, n)) for n in numbers}
-            for way, messages in self._messages.instead([each for n in numbers for each in taken[n]]):
+            for way, messages in self._messages.instead([each for n in numbers for each in taken[n]], hold=True):
                 left, others = iter(messages), dict[Call, Other]()
                 for n in numbers:
                     firing = line.shots[n].firing
@@ -555,7 +555,7 @@ class Blame:
     def _sensed(self, taken: Sequence[Taken]) -> tuple[Effect, ...]:
         """The effects of sensors' messages that are others for all calls that take them; of several, one."""
         effects: dict[Way, Effect] = {}
-        for way, messages in self._messages.instead(taken):
+        for way, messages in self._messages.instead(taken, hold=True):
             others = {place_of(each.entry): message for each, message in zip(taken, messages, strict=True)}
             if way not in effects and (found := self._changed(way, {}, messages=others)) is not None:
                 effects[way] = Effect(way, (), found[0], len(taken))

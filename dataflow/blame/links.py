@@ -14,6 +14,8 @@ from dataflow.blame.nudge import SIZE
 
 Way = Literal["nudged", "made finite", "the one before", "left out", "another", "call left out", "a new operator"]
 """The change of an input, or of the calls before."""
+OTHER_CONTENT: frozenset[Way] = frozenset({"the one before", "another"})
+"""Ways that put the content of another message in place of one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,14 +123,20 @@ class Chain:
         own, others = 0.0, 0.0
         for effect in link.effects:
             size = change(self.value, effect.value)
-            if effect.way in ("the one before", "another"):
+            if effect.way in OTHER_CONTENT:
                 others = max(others, size)
             else:
                 own = max(own, size / SIZE if effect.way == "nudged" and is_measured(self.value) else size)
         return float(f"{own:.1e}"), float(f"{others:.1e}")
 
     def is_loose(self, call: Call) -> bool:
-        """Returns whether no link leads on from a call: neither its own, nor one that was found for a later call."""
+        """Returns whether no link leads on from a call: neither its own, nor one that was found for a later call.
+
+        A call that counts only by what another content would do, beside one that counts by its own, need not lead on.
+        """
+        reached = [link for link in self.links if link.maker == call]
+        if reached and all(self._is_aside(link) for link in reached):
+            return False
         return not any(
             link.call == call
             or (
@@ -139,6 +147,10 @@ class Chain:
             )
             for link in self.links
         )
+
+    def _is_aside(self, link: Link) -> bool:
+        beside = {effect.way for other in self.links if other.call == link.call for effect in other.effects}
+        return OTHER_CONTENT.issuperset(e.way for e in link.effects) and not OTHER_CONTENT.issuperset(beside)
 
     def was_raised(self, call: Call, last: int, name: str, error: str) -> None:
         """Notes what could not be tried; calls beside those that were noted before are noted with them."""

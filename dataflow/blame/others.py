@@ -35,15 +35,15 @@ class Others:
         self._spread: dict[str, list[Message]] = {}
         """Of recorded streams, some messages of the whole length."""
 
-    def instead(self, taken: Sequence[Taken]) -> Iterator[tuple[Way, Sequence[Message]]]:
-        """Yields other messages in place of some (`_alternatives`), where one is another indeed."""
-        for way, messages in self._alternatives(taken):
+    def instead(self, taken: Sequence[Taken], *, hold: bool) -> Iterator[tuple[Way, Sequence[Message]]]:
+        """Yields other messages in place of some, where one is another indeed: nudged to either side; made finite and
+        nudged, where some are not; the one before each, or with `hold` the one before the first of its stream, since a
+        spike that lasts would only be put off."""
+        for way, messages in self._alternatives(taken, hold=hold):
             if any(message != each.entry.value for message, each in zip(messages, taken, strict=True)):
                 yield way, messages
 
-    def _alternatives(self, taken: Sequence[Taken]) -> Iterator[tuple[Way, Sequence[Message]]]:
-        """Yields messages nudged to either side; made finite and nudged, where some are not; of each stream the message
-        before the first of them."""
+    def _alternatives(self, taken: Sequence[Taken], *, hold: bool) -> Iterator[tuple[Way, Sequence[Message]]]:
         values = [each.entry.value for each in taken]
         for sign in (1, -1):
             yield "nudged", [nudged(value, sign=sign)[0] for value in values]
@@ -52,12 +52,14 @@ class Others:
             for sign in (1, -1):
                 yield "made finite", [nudged(value, sign=sign)[0] for value in finite]
         before: dict[tuple[str, str], Message | None] = {}
+        others: list[Message] = []
         for call, name, entry in taken:
-            if (name, entry.stream) not in before:
-                before[name, entry.stream] = self._before(call, name, entry)
-        if any(message is not None for message in before.values()):
-            held = [(before[name, entry.stream], entry) for _, name, entry in taken]
-            yield "the one before", [e.value if m is None else m.replace(stamp=e.stamp) for m, e in held]
+            key = name, entry.stream
+            if key not in before or not hold:
+                before[key] = self._before(call, name, entry)
+            other = before[key]
+            others.append(entry.value if other is None else other.replace(stamp=entry.stamp))
+        yield "the one before", others
 
     def _finite(self, taken: Taken) -> Message:
         """A message with finite neighbours in place of infinities, if there are any; else itself."""
