@@ -104,7 +104,7 @@ class Blame:
                 for line in self._lines.values():
                     line.close()
         looked_into = sorted(self._seen - set(chain.left), key=self._age)
-        chain.loose += [call for call in looked_into if chain.is_loose(call) and call not in chain.loose]
+        chain.loose += [call for call in chain.loose_of(looked_into) if call not in chain.loose]
         chain.links.sort(key=lambda link: (*(-each for each in chain.weight(link)), -link.stamp, self._age(link.call)))
         chain.seconds = time.monotonic() - began
         return chain

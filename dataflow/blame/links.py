@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -129,15 +129,16 @@ class Chain:
                 own = max(own, size / SIZE if effect.way == "nudged" and is_measured(self.value) else size)
         return float(f"{own:.1e}"), float(f"{others:.1e}")
 
-    def is_loose(self, call: Call) -> bool:
-        """Returns whether no link leads on from a call: neither its own, nor one that was found for a later call.
+    def loose_of(self, calls: Sequence[Call]) -> list[Call]:
+        """Returns those of some calls from which no link leads on: neither its own, nor one found for a later call.
 
         A call that counts only by what another content would do, beside one that counts by its own, need not lead on.
         """
-        reached = [link for link in self.links if link.maker == call]
-        if reached and all(self._is_aside(link) for link in reached):
-            return False
-        return not any(
+        aside = self._aside()
+        return [call for call in calls if call not in aside and not self._leads_on(call)]
+
+    def _leads_on(self, call: Call) -> bool:
+        return any(
             link.call == call
             or (
                 not link.input
@@ -148,9 +149,26 @@ class Chain:
             for link in self.links
         )
 
-    def _is_aside(self, link: Link) -> bool:
-        beside = {effect.way for other in self.links if other.call == link.call for effect in other.effects}
-        return OTHER_CONTENT.issuperset(e.way for e in link.effects) and not OTHER_CONTENT.issuperset(beside)
+    def _aside(self) -> set[Call]:
+        """Returns the calls to which links lead only by another content, from calls that have other links, too, or that
+        are such calls themselves."""
+        others = {id(link) for link in self.links if OTHER_CONTENT.issuperset(e.way for e in link.effects)}
+        counts = {link.call for link in self.links if id(link) not in others}
+        to: dict[Call, list[Link]] = defaultdict(list)
+        for link in self.links:
+            if link.maker is not None:
+                to[link.maker].append(link)
+        found: set[Call] = set()
+        while True:
+            more = {
+                call
+                for call, links in to.items()
+                if call not in found
+                and all(link.call in found or (link.call in counts and id(link) in others) for link in links)
+            }
+            if not more:
+                return found
+            found |= more
 
     def was_raised(self, call: Call, last: int, name: str, error: str) -> None:
         """Notes what could not be tried; calls beside those that were noted before are noted with them."""
