@@ -49,6 +49,7 @@ class Part:
     ready: float = 0.0
     messages: int = 0
     bytes: int = 0
+    abandoned: bool = False
 
 
 class PartsSink:
@@ -297,7 +298,10 @@ class PartsSink:
             self._count(part)
 
     def _abandon(self, part: Part) -> None:
-        """Closes a file whose disk refuses."""
+        """Closes a file whose disk refuses, once: more than one thing may be refused before that is noticed."""
+        if part.abandoned:
+            return
+        part.abandoned = True
         with suppress(RecordingError):  # the refusal once more; the file is closed
             part.sink.writer.close()
         self.lost.firings += part.sink.unsaved_calls
