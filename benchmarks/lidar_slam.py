@@ -150,7 +150,9 @@ def tries(map_file: Path, origin: Array | None, drive: Drive, every: int) -> Cou
         operator.setup()
         tally["tries"] += 1
         for k in range(begin, begin + TRY):
+            start = time.process_time()
             pose = operator.process(drive.clouds[k]).get("pose")
+            tally["longest, ms"] = max(tally["longest, ms"], round(1e3 * (time.process_time() - start)))
             if not isinstance(pose, Odometry):
                 continue
             tally["found"] += 1
@@ -176,14 +178,18 @@ def relocalise(named: list[tuple[str, int]], cache: Path, every: int) -> None:
             operator.process(cloud)
         operator.finish()
         maps[world, seed] = file, origin
-    print("| world | tries | found | within 5 cm | scans until found, mean | wrong | tries in another's map | found |")
-    print(f"| --- |{' ---: |' * 7}")
+    print(
+        "| world | tries | found | within 5 cm | scans until found, mean | wrong | tries in another's map | found "
+        "| longest call, CPU s |"
+    )
+    print(f"| --- |{' ---: |' * 8}")
     for k, (world, seed) in enumerate(named):
         drive = rendered(cache, world, seed, 40, 0.5, "tour")
         own = tries(*maps[world, seed], drive, every)
         other = tries(maps[named[k - 1]][0], None, drive, 3 * every) if len(named) > 1 else Counter[str]()
         print(f"| {world} {seed} | {own['tries']} | {own['found']} | {own['within 5 cm']} "
-              f"| {own['scans'] / max(1, own['found']):.1f} | {own['wrong']} | {other['tries']} | {other['found']} |",
+              f"| {own['scans'] / max(1, own['found']):.1f} | {own['wrong']} | {other['tries']} | {other['found']} "
+              f"| {max(own['longest, ms'], other['longest, ms']) / 1e3:.1f} |",
               flush=True)  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import heapq
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Set
 from typing import Any, NamedTuple
 
@@ -38,6 +39,7 @@ class Spans:
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
         self._of: dict[str, dict[_Place, _Span]] = {name: {} for name in graph.streams}
+        self._calls = Counter[str]()
         self._passed: dict[str, _Place] = {}
         """Each stream's latest message that a record has come to."""
 
@@ -94,6 +96,8 @@ class Spans:
 
     def _span(self, record: FiringRecord) -> dict[str, Any]:
         name = f"{record.operator} {record.incarnation} {record.index}".encode()
+        number = self._calls[record.operator]
+        self._calls[record.operator] += 1
         causes = [found for ref in record.inputs.values() if (found := self._cause(ref)) is not None]
         trace = causes[0].trace if causes else xxhash.xxh3_128_hexdigest(name)
         own = _Span(trace, xxhash.xxh3_64_hexdigest(name))
@@ -112,7 +116,7 @@ class Spans:
                 {"key": f"dataflow.{key}", "value": {"intValue": str(value)}}
                 for key, value in (
                     ("stamp", record.stamp),
-                    ("firing", record.index),
+                    ("call", number),
                     ("incarnation", record.incarnation),
                     ("dropped", len(record.drops)),
                 )

@@ -203,7 +203,6 @@ def config_of(graph: Graph, log: LogPlan | None, *, paranoid: bool = False, sour
         listen=[],
         replay=replay_of(log),
         paranoid=paranoid,
-        snapshots=graph.record.snapshots,
         warm=warm_start_of(log),
     )
 

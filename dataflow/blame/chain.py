@@ -466,11 +466,13 @@ class Blame:
 
     def _look_back(self, call: Call) -> None:
         """Finds the earlier calls of an operator that left their mark in its state: the latest ones first, in blocks of
-        1, 1, 2, 4, 8... calls, back to where an operator that is new gives the same value."""
+        1, 1, 2, 4, 8... calls, back to where an operator that is new gives the same value, and no call before has
+        brought the state back to that of a new one."""
         operator, line = call.operator, self._line(call.operator)
         first = line.begin_of(call.number)
-        end, size = min(call.number, self._searched.get(operator, call.number)), 1
-        if first < end < call.number and self._changed({}, anew=Call(operator, end)) is None:
+        end = min(call.number, self._searched.get(operator, call.number))
+        size = 1 if end == call.number else end - self._goes_back_to(operator, first, end)
+        if end > first and not size:
             return
         deadline = self._deadline
         self._deadline = min(deadline, time.monotonic() + HISTORY * (deadline - time.monotonic()))
@@ -484,16 +486,32 @@ class Blame:
                     if any(effect.together == 1 for effect in effects):
                         self._queue(earlier)
                 self._searched[operator] = begin
-                if begin > first and self._changed({}, anew=Call(operator, begin)) is None:
+                back = self._goes_back_to(operator, first, begin)
+                if begin > first and back == begin:
                     self._chain.ended[operator] = min(begin, self._chain.ended.get(operator, begin))
                     break
-                size, end = max(size, call.number - begin), begin
+                size, end = max(size, call.number - begin, begin - back), begin
             else:
                 self._look_at_beginning(Call(operator, first))
         except _OutOfTime:
             self._chain.unsplit.append((operator, first, end - 1))
         finally:
             self._deadline = deadline
+
+    def _goes_back_to(self, operator: str, first: int, begin: int) -> int:
+        """The call down to which at least the search for marks goes on before `begin`: that itself where it ends.
+
+        A new operator gives the same value where the calls before are forgotten, and where one of them has brought the
+        state back to that of a new one: then the search goes back to that call.
+        """
+        if begin <= first or self._changed({}, anew=Call(operator, begin)) is not None:
+            return begin - 1
+        line = self._line(operator)
+        if not line.is_as_new(begin):
+            return begin
+        self._reach(Call(operator, first), self._last[operator])
+        returned = line.returned_by(begin)
+        return begin if returned is None else returned
 
     def _look_at_beginning(self, first: Call) -> None:
         """Names the state that an operator was given before its first call, where that decides."""

@@ -76,6 +76,8 @@ class Line:
         self._read: set[int] = set()
         self._states: dict[int, bytes] = {}
         """States before calls."""
+        self._as_new: dict[int, bool] = {}
+        """By call, whether the state before it is that of a new operator."""
         self._graph, self._seeding, self._made, self._was_read = graph, seeding_of(recording), made, read
         self._journal = RecordedJournal()
         self._calls: Calls | None = None
@@ -179,6 +181,37 @@ class Line:
         self._at = -1 if anew else number
         self._keep(number)
 
+    def is_as_new(self, number: int) -> bool:
+        """Returns whether the state before a call is that of a new operator; False where the operator gives none."""
+        if number not in self._as_new:
+            self.begin(number, anew=True)
+            new = self._state(number)
+            self.begin(number)
+            self._as_new[number] = new is not None and self._state(number) == new
+        return self._as_new[number]
+
+    def returned_by(self, number: int) -> int | None:
+        """The last of the calls before one, all held, that has brought another state back to that of a new operator."""
+        return next((n for n in range(number - 1, self.begin_of(number) - 1, -1) if not self._was_new(n)), None)
+
+    def _was_new(self, number: int) -> bool:
+        """`is_as_new` of a call whose inputs are held, found for all calls up to it at once."""
+        if number not in self._as_new:
+            first = self.begin_of(number)
+            self.begin(first, anew=True)
+            new = self._state(first)
+            self.begin(first)
+            for passed in range(first, number + 1):
+                self._as_new[passed] = self._state(passed) == new
+                if passed in self.shots:
+                    self.fire(passed, self.shots[passed].firing)
+        return self._as_new[number]
+
+    def _state(self, number: int) -> bytes | None:
+        """The state of the operator, just before a call."""
+        assert self._calls is not None
+        return self._calls.snapshot((self.records[number].incarnation, self.records[number].stamp - 1))
+
     def _set_up(self, number: int) -> None:
         """Makes a new operator, with the parameters as they were before a call."""
         self.leave()
@@ -222,8 +255,7 @@ class Line:
     def _keep(self, number: int) -> None:
         if self.stateless or self._at != number or number in self._states or self._calls is None:
             return
-        record = self.records[number]
-        state = self._calls.snapshot((record.incarnation, record.stamp - 1))
+        state = self._state(number)
         if state is not None and sum(map(len, self._states.values())) + len(state) <= MOST_BYTES:
             self._states[number] = state
 

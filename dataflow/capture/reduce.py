@@ -64,3 +64,28 @@ def needed(items: Sequence[T], shows: Callable[[Sequence[T]], bool]) -> Sequence
         if not left:
             break
     return found
+
+
+def thinned(items: Sequence[T], shows: Callable[[Sequence[T]], bool]) -> Sequence[T]:
+    """Every other one of `items`, which show it, again and again as long as these show it."""
+    left = items
+    while len(left) > 1:
+        half = next((part for part in (left[1::2], left[::2]) if shows(part)), None)
+        if half is None:
+            break
+        left = half
+    return left
+
+
+def none_to_spare(items: Sequence[T], shows: Callable[[Sequence[T]], bool]) -> Sequence[T]:
+    """As `smallest`, by leaving out one after the other, the last one first: quicker where most of `items` are
+    needed."""
+    left, at, kept = list(items), len(items) - 1, 0
+    while left and kept < len(left):
+        rest = left[:at] + left[at + 1 :]
+        if shows(rest):
+            left, kept = rest, 0
+        else:
+            kept += 1
+        at = (at - 1) % max(len(left), 1)
+    return left

@@ -55,8 +55,8 @@ def merge(
         done.notes += [f"{origin.path} {NOTHING_IN_IT}" for origin in bare]
         prefixes = [p for origin, p in zip(origins, prefixes, strict=True) if origin not in bare]
         origins = [origin for origin in origins if origin not in bare]
-        if not origins:
-            raise RecordingError("nothing is in any of these files")
+    if not origins:
+        raise RecordingError("nothing is in any of these files")
     one_run = not any(prefixes) and are_of_one_run(origins)
     with ExitStack() as stack:
         if one_run:
@@ -137,17 +137,29 @@ def _joined_metadata(origins: Sequence[Origin], done: Edited, *, left_out: bool)
     if ends:
         metadata[ENDS] = {stream: json.dumps(end) for stream, end in ends.items()}
     parts = [cut_of(o.metadata) or Cut(o.path.name, None, None) for o in origins]
-    gaps = []
-    for one, other in pairwise(parts):
-        if one.end is not None and other.start is not None and other.start > one.end + 1:
-            gaps.append((one.end, other.start))
-            done.notes.append(f"nothing is known of {format_stamp(one.end)} to {format_stamp(other.start)}")
+    gaps = list(_gaps(parts))
+    done.notes += [f"nothing is known of {format_stamp(end)} to {format_stamp(start)}" for end, start in gaps]
     start = None if any(p.start is None for p in parts) else min(p.start for p in parts if p.start is not None)
     end_stamp = None if any(p.end is None for p in parts) else max(p.end for p in parts if p.end is not None)
     metadata.pop(CUT, None)
     if gaps or left_out or start is not None or end_stamp is not None:
         metadata[CUT] = Cut(parts[0].of, start, end_stamp).metadata()
     return metadata
+
+
+def _gaps(parts: Sequence[Cut]) -> Iterator[tuple[int, int]]:
+    """Yields from where to where (stamps, ns) no part reaches, of parts in the order of their beginnings.
+
+    A part may lie within another: its stamps were new again after a jump of the clock, or it was cut out besides. One
+    without an end reaches to that of the run.
+    """
+    reached: int | None = None
+    for part in parts:
+        if reached is not None and part.start is not None and part.start > reached + 1:
+            yield reached, part.start
+        if part.end is None:
+            return
+        reached = part.end if reached is None else max(reached, part.end)
 
 
 def _taken_once(origins: Sequence[Origin]) -> list[dict[int, Mask]]:

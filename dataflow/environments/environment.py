@@ -6,6 +6,7 @@ version of Python.
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import subprocess
@@ -14,7 +15,7 @@ import sysconfig
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dataflow.environments import lock
 
@@ -77,9 +78,7 @@ def environment_of(env: str) -> Environment:
             f"env {env!r} is no environment: {python} is missing; `{sys.executable} -m venv {env}` makes one"
         )
     try:
-        probe = [str(python), "-I", "-c", _PROBE]
-        answer = subprocess.run(probe, capture_output=True, text=True, timeout=_PROBE_WITHIN, check=True).stdout
-        python_version, path, engine = json.loads(answer)
+        python_version, path, engine = _probed(str(python), _state(folder))
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         why = (getattr(error, "stderr", "") or str(error)).strip().rpartition("\n")[2]
         raise EnvError(f"env {env!r}: its Python cannot be run: {why}") from error
@@ -96,13 +95,29 @@ def environment_of(env: str) -> Environment:
     return Environment(folder, str(python), tuple(path))
 
 
+@functools.lru_cache(maxsize=64)
+def _probed(python: str, state: tuple[tuple[int, int, int], ...]) -> tuple[Any, Any, Any]:
+    """Returns version, import path and engine of an interpreter: asked once while the `state` lasts."""
+    probe = [python, "-I", "-c", _PROBE]
+    answer = subprocess.run(probe, capture_output=True, text=True, timeout=_PROBE_WITHIN, check=True).stdout
+    version, path, engine = json.loads(answer)
+    return version, path, engine
+
+
+def _state(folder: Path) -> tuple[tuple[int, int, int], ...]:
+    """Returns what changes when the interpreter of an environment, its settings or its packages do."""
+    places = (folder / "bin/python", folder / "pyvenv.cfg", *sorted(folder.glob("lib/python*/site-packages")))
+    found = [place.stat() for place in places if place.exists()]
+    return tuple((state.st_ino, state.st_size, state.st_mtime_ns) for state in found)
+
+
 def require_environment(operator: str, env: str | None) -> None:
     """Raises `EnvError` where this process is not in the environment that an operator needs."""
     here = os.environ.get(_MARK, "").partition(os.pathsep)[0]
     if env is not None and str(_folder(env)) != here:
         raise EnvError(
             f"operator {operator!r} needs the environment {env!r}, and this process is in "
-            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay` and `verify` start processes in it"
+            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay`, `verify` and `debug` start processes in it"
         )
 
 

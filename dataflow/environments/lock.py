@@ -1,16 +1,26 @@
 """The lock of an environment that is built from a file of requirements, beside it.
 
 `odometry.txt` (requirements as pip reads them) has the lock `odometry.lock`, and the environment `odometry.env`, in
-which a copy of the lock shows what it was built from.
+which a copy of the lock shows what it was built from. A lock is a file of requirements, too: a version of each package,
+with the hashes of its files for each kind of machine on which it was built.
 """
 
 from __future__ import annotations
 
 import hashlib
+import sys
+import sysconfig
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 _HEAD = "# of "
+_KINDS = "# hashes of "
+_HASH = " --hash=sha256:"
 _BUILT = "built.lock"
+HERE = f"{sysconfig.get_platform()} {sys.implementation.cache_tag}"
+"""The kind of this machine: wheels of others are other files."""
+Pins = Mapping[str, Collection[str]]
+"""By line of a package, as pip reads it, the SHA-256 of its files; none of a folder or a repository."""
 
 
 def is_requirements(env: str) -> bool:
@@ -47,9 +57,35 @@ def is_locked(requirements: Path) -> bool:
     return lock.is_file() and lock.read_text().partition("\n")[0] == _head(requirements)
 
 
-def write(requirements: Path, lines: list[str]) -> None:
-    """Writes the lock."""
-    lock_of(requirements).write_text("\n".join((_head(requirements), *lines, "")))
+def kinds(requirements: Path) -> set[str]:
+    """Returns the kinds of machine whose files the hashes are of."""
+    named = [line for line in _lines(requirements) if line.startswith(_KINDS)]
+    return {kind for line in named for kind in line.removeprefix(_KINDS).split(", ")}
+
+
+def pins(requirements: Path) -> dict[str, set[str]]:
+    """Returns what is locked, with the hashes."""
+    found = {}
+    for line in _lines(requirements):
+        if line and not line.startswith(("#", "-")):
+            pin, *hashes = line.split(_HASH)
+            found[pin] = set(hashes)
+    return found
+
+
+def write(requirements: Path, options: Collection[str], locked: Pins, machines: Collection[str] = (HERE,)) -> None:
+    """Writes the lock: options that say where packages are looked for, and what is locked for kinds of machines."""
+    head = (_head(requirements), _KINDS + ", ".join(sorted(machines)), *options)
+    lock_of(requirements).write_text("\n".join((*head, *lines(locked), "")))
+
+
+def lines(locked: Pins) -> list[str]:
+    """Returns the lines of packages in a file for pip."""
+    return ["".join((pin, *(_HASH + each for each in sorted(locked[pin])))) for pin in sorted(locked, key=str.lower)]
+
+
+def _lines(requirements: Path) -> list[str]:
+    return lock_of(requirements).read_text().splitlines()
 
 
 def note_built(requirements: Path) -> None:

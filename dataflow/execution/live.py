@@ -26,9 +26,9 @@ from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.code import ReloadError, Replaced, code_now
 from dataflow.graph.model import Node, OperatorImportError
-from dataflow.graph.sections import Snapshots
 from dataflow.operator import Operator, OperatorSpec
 from dataflow.records.firing import MAX_STATE_BYTES
+from dataflow.records.spacing import StateSpacing
 from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
 from dataflow.sync.single import make_aligner
 
@@ -57,7 +57,7 @@ class LiveRunner(OperatorRunner):
         seed: int = 0,
         paranoid: bool = False,
         operator: Operator | None = None,
-        snapshots: Snapshots | None = None,
+        snapshots: StateSpacing | None = None,
         clock: Clock | None = None,
         event_clock: EventClock = time.time_ns,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,

@@ -20,10 +20,10 @@ from dataflow.execution.memory import WATCHED, MemoryGuard
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
 from dataflow.graph.model import Node
-from dataflow.graph.sections import Snapshots
 from dataflow.messages.base import Message
 from dataflow.operator import Operator
 from dataflow.records.firing import MAX_STATE_BYTES, Emission, Kind
+from dataflow.records.spacing import StateSpacing
 from dataflow.sync import FOREVER, NEVER, Drop, Entry, Firing, format_duration, format_stamp
 from dataflow.sync.single import make_aligner
 
@@ -34,12 +34,6 @@ by a wrong stamp. A live run leaves ticks out instead, and counts them."""
 SHORT = 1_000_000
 """ns: an operator whose calls take less on average does not announce each one by a frontier below its stamp. Its
 messages imply the same frontier at once."""
-
-CPU_SPACING = 250_000_000
-"""ns of CPU time between two snapshots of an operator's state, where they are spaced by that: of its calls, and of
-what repeating them takes besides."""
-REPEATING = 2_000_000
-"""ns that repeating a call takes besides: reading, decoding, comparing (`benchmarks/debugging.md`)."""
 
 MOST_DROPPED = 10_000
 """Stamps that one step may drop before it returns to its driver, which has other work."""
@@ -61,11 +55,10 @@ class OperatorRunner(Runner):
         paranoid: bool = False,
         operator: Operator | None = None,
         lossy: bool = False,
-        snapshots: Snapshots | None = None,
+        snapshots: StateSpacing | None = None,
     ) -> None:
         super().__init__(node, node.make() if operator is None else operator, emitter, lossy=lossy)
         self.paranoid, self.snapshots = paranoid, snapshots
-        self._next_snapshot: int | None = None
         self._left_out = 0
         self._warm: int | None = None
         self._guard, self._watched = MemoryGuard(), FOREVER if paranoid else WATCHED
@@ -199,8 +192,9 @@ class OperatorRunner(Runner):
         self.firings += kind != "finish"
         self._record(kind, firing, started, emissions, None)
         self.ports.publish()
-        if self.snapshots is not None and kind != "finish":
-            self._snapshot_if_due(firing.stamp)
+        spacing = self.snapshots if kind != "finish" else None
+        if spacing is not None and spacing.is_due(firing.stamp, self.work.cpu_ns, self.firings):
+            self._snapshot(firing.stamp, spacing)
 
     def _call_watched(self, firing: Firing) -> dict[str, Message]:
         """Makes a call and looks whether it has written into its inputs: an error if `paranoid`, else printed."""
@@ -214,22 +208,13 @@ class OperatorRunner(Runner):
             self._watched = 0
         return messages
 
-    def _snapshot_if_due(self, stamp: int) -> None:
-        """Records the operator's state, about every `snapshots` ns of event time, then at the same firings in every
-        run; or every `CPU_SPACING` ns of the CPU time that it takes to repeat its calls."""
-        assert self.snapshots is not None
-        at, spacing = stamp, self.snapshots
-        if spacing == "cpu":
-            at, spacing = self.work.cpu_ns + self.firings * REPEATING, CPU_SPACING
-        if self._next_snapshot is None:
-            self._next_snapshot = at + spacing
-        if at < self._next_snapshot:
-            return
-        self._next_snapshot = at + spacing
+    def _snapshot(self, stamp: int, spacing: StateSpacing) -> None:
+        """Records the operator's state behind the firing at a stamp."""
         started = time.time_ns()
         state = self.calls.snapshot((self.records.incarnation, stamp))
         if state is None:
             return
+        spacing.took(len(state))
         if len(state) <= MAX_STATE_BYTES:
             self.records.add("snapshot", stamp, started, detail={"state": state})
             return

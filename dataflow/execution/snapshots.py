@@ -12,6 +12,8 @@ import numpy as np
 from dataflow.state import StateError
 
 _ARRAY = 1
+_LONGEST_HEADER = 1024
+"""Bytes of the type and shape in front of an array's: at most 64 lengths of up to 9 bytes each."""
 _AS_IS = frozenset({type(None), bool, int, float, str, bytes})
 
 
@@ -72,9 +74,8 @@ def changes(before: Any, after: Any, place: str = "") -> Iterator[tuple[str, Any
 def _plain(value: Any, place: str) -> Any:
     match value:
         case np.ndarray() if value.dtype != object:
-            return msgpack.ExtType(
-                _ARRAY, _header(value.dtype.str, value.shape) + np.ascontiguousarray(value).tobytes()
-            )
+            data = np.ascontiguousarray(value).reshape(-1).view(np.uint8).data if value.size else b""
+            return msgpack.ExtType(_ARRAY, b"".join((_header(value.dtype.str, value.shape), data)))
         case np.generic():
             return _plain(np.asarray(value), place)
         case dict() | Mapping():
@@ -106,6 +107,6 @@ def _array(code: int, data: bytes) -> Any:
     if code != _ARRAY:
         raise StateError(f"a value of unknown kind {code}")
     unpacker = msgpack.Unpacker(raw=False)
-    unpacker.feed(data)
+    unpacker.feed(data[:_LONGEST_HEADER])
     dtype, shape = unpacker.unpack()
     return np.frombuffer(data, np.dtype(dtype), offset=unpacker.tell()).reshape(shape).copy()

@@ -21,6 +21,7 @@ from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.process.live_sources import LiveSources
 from dataflow.recording import Recording
 from dataflow.records.black_box import BlackBox, Reached
+from dataflow.records.spacing import StateSpacing
 from dataflow.remote import Remote
 
 Outlived = Callable[[OperatorFailure, float], None]
@@ -85,11 +86,12 @@ def _make_runner(
     on_failure: Outlived,
 ) -> OperatorRunner:
     """Makes the runner of an operator that has inputs."""
+    snapshots = graph.record.snapshots
     common: dict[str, Any] = {
         "static": graph.static,
         "seed": graph.seed,
         "paranoid": config.paranoid,
-        "snapshots": config.snapshots,
+        "snapshots": None if snapshots is None else StateSpacing(snapshots, len(graph.repeated_for(node.name))),
     }
     if config.live:
         live = LiveRunner(node, emitter, **common, event_clock=event_clock, on_failure=on_failure)

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from dataflow.graph.sections import Snapshots
-
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
@@ -36,7 +34,6 @@ class ProcessConfig:
     link to and from another process the keys of its channels, after whether messages may be dropped for a consumer that
     takes nothing; their descriptors were handed down in this order. `life`: how many processes have had its place, with
     this one.
-    `snapshots`: nanoseconds of event time between two snapshots of an operator, or "cpu"; see `Record`.
     """
 
     label: str
@@ -53,7 +50,6 @@ class ProcessConfig:
     firings: bool = False
     live: bool = False
     resume: dict[str, Any] | None = None
-    snapshots: Snapshots | None = None
     warm: dict[str, Any] | None = None
     rings_out: Sequence[tuple[bool, Sequence[str]]] = ()
     rings_in: Sequence[Sequence[str]] = ()

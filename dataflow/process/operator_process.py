@@ -88,20 +88,7 @@ class OperatorProcess:
             losses=self._losses,
             from_start=config.live and config.resume is None,
         )
-        before = {name: config.resumed(name) for name in config.resume or ()}
-        outputs = {name: node.outputs for name, node in self.graph.nodes.items()}
-        pool_bytes = POOL_BYTES if self.graph.network.shared_memory else 0
-        self.outlet = Outlet(
-            channel,
-            self.driver.consumers,
-            fanout=Fanout(outgoing, pool_bytes=pool_bytes, gives_way=config.live),
-            namespace=self.graph.namespace,
-            static=self.graph.static,
-            box=None if box is None else open_box(box, config, self.graph),
-            firings=config.firings,
-            incarnations=incarnations_of(before, outputs),
-            left=left_by(before, outputs),
-        )
+        self.outlet = self._outlet(outgoing, box)
         self.progress = Progress(channel, self.driver, self.live, paced=config.live)
         self.requests = Requests(
             config,
@@ -135,6 +122,24 @@ class OperatorProcess:
         self._take_within = math.inf if config.live else TAKE_WITHIN
         self._watch: Watchdog | None = None
         self._running = False
+
+    def _outlet(self, outgoing: Links, box: int | None) -> Outlet:
+        """Returns what sends the outputs; of restarted operators it goes on numbering where they ended."""
+        config, graph = self.config, self.graph
+        before = {name: config.resumed(name) for name in config.resume or ()}
+        outputs = {name: node.outputs for name, node in graph.nodes.items()}
+        pool_bytes = POOL_BYTES if graph.network.shared_memory else 0
+        return Outlet(
+            self.channel,
+            self.driver.consumers,
+            fanout=Fanout(outgoing, pool_bytes=pool_bytes, gives_way=config.live),
+            namespace=graph.namespace,
+            static=graph.static,
+            box=None if box is None else open_box(box, config, graph),
+            firings=config.firings,
+            incarnations=incarnations_of(before, outputs),
+            left=left_by(before, outputs),
+        )
 
     # Life
 

@@ -11,7 +11,11 @@ Verdict = Literal["identical", "culprit", "downstream", "unverifiable"]
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The first firing of an operator that differs. `expected` and `got` are digests, or say what else differs."""
+    """The first record of an operator that differs. `expected` and `got` are digests, or say what else differs.
+
+    `call`: the number of the call among the operator's, of what lies between calls (a state) of the one before; None
+    before all calls, and where the records were not counted. `index`: of the record in its incarnation.
+    """
 
     index: int
     kind: str
@@ -20,6 +24,7 @@ class Difference:
     expected: str
     got: str
     incarnation: int = 0
+    call: int | None = None
 
 
 @dataclass(slots=True)

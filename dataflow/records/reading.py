@@ -132,6 +132,12 @@ class FiringLog:
                 found.append(Heading(*last, KINDS[row[0]], row[1]))
         return found
 
+    def call_at(self, maker: Maker, place: Place) -> int | None:
+        """The number of the record at a place (incarnation, index) among the calls of `maker`, counted from 0 over the
+        run; of a record between calls, of the one before it. None before all calls."""
+        calls = sum(h.kind in CALLS and (h.incarnation, h.record) <= place for h in self.headings(maker))
+        return calls - 1 if calls else None
+
     def records(self, operator: str, first: int = 0, end: int | None = None) -> Iterator[FiringRecord]:
         """The records of one operator in the order of the file, of the batches from `first` to before `end`.
 

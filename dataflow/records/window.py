@@ -80,7 +80,8 @@ def _window(
     there."""
     firsts: dict[str, bytes] = {}
     for maker in makers:
-        firsts |= islice(recording.firings(maker.name, start, end), 1)
+        inside = recording.firings(maker.name, start, end)
+        firsts |= islice((each for each in inside if each[1] != heads.get(maker.name)), 1)  # a head may be written late
     names = {maker.name for maker in makers}
     batches = {name: count for name, count in recording.firing_batches().items() if name in names}
     counts = {name: count for name, count in batches.items() if name not in firsts}
@@ -106,12 +107,12 @@ def _window(
             cut = cut_record(place, left_out=left_out, taken=taken, held=(), stamp=first.stamp)
             kept[operator] = [head, encode_batch([cut])]
             begins[operator] = first.index
-        elif first.index == last.index + 1:
+        else:
             kept[operator] = [head]
     if end is None:
         return FiringLog(kept, str(recording.path), recording, start=start, begins=begins)
     for name in firsts:
-        kept[name] += [payload for _, payload in recording.firings(name, start, end)]
+        kept[name] += [payload for _, payload in recording.firings(name, start, end) if payload != heads[name]]
     return FiringLog(kept, str(recording.path), begins=begins, remembers=True)
 
 

@@ -272,13 +272,14 @@ class FlightSink:
     # Keeping
 
     def _is_over(self, wanted: Wanted) -> bool:
-        """Returns whether a span is over, and the firing records of it have had the time to come."""
+        """Returns whether a span is over, and the firing records of it, some of every operator, have had the time to
+        come."""
         if self._clock <= wanted.due:
             return False
         now = self._awake()
         wanted.over = now if wanted.over is None else wanted.over
         waited = now - wanted.over
-        behind = any(
+        behind = not self.graph.nodes.keys() <= self._recorded.keys() or any(
             self._recorded.get(self.graph.streams[stream].node, 0) < min(message.stamp, wanted.due)
             for stream, (message, _, _) in self._newest.items()
         )

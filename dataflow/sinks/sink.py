@@ -32,6 +32,8 @@ from dataflow.transport.envelope import MAGIC
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.01
+ALIVE_EVERY = 1.0
+"""Seconds between two reports of one that stores things, though it is no further with one of the streams."""
 FLUSH_EVERY = 1.0
 DRAIN_WITHIN = 5.0
 
@@ -121,6 +123,7 @@ class SinkProcess:
         taken = [*(self.graph.streams[s].node for s in config.streams), *config.firings]
         self._taken = {name: NEVER for name in taken if self.graph.nodes[name].source}
         self._told: dict[str, int] = {}
+        self._stored_told, self._told_at = 0, 0.0
         self._done = NEVER
         self._report_due = 0.0
         self._flush_due = 0.0
@@ -239,8 +242,9 @@ class SinkProcess:
         self._done = min(dynamic, default=FOREVER)
         done = self._reached()
         self._report_due = now + REPORT_EVERY
-        if done != self._told:
-            self._told = done
+        stored = self.written + self.batches
+        if done != self._told or (stored != self._stored_told and now >= self._told_at + ALIVE_EVERY):
+            self._told, self._stored_told, self._told_at = done, stored, now
             self.channel.send("progress", done=done, counts=self._counts())
         if not self._ended and not self._open and not self.firings_open:
             self._ended = True

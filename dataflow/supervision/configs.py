@@ -72,7 +72,6 @@ def _operators(
         "paused": plan.paused,
         "paranoid": plan.paranoid,
         "firings": plan.keeps_records,
-        "snapshots": plan.graph.record.snapshots,
         "warm": warm_start_of(plan.log),
     }
 

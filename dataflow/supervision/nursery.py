@@ -20,6 +20,7 @@ import msgpack
 from dataflow.environments import Environment, environment_of
 from dataflow.process.channel import QueuedChannel
 from dataflow.process.polling import readable
+from dataflow.process.start import start
 from dataflow.supervision.core.wording import how_it_ended
 from dataflow.supervision.nursery_process import DIE_WITHIN, ENVIRONMENT, MORE, MOST_DESCRIPTORS, SPAWN, adopt_orphans
 
@@ -184,13 +185,8 @@ class Nursery:
         python = sys.executable if env is None else env.python
         ours, theirs = socket.socketpair()
         with theirs:
-            self._process = subprocess.Popen(
-                [python, "-P", "-m", "dataflow.supervision.nursery_process", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),),
-                env=self.environment,
-                stdin=subprocess.DEVNULL,
-                process_group=0,
-            )
+            words, handed = (str(theirs.fileno()),), (theirs.fileno(),)
+            self._process = start("dataflow.supervision.nursery_process", words, handed, self.environment, python)
         ours.setblocking(False)
         self._socket = ours
         self._unpacker = msgpack.Unpacker()

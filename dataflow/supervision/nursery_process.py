@@ -131,7 +131,7 @@ def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: in
     os.close(pidfd)
     with contextlib.suppress(ProcessLookupError, PermissionError):  # it does not lead a group yet
         os.killpg(pid, signal.SIGKILL)  # before it is waited for: until then no other process can have its number
-    left = _end_orphans({pid, *children.values()}, pid)
+    left = end_orphans({pid, *children.values()}, pid)
     _, status = os.waitpid(pid, 0)
     if connection is not None:
         if left:
@@ -140,7 +140,7 @@ def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: in
         _tell(connection, "ended", pid, os.waitstatus_to_exitcode(status))
 
 
-def _end_orphans(known: set[int], group: int) -> list[str]:
+def end_orphans(known: set[int], group: int) -> list[str]:
     """Kills every child that is not `known`, and theirs; returns those that had left the process group."""
     left = []
     while orphans := [pid for pid in _children() if pid not in known]:
@@ -206,8 +206,8 @@ def _outlive(children: dict[int, int]) -> None:
                 os.killpg(pid, signal.SIGKILL)
 
 
-def main(descriptor: int) -> None:
-    """Runs the nursery process."""
+def run(words: Sequence[str]) -> int:
+    """Runs the nursery process on the descriptor that a word names; returns its exit code."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     from dataflow.process import stacks
 
@@ -217,9 +217,10 @@ def main(descriptor: int) -> None:
         importlib.import_module(name)
     gc.collect()
     gc.freeze()
-    with socket.socket(fileno=descriptor) as connection:
+    with socket.socket(fileno=int(words[0])) as connection:
         serve(connection)
+    return 0
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    run(sys.argv[1:])

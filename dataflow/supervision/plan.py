@@ -156,7 +156,33 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
         if edge.stream in streams and edge.consumer not in replaced:
             taken_in[edge.stream].add(labels[edge.consumer])
 
-    storage = plan.storage.to_json()
+    sinks = _sinks_of(plan, streams)
+    for label, (_, taken, _) in sinks.items():
+        for stream in taken:
+            taken_in[stream].add(label)
+
+    plans: dict[str, ProcessPlan] = {}
+    firings = tuple(node.name for node in graph.nodes.values() if node.outputs or node.name not in replaced)
+    for label, nodes in processes.items():
+        publish = {
+            s: len(taken_in[s] - {label}) for s in sorted(streams) if made_in[s] == label and taken_in[s] - {label}
+        }
+        if plan.keeps_records:
+            publish |= {firings_key(graph.namespace, node): 1 for node in nodes if node in firings}
+        subscribe = tuple(s for s in sorted(streams) if label in taken_in[s] and made_in[s] != label)
+        running = tuple(node for node in nodes if node not in replaced)
+        machine, env = _machine_of(plan, label, nodes), _env_of(graph, label, running)
+        has_log = not replaced.isdisjoint(nodes)
+        plans[label] = ProcessPlan(label, running, publish, subscribe, has_log=has_log, machine=machine, env=env)
+    for label, (kind, taken, chosen) in sinks.items():
+        process = ProcessPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
+        plans[label] = replace(process, firings=firings) if kind == "record" else process
+    return plans
+
+
+def _sinks_of(plan: RunPlan, streams: set[str]) -> dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]]:
+    """Returns the recorder and the viewer file of a run by label: their kind, the streams that they take, options."""
+    graph, storage = plan.graph, plan.storage.to_json()
     sinks: dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]] = {}
     recorded = tuple(s for s in graph.record.streams if s in streams)
     options: dict[str, Any] = {
@@ -175,30 +201,7 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
         hidden = {s for s in graph.view.hide if not set(graph.streams[s].types) & set(PLACE_FRAMES)}
         shown = tuple(sorted(streams - hidden))
         sinks[VIEWER_FILE] = ("view", shown, {"path": str(plan.view_file), "storage": storage})
-    for label, (_, taken, _) in sinks.items():
-        for stream in taken:
-            taken_in[stream].add(label)
-
-    plans: dict[str, ProcessPlan] = {}
-    firings = tuple(node.name for node in graph.nodes.values() if node.outputs or node.name not in replaced)
-    for label, nodes in processes.items():
-        publish = {
-            s: len(taken_in[s] - {label}) for s in sorted(streams) if made_in[s] == label and taken_in[s] - {label}
-        }
-        if plan.keeps_records:
-            publish |= {firings_key(graph.namespace, node): 1 for node in nodes if node in firings}
-        subscribe = tuple(s for s in sorted(streams) if label in taken_in[s] and made_in[s] != label)
-        running = tuple(node for node in nodes if node not in replaced)
-        machine, env, has_log = (
-            _machine_of(plan, label, nodes),
-            _env_of(graph, label, running),
-            bool(replaced & {*nodes}),
-        )
-        plans[label] = ProcessPlan(label, running, publish, subscribe, has_log=has_log, machine=machine, env=env)
-    for label, (kind, taken, chosen) in sinks.items():
-        process = ProcessPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
-        plans[label] = replace(process, firings=firings) if kind == "record" else process
-    return plans
+    return sinks
 
 
 def _machine_of(plan: RunPlan, label: str, nodes: list[str]) -> str | None:

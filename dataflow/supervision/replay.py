@@ -17,16 +17,20 @@ def plan_replay(
     graph: Graph,
     *,
     replaced: Collection[str] | None = None,
+    resting: Collection[str] = (),
     start: float | None = None,
     end: float | None = None,
 ) -> LogPlan:
     """Returns which recorded streams stand in for which operators: the sources, or those that `replaced` names.
 
+    What only these and the `resting` ones take may be missing: they do not run.
     `start`, `end`: seconds from the recording's first message, or from where it was cut: then it begins there, with the
     states that operators had. Raises `ReplayError`.
     """
     streams: list[str] = []
-    for node in graph.sources() if replaced is None else [graph.nodes[name] for name in sorted(replaced)]:
+    nodes = graph.sources() if replaced is None else [graph.nodes[name] for name in sorted(replaced)]
+    idle = {node.name for node in nodes} | {*resting}
+    for node in nodes:
         outputs = tuple(node.outputs.values())
         recorded = [s for s in outputs if s in recording.streams]
         if not recorded:
@@ -34,11 +38,12 @@ def plan_replay(
                 f"{recording.path}: no stream of {node.name!r} is in the recording "
                 f"(looked for {', '.join(outputs)}; it holds {', '.join(recording.streams) or 'none'})"
             )
-        missing = [s for s in outputs if s not in recording.streams and graph.consumers(s)]
+        takers = {s: [n.name for n, _ in graph.consumers(s) if n.name not in idle] for s in outputs}
+        missing = [s for s in outputs if s not in recording.streams and takers[s]]
         if missing:
             raise ReplayError(
                 f"{recording.path}: stream {missing[0]!r} of {node.name!r} was not recorded, "
-                f"but {graph.consumers(missing[0])[0][0].name!r} takes it; record it, or leave that operator out"
+                f"but {takers[missing[0]][0]!r} takes it; record it, or leave that operator out"
             )
         for stream in recorded:
             check_type(recording, graph, stream)

@@ -52,7 +52,8 @@ class Task:
     """One recording with one choice of settings.
 
     `words`: those of the command, with `None` where the recording's path stands. `key`: a digest of the recording, the
-    graph, the code, the packages and the words; tasks of equal keys have equal outcomes.
+    graph, the code, the packages and the words; tasks of equal keys have equal outcomes. `operators`: what the
+    graph uses, as `module:name`, where it is known.
     """
 
     source: Source
@@ -60,6 +61,7 @@ class Task:
     settings: Choice
     words: tuple[str | None, ...]
     key: str
+    operators: tuple[str, ...] = ()
 
 
 def grid(words: Sequence[str]) -> list[Choice]:
@@ -196,9 +198,23 @@ def tasks_of(
         line = (verb, None, *given, *chosen, *where, *words, "--json", "--quiet")
         same = None if loaded is None else code.of(loaded)
         for source in sources:
-            graph_digest = code.of_recorded(source) if same is None else same
-            made.append(Task(source, what, settings, line, _digest((source.digest, graph_digest, what, line[2:]))))
+            graph_of = loaded or _recorded(source)
+            digest = same or code.of(graph_of)
+            key = _digest((source.digest, digest, what, line[2:]))
+            made.append(Task(source, what, settings, line, key, _uses(graph_of)))
     return made
+
+
+def _recorded(source: Source) -> Graph | None:
+    """Returns the graph inside a recording; None of a URL, which is not opened."""
+    if "://" in source.where:
+        return None
+    with Recording(Path(source.where)) as opened:
+        return recorded_graph(opened)
+
+
+def _uses(graph: Graph | None) -> tuple[str, ...]:
+    return () if graph is None else tuple(sorted({node.use for node in graph.nodes.values() if node.env is None}))
 
 
 class Code:
@@ -214,21 +230,19 @@ class Code:
         given = [self._code(sorted(folder.rglob("*.py"))) for folder in folders]
         self._base = [self._package("dataflow"), facts["packages"], facts["machine"]["python"], given]
 
-    def of(self, graph: Graph) -> str:
-        """Raises `OSError` for a file that cannot be read."""
+    def of(self, graph: Graph | None) -> str:
+        """Returns the digest for a graph; for one that is not known, all shipped operators count.
+
+        Raises `OSError` for a file that cannot be read.
+        """
+        if graph is None:
+            return _digest((self._base, self._package("operators")))
         described = graph.to_json()
         parts = [described[part] for part in ("nodes", "streams", "seed", "threads", "namespace")]
         used = sorted({node.use.partition(":")[0].partition(".")[0] for node in graph.nodes.values()})
         files = sorted(set(_files_named([node.params for node in graph.nodes.values()])))
         code = [self._package(name) for name in used]
         return _digest((self._base, parts, code, [self._digests.of(file) for file in files]))
-
-    def of_recorded(self, source: Source) -> str:
-        """Returns the digest for the graph inside a recording. A URL is not opened: all shipped operators count."""
-        if "://" in source.where:
-            return _digest((self._base, self._package("operators")))
-        with Recording(Path(source.where)) as opened:
-            return self.of(recorded_graph(opened))
 
     def _package(self, name: str) -> str:
         if name not in self._packages:

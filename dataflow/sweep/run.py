@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import closing, suppress
+from contextlib import closing, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Event
 from typing import Any
 
@@ -15,7 +17,8 @@ from dataflow.graph import Graph, load_graph
 from dataflow.graph.search import import_path
 from dataflow.sweep.plan import Choice, Digests, SweepError, Task, What, sources_in, tasks_of
 from dataflow.sweep.table import Store, summed_up, write_table
-from dataflow.sweep.work import Result, perform
+from dataflow.sweep.warm import Worker
+from dataflow.sweep.work import Result, commands_of, perform
 
 AHEAD = 4
 """Tasks handed to a cluster for each of its processors, so that none waits for this process."""
@@ -26,10 +29,22 @@ def local(tasks: Sequence[Task], jobs: int, timeout: float) -> Generator[tuple[T
     """Yields tasks with their results as they end, `jobs` at a time. Those running end with the iteration."""
     pool = ThreadPoolExecutor(jobs, thread_name_prefix="sweep")
     left, running, stop = iter(tasks), dict[Future[Result], Task](), Event()
+    workers = [Worker(commands_of(tasks)) for _ in range(jobs)]
+    idle = SimpleQueue[Worker]()
+    for worker in workers:
+        idle.put(worker)
+
+    def work(task: Task) -> Result:
+        worker = idle.get()
+        try:
+            return perform(task, timeout, worker, stop)
+        finally:
+            idle.put(worker)
+
     try:
         while True:
             for task in left:
-                running[pool.submit(perform, task, timeout, stop)] = task
+                running[pool.submit(work, task)] = task
                 if len(running) == jobs:
                     break
             if not running:
@@ -39,6 +54,8 @@ def local(tasks: Sequence[Task], jobs: int, timeout: float) -> Generator[tuple[T
     finally:
         stop.set()
         pool.shutdown(cancel_futures=True)
+        for worker in workers:
+            worker.close()
 
 
 def on_ray(
@@ -64,25 +81,43 @@ def on_ray(
         raise SweepError(
             f"--ray {address}: {error}; 'local' begins a cluster here, 'auto' takes a running one"
         ) from error
-    try:
-        remote = ray.remote(num_cpus=1, max_retries=1)(perform)
-        most = max(1, int(ray.cluster_resources().get("CPU", 1))) * AHEAD
-        left, running = iter(tasks), dict[Any, Task]()
-        while True:
-            while len(running) < most and (task := next(left, None)) is not None:
-                running[remote.remote(task, timeout)] = task
-            if not running:
-                return
-            for over in ray.wait(list(running))[0]:
-                task = running.pop(over)
-                try:
-                    yield task, ray.get(over)
-                except ray.exceptions.RayError as error:
-                    text = f"{type(error).__name__}: {error}"
-                    yield task, Result(task.key, "killed", -1, text.splitlines()[0], ({},), 0.0, text)
-    finally:
-        with suppress(Exception):  # an interrupted cluster that does not answer must not hide why it was left
-            ray.shutdown()
+    with redirect_stdout(sys.stderr):  # Ray's threads print there that a process was killed, and results go there, too
+        try:
+            yield from _awaited(ray, tasks, timeout)
+        finally:
+            with suppress(Exception):  # an interrupted cluster that does not answer must not hide why it was left
+                ray.shutdown()
+
+
+def _awaited(ray: Any, tasks: Sequence[Task], timeout: float) -> Generator[tuple[Task, Result]]:
+    """Yields tasks with their results as they end on the cluster to which this process is connected."""
+    remote = ray.remote(num_cpus=1, max_retries=1)(_there)
+    most = max(1, int(ray.cluster_resources().get("CPU", 1))) * AHEAD
+    left, running = iter(tasks), dict[Any, Task]()
+    while True:
+        while len(running) < most and (task := next(left, None)) is not None:
+            running[remote.remote(task, timeout)] = task
+        if not running:
+            return
+        for over in ray.wait(list(running))[0]:
+            task = running.pop(over)
+            try:
+                yield task, ray.get(over)
+            except ray.exceptions.RayError as error:
+                text = f"{type(error).__name__}: {error}"
+                yield task, Result(task.key, "killed", -1, text.splitlines()[0], ({},), 0.0, text)
+
+
+_worker: Worker | None = None
+"""That of a process of a cluster, which does one task after the other."""
+
+
+def _there(task: Task, timeout: float) -> Result:
+    """Does a task on a machine of a cluster."""
+    global _worker
+    if _worker is None:
+        _worker = Worker(commands_of([task]))
+    return perform(task, timeout, _worker)
 
 
 @dataclass(slots=True)

@@ -104,12 +104,12 @@ def shares(found: Sequence[Mapping[str, float]]) -> list[Share]:
 
 
 def _above(graph: Graph, operator: str) -> set[str]:
-    found, left = {operator}, [operator]
+    found, left = set[str](), [operator]
     while left:
         makers = {graph.streams[stream].node for stream in graph.nodes[left.pop()].taken}
         left += makers - found
         found |= makers
-    return found
+    return found - {operator}
 
 
 def _named(summaries: Mapping[str, Mapping[str, object]]) -> dict[str, float]:

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import select
 import signal
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import xxhash
 
-from dataflow.graph.search import import_path
-from dataflow.parent import end_with_parent
 from dataflow.sweep.plan import Task
+from dataflow.sweep.warm import Worker
 
 Outcome = Literal["done", "failed", "killed", "timed out", "not fetched"]
 TRIES = 2
@@ -30,12 +24,8 @@ TRIES = 2
 LOG_BYTES = 1 << 16
 """Bytes kept of the end of a failed task's output."""
 PRINTED, LOG = "printed.json", "log.txt"
-FETCH = "import fsspec, sys; store, path = fsspec.core.url_to_fs(sys.argv[1]); store.get_file(path, sys.argv[2])"
-"""A program that fetches a file; fsspec is of the extra `ray`."""
 WORKER_KILLED = f"was killed by {signal.SIGKILL.name}"
 """Of a worker of `dataflow verify`, as that reports it: for want of memory, as a rule."""
-STEP = 0.2
-"""Seconds between two looks at whether to stop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +49,12 @@ class Result:
         return self.outcome in ("done", "failed")
 
 
-def perform(task: Task, timeout: float, stop: Event | None = None) -> Result:
+def commands_of(tasks: Iterable[Task]) -> tuple[str, ...]:
+    """Returns the commands that tasks call."""
+    return tuple(sorted({word for task in tasks if (word := task.words[0]) is not None}))
+
+
+def perform(task: Task, timeout: float, worker: Worker, stop: Event | None = None) -> Result:
     """Runs a task's command to its end, within `timeout` seconds; a second time where it was killed.
 
     `stop`: ends it as soon as this is set.
@@ -67,24 +62,26 @@ def perform(task: Task, timeout: float, stop: Event | None = None) -> Result:
     Raises only what interrupts this process.
     """
     for _ in range(TRIES):
-        result = _once(task, timeout, stop)
+        result = _once(task, timeout, worker, stop)
         if result.outcome != "killed" or (stop is not None and stop.is_set()):
             break
     return result
 
 
-def _once(task: Task, timeout: float, stop: Event | None) -> Result:
+def _once(task: Task, timeout: float, worker: Worker, stop: Event | None) -> Result:
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="dataflow_sweep_") as name:
-        folder = Path(name)
-        recording, fetched = _here(task.source.where, folder)
-        words = [recording if word is None else word for word in task.words]
-        command = [sys.executable, "-m", "dataflow.cli.start", *words]
-        code = _run(fetched, folder, timeout, stop) if fetched else 0
+        output = Path(name, PRINTED), Path(name, LOG)
+        where, code = task.source.where, cast("int | None", 0)
+        if "://" in where:
+            where = str(Path(name, Path(where).name))
+            code = worker.call("fetch", [task.source.where, where], (), output, timeout, stop)
         if got := code == 0:
-            code = _run(command, folder, timeout - (time.monotonic() - began), stop)
-        said = (folder / LOG).read_bytes()[-LOG_BYTES:].decode(errors="replace")
-        report = _read(folder / PRINTED)
+            words = [where if word is None else word for word in task.words]
+            left = timeout - (time.monotonic() - began)
+            code = worker.call("command", words, task.operators, output, left, stop)
+        said = output[1].read_bytes()[-LOG_BYTES:].decode(errors="replace")
+        report = _read(output[0])
     outcome: Outcome = (
         "done" if report is not None and (code == 0 or (task.what == "verify" and code == 1)) else "failed"
     )
@@ -103,42 +100,6 @@ def _once(task: Task, timeout: float, stop: Event | None) -> Result:
     wall, failed = time.monotonic() - began, outcome != "done"
     log = f"{said}\n{last}".strip() if failed else ""
     return Result(task.key, outcome, -1 if code is None else code, last if failed else "", rows or ({},), wall, log)
-
-
-def _here(where: str, folder: Path) -> tuple[str, list[str]]:
-    """Returns the path of a recording, and the command that fetches it into `folder` if it is elsewhere."""
-    if "://" not in where:
-        return where, []
-    file = str(folder / Path(where).name)
-    return file, [sys.executable, "-c", FETCH, where, file]
-
-
-def _run(command: list[str], folder: Path, timeout: float, stop: Event | None) -> int | None:
-    """Returns the exit code, negative for a signal; None after `timeout`, or where it was stopped.
-
-    What it prints is in the files `PRINTED` and `LOG` of `folder`. Nothing that it started outlives this call.
-    """
-    environment = {**os.environ, "PYTHONPATH": import_path(), "PYTHONUNBUFFERED": "1"}
-    with (folder / PRINTED).open("wb") as out, (folder / LOG).open("wb") as err:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=err,
-            env=environment,
-            start_new_session=True,
-            preexec_fn=end_with_parent,
-        )
-    handle, ended, deadline = os.pidfd_open(process.pid), False, time.monotonic() + timeout
-    try:
-        while not ended and (left := deadline - time.monotonic()) > 0 and not (stop is not None and stop.is_set()):
-            ended = bool(select.select([handle], [], [], min(left, STEP))[0])
-    finally:
-        os.close(handle)
-        with suppress(ProcessLookupError):  # all of them have ended
-            os.killpg(process.pid, signal.SIGKILL)
-        code = process.wait()  # only now: until then no other process has its number
-    return code if ended else None
 
 
 def _read(printed: Path) -> dict[str, Any] | None:

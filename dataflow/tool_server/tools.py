@@ -35,15 +35,10 @@ def verify(
     """Re-execute a recorded run with the code as it is now and compare every output, bit for bit.
 
     A culprit was given the recorded inputs and made another output; `first` is its first differing call, with the
-    field; `call` is the number of that for the other tools. `only`: these operators; `graph`: a graph file in place of
+    field; its `call` is the number for the other tools. `only`: these operators; `graph`: a graph file in place of
     the recorded graph; `path`: folders of modules.
     """
-    file = _file(recording)
-    values = _verified(_verify(file, only, _loaded(graph))[1])
-    for each in values.get("operators", ()):
-        if each.get("first"):
-            each |= _call_of(file, each["operator"], each["first"])
-    return values
+    return _verified(_verify(_file(recording), only, _loaded(graph))[1])
 
 
 def why(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None) -> Any:
@@ -362,22 +357,6 @@ def _verdict(file: Path, operator: str, graph: Graph | None) -> str:
     """Returns the verdict of verification on one operator."""
     report = _verify(file, [operator], graph)[1]
     return next((report.verdict(v) for v in report.operators if v.operator == operator), "not re-executed")
-
-
-def _call_of(file: Path, operator: str, first: Mapping[str, Any]) -> dict[str, int]:
-    """Returns the number of the last of an operator's calls up to the firing record at which it first differs, as
-    `call`: a state lies behind the call that made it. Of a record before all calls, nothing."""
-    from dataflow.recording import Recording
-    from dataflow.records.firing import CALLS
-    from dataflow.records.reading import FiringLog
-    from dataflow.reexecution.recorded_run import graph_that_is_here
-
-    with Recording(file) as opened:
-        node = graph_that_is_here(opened)[0].nodes[operator]
-        headings = FiringLog.read(opened).headings(node)
-    place = first["incarnation"], first["index"]
-    calls = sum(h.kind in CALLS and (h.incarnation, h.record) <= place for h in headings)
-    return {"call": calls - 1} if calls else {}
 
 
 def _verified(report: VerifyReport) -> dict[str, Any]:

@@ -21,7 +21,8 @@ NOT_STORED = "the recording does not hold this message"
 class OutputDifference:
     """One message that differs from the recorded one.
 
-    `index`, `kind` and `firing`: of the firing record and its stamp; `seq`, `incarnation`: the place in the stream.
+    `index`, `kind` and `firing`: of the firing record, and its stamp; `call`: its number among the operator's calls,
+    once they were counted. `seq`, `incarnation`: the place in the stream.
     `fields` are the fields that differ (beyond the tolerance, where there is one): empty, with the reason in `note`,
     where the recorded message is unavailable.
     """
@@ -37,6 +38,7 @@ class OutputDifference:
     here: str
     fields: tuple[FieldDifference, ...] = ()
     note: str = ""
+    call: int | None = None
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self) | {"fields": [f.as_json() for f in self.fields]}

@@ -121,8 +121,10 @@ def complete(
 def _plan(recording: Recording, graph: Graph) -> Feeding:
     again = [name for name, node in graph.nodes.items() if not node.source and not node.external]
     require_records(recording, FiringLog.read(recording).operators, again)
-    replaced = set(graph.nodes) - set(again)
-    return Feeding(tuple(again), plan_replay(recording, graph, replaced=replaced).streams)
+    resting = set(graph.nodes) - set(again)
+    given = set(recording.streams).union(*(graph.nodes[name].taken for name in again))
+    replaced = {name for name in resting if given & set(graph.nodes[name].outputs.values())}
+    return Feeding(tuple(again), plan_replay(recording, graph, replaced=replaced, resting=resting).streams)
 
 
 def complete_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:

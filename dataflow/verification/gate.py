@@ -21,7 +21,7 @@ from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.errors import WRONG_INPUT
 from dataflow.verification.report import StandIn, VerifyReport
 
-FORMAT = 1
+FORMAT = 2
 
 OperatorVerdict = Literal[
     "identical",
@@ -359,7 +359,7 @@ def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | No
     return {
         "streams": {stream: {"messages": count, "digest": digest} for stream, (count, digest) in streams.items()},
         "differing": verification.differing,
-        "first": {"firing": first.index, "stamp": first.stamp, "port": first.port, "got": first.got},
+        "first": {"call": first.call, "stamp": first.stamp, "port": first.port, "got": first.got},
     }
 
 

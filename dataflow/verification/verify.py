@@ -272,11 +272,14 @@ def _locate(task: _Task) -> Locate:
         node = task.graph.nodes[operator]
         begin, _ = call.request["slices"].get(operator, (task.begin, None))
         with Recording(task.path) as recording:
-            log = FiringLog.from_wire(task.records, recording)
+            log, whole = FiringLog.from_wire(task.records, recording), FiringLog.read(recording)
             ahead = Repetition(partial(log.ordered, node), begin=begin, stateless=node.operator.stateless)
             look_at([ahead])
             record = next(islice((r for r in ahead if r.kind in CALLS), repeated, None), None)
-        return "its end" if record is None else f"firing {record.index} ({record.kind}) at stamp {record.stamp}"
+            if record is None:
+                return "its end"
+            number = whole.call_at(node, (record.incarnation, record.index))
+        return f"call {number} ({record.kind}) at stamp {record.stamp}"
 
     return located
 
@@ -298,6 +301,12 @@ def _report(
     for name, stream in task.unfed.items():
         calls = task.books.of(name).calls
         found[name] = Verification(name, firings=calls, unverifiable=max(calls, 1), missing=stream)
+    comparisons = {
+        name: OutputComparison.from_wire(answer["comparisons"][name])
+        for name, answer in of.items()
+        if name in answer["comparisons"]
+    }
+    _count_calls(task, found, comparisons)
     operators = tuple(found[name] for name in task.graph.nodes if name in found)
     nodes = task.graph.nodes
     return VerifyReport(
@@ -313,11 +322,7 @@ def _report(
         stored=tuple(sorted(stored, key=lambda s: s.stream)),
         unchecked=task.unchecked,
         tolerance=tolerance,
-        comparisons={
-            name: OutputComparison.from_wire(answer["comparisons"][name])
-            for name, answer in of.items()
-            if name in answer["comparisons"]
-        },
+        comparisons=comparisons,
         digests={
             stream: tuple(answer["digests"][stream])
             for name, answer in of.items()
@@ -338,6 +343,19 @@ def _report(
         shared=retrial.shared,
         mates={name: tuple(sorted(mates - {name})) for name, mates in mates_of(task.placed, task.operators).items()},
     )
+
+
+def _count_calls(task: _Task, found: Mapping[str, Verification], comparisons: Mapping[str, OutputComparison]) -> None:
+    """Gives first differences the number of their call."""
+    with Recording(task.path) as recording:
+        log = FiringLog.read(recording)
+        for name, verification in found.items():
+            node, first = task.graph.nodes[name], verification.first
+            if first is not None:
+                verification.first = replace(first, call=log.call_at(node, (first.incarnation, first.index)))
+            if name in comparisons:
+                outputs = comparisons[name].first
+                outputs[:] = [replace(o, call=log.call_at(node, (o.incarnation, o.index))) for o in outputs]
 
 
 def _answer_of_each(answers: Sequence[Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:

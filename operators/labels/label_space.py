@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML
@@ -75,7 +76,7 @@ class LabelSpace:
     def read(cls, file: Path) -> LabelSpace:
         """Reads a YAML file. Raises FileNotFoundError, and LabelSpaceError for a file that is no label space."""
         try:
-            content = YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
+            content = _content(file.read_text(encoding="utf-8"))
         except (YAMLError, UnicodeDecodeError) as error:
             raise LabelSpaceError(f"{file} is no YAML: {error}") from None
         try:
@@ -159,3 +160,9 @@ class _File(_Strict):
     label_space: str
     unit: Literal["m", "cm", "mm"]
     labels: dict[str, _Label]
+
+
+@lru_cache(maxsize=8)
+def _content(text: str) -> Any:
+    """Returns the values of a YAML text, parsed once for all operators that read it. Raises `YAMLError`."""
+    return YAML(typ="safe", pure=True).load(text)

@@ -231,6 +231,21 @@ def test_a_call_that_raised_in_the_run_too_hides_nothing_behind_it(tmp_path: Pat
     assert blamed_graphs.number(made["out"]) == 0.0, "the first call behind a restart begins anew"
 
 
+def test_a_state_that_was_brought_back_to_that_of_a_new_operator_leads_to_the_call_that_did(tmp_path: Path) -> None:
+    readings = [blamed_graphs.reading(0, "a", k) for k in range(21)]
+    assert [k for k, x in enumerate(readings) if x < blamed_graphs.LOW] == [8]
+    assert [k for k, x in enumerate(readings) if x > blamed_graphs.HIGH] == [2, 11]
+    graph = blamed_graphs.graph_of("latch | Latch | x: src/a")
+    path = held_runs.recorded(graph, held_runs.Faults(), tmp_path / "run.mcap")
+
+    with Recording(path) as recording:
+        chain = Blame(recording, Field.parse(blamed_graphs.at(20, "latch/out"))).find()
+
+    assert chain.value == 1.0
+    assert sensed(chain) == {("a", 11), ("a", 20)}, "call 20 would have closed it, with another reading"
+    assert chain.whole
+
+
 def test_a_row_stands_before_or_behind_its_field_and_brackets_see_other_fields() -> None:
     message = FeatureVector(stamp=5, vectors=np.arange(6, dtype=np.float32).reshape(3, 2), model="m")
 

@@ -101,7 +101,7 @@ def test_a_change_is_named_with_its_field_in_the_table_the_json_and_the_junit_fi
     told = gate(dataflow, folder, "--graph", changed, "--junit", junit, code=1).stdout
 
     assert "0 of 2 recordings passed (2 different)" in told
-    assert "one: first difference in firing" in told
+    assert "one: first difference in call" in told
     assert "mean.vectors[0, 2]: recorded" in told
     assert "machine, libraries, threads and devices are as when it was recorded" in told
     root = ElementTree.parse(junit).getroot()
@@ -304,5 +304,5 @@ def test_a_completion_that_comes_out_otherwise_writes_nothing_and_says_where(
     ).stdout
 
     assert "nothing written; look at one" in told
-    assert "one: first difference in firing" in told
+    assert "one: first difference in call" in told
     assert not out.exists()

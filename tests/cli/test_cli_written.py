@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,20 @@ def test_a_merge_is_compressed_as_is_asked_for(dataflow, recorded: Recorded, tmp
 
     assert compressions(tmp_path / "whole.mcap") == {""}
     dataflow("diff", recorded[0], tmp_path / "whole.mcap")
+
+
+def test_a_merge_passes_over_parts_that_are_empty(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+    """As a recorder leaves them that is killed once it has created the next file."""
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).touch()
+    whole = tmp_path / "whole.mcap"
+
+    told = dataflow("merge", recorded[0], tmp_path / "a.mcap", "-o", whole, "--json").stdout
+
+    assert f"{tmp_path / 'a.mcap'} holds nothing: its writer died as it began the file" in json.loads(told)["notes"]
+    dataflow("diff", recorded[0], whole)
+    nothing = dataflow("merge", tmp_path / "a.mcap", tmp_path / "b.mcap", "-o", tmp_path / "none.mcap", code=2)
+    assert "nothing is in any of these files" in nothing.stderr
 
 
 def test_what_to_write_is_named_by_out_in_every_command(dataflow, recorded: Recorded, tmp_path: Path) -> None:

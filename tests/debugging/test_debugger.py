@@ -232,7 +232,7 @@ def test_states_are_recorded_by_cpu_time_where_a_graph_asks_for_it(
     graph = replace(graph_that_is_here(added)[0], record=Record(tuple(added.streams), snapshots="cpu"))
     assert Graph.from_json(json.loads(json.dumps(graph.to_json()))).record == graph.record
     for spacing, expected in ((0, 30), (10**12, 0)):
-        monkeypatch.setattr("dataflow.execution.runner.CPU_SPACING", spacing)
+        monkeypatch.setattr("dataflow.records.spacing.CPU_SPACING", spacing)
         path = tmp_path / f"{spacing}.mcap"
         LocalRun(graph).execute(record=path)
         with Recording(path) as recording:

@@ -11,7 +11,7 @@ from source_trees import nodes_of
 PACKAGES = ("execution", "process", "reexecution", "supervision", "verification")
 KINDS = {"LiveRunner", "OperatorRunner", "RecordedRunner", "LogFeed", "NoLoss", "LossTold", "LiveSinkProcess"}
 """Classes of which one run has this and another that."""
-MAKES = {"__init__", "open", "release", "_make_runner", "_make_source"} | {
+MAKES = {"__init__", "_outlet", "open", "release", "_make_runner", "_make_source"} | {
     "core_of",
     "configurations",
     "_common",

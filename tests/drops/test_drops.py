@@ -128,6 +128,17 @@ def test_other_code_is_no_base_for_a_comparison(run: Path) -> None:
         Drops(recording, "end_error_m > 5", other).find()
 
 
+def test_a_run_with_a_restart_is_refused_with_its_place(tmp_path: Path) -> None:
+    text = held_runs.TEXT.format(steps=STEPS, score="Score").replace("held_runs:Smooth", "held_runs:Brittle")
+    brittle = load_text(text.replace("live: {queue: newest, size: 4}", "live: {queue: newest, restart: {max: 1}}"))
+    run = held_runs.recorded(brittle, FAULTS, tmp_path / "run.mcap")
+
+    with Recording(run) as recording, pytest.raises(DropsError) as caught:
+        Drops(recording, "end_error_m > 5").find()
+    place = f"smooth: it was restarted behind its call at stamp {STAMP + 2000 * MS}"
+    assert str(caught.value).startswith(place)
+
+
 def test_a_figure_that_changes_by_itself_is_refused(run: Path) -> None:
     chancy = held_runs.graph(STEPS, "Chancy")
 

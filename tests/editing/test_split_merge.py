@@ -18,6 +18,7 @@ from dataflow.editing.spool import Spool
 from dataflow.messages import Imu, Odometry
 from dataflow.recording import Recorded, Recording, RecordingError, RecordingWriter
 from dataflow.recording.streams.copying import Origin
+from dataflow.recording.streams.cutting import cut_of
 from dataflow.recording.streams.ordering import Row
 from dataflow.recording.streams.streams import IndexedStream
 from dataflow.records.reading import FiringLog
@@ -120,6 +121,18 @@ def test_overlapping_parts_hold_everything_once(recorded: Path, tmp_path: Path) 
 
     assert messages(tmp_path / "both.mcap") == messages(recorded)
     assert verify(tmp_path / "both.mcap").identical
+
+
+def test_no_gap_is_behind_a_part_that_lies_within_another(kept: Path, tmp_path: Path) -> None:
+    """As the spans of parts do after a jump of the clock, too."""
+    spans = [(None, 0.6), (0.2, 0.4), (0.5, None), (0.7, 0.8)]
+    parts = [cut(kept, tmp_path / f"{k}.mcap", *span) for k, span in enumerate(spans)]
+
+    notes = merged(parts, tmp_path / "all.mcap")
+
+    assert not any("nothing is known of" in note for note in notes)
+    with Recording(tmp_path / "all.mcap") as whole:
+        assert cut_of(whole.metadata) is None
 
 
 def test_each_part_is_open_once_while_many_are_merged(kept: Path, tmp_path: Path) -> None:

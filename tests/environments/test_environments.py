@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 import sys
 import sysconfig
 from pathlib import Path
@@ -107,6 +108,7 @@ def thin(environments: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_an_operator_that_only_one_process_could_repeat_with_its_maker_is_unverifiable(thin: Path) -> None:
     report = verify(thin)
 
@@ -145,6 +147,20 @@ def test_an_operator_is_not_made_in_a_process_of_another_environment(recorded: P
         Debugger(recording, "first").goto(0)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("operator", ["first", "second"])
+def test_the_debugger_begins_in_the_environment_of_its_operator(operator: str, recorded: Path) -> None:
+    here = str(Path(__file__).resolve().parent)
+    words = ["debug", str(recorded), operator, "--do", "goto 1", "--path", here]
+    told = subprocess.run(
+        [sys.executable, "-m", "dataflow.cli.main", *words], capture_output=True, text=True, timeout=100
+    )
+
+    assert told.returncode == 0, told.stderr
+    assert f"{operator}  call 1 of " in told.stdout
+    assert "as recorded" in told.stdout
+
+
 def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_path: Path) -> None:
     broken = environment(tmp_path / "one", "1.0", 2.0)
     environment(tmp_path / "two", "1.0", 2.0)
@@ -152,6 +168,22 @@ def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_pat
 
     with pytest.raises(RunFailed, match=f"starts the others in {re.escape(str(broken))} "):
         run(graph(tmp_path))
+
+
+def test_an_environment_is_asked_once_until_it_changes(tmp_path: Path) -> None:
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.write_text(f"#!/bin/sh\necho asked >> {tmp_path}/asked\necho '[{list(sys.version_info[:2])}, [], null]'\n")
+    python.chmod(0o755)
+    (packages := tmp_path / "lib" / "python3" / "site-packages").mkdir(parents=True)
+
+    def asked() -> int:
+        environment_of(str(tmp_path))
+        return len((tmp_path / "asked").read_text().splitlines())
+
+    assert [asked(), asked()] == [1, 1]
+    (packages / "other.pth").touch()
+    assert asked() == 2
 
 
 def test_an_environment_that_cannot_serve_is_refused_with_what_would_be_right(tmp_path: Path) -> None:
@@ -185,12 +217,12 @@ def test_requirements_without_their_lock_or_environment_are_refused(tmp_path: Pa
     assert "there is no file" in why()
     requirements.write_text("tiny\n")
     assert "gains.lock is missing" in why()
-    lock.write(requirements, ["tiny==1.0"])
+    lock.write(requirements, (), {"tiny==1.0": ()})
     assert "gains.env is not built" in why()
     environment(tmp_path / "gains.env", "1.0", 2.0)
     lock.note_built(requirements)
     assert environment_of(str(requirements)).folder == tmp_path / "gains.env"
-    lock.write(requirements, ["tiny==1.1"])
+    lock.write(requirements, (), {"tiny==1.1": ()})
     assert "gains.env was built from another lock" in why()
     requirements.write_text("tiny>1\n")
     assert "gains.lock is out of date" in why()

@@ -145,7 +145,7 @@ def test_a_changed_argument_is_a_miss_with_call_and_line_never_the_next_answer()
     assert result.first is not None
     assert result.first.stamp == 200
     assert result.first.got == (
-        f"error: EffectMiss: miss at call 3 (test_effects.py:{line_of('# the changed question')}), ask: "
+        f"error: EffectMiss: miss at effect 3 (test_effects.py:{line_of('# the changed question')}), ask: "
         "argument 0 differs from the recorded call"
     )
     assert result.effects["ask"] == {"given": 4, "missed": 2, "again": 0, "same": 0}
@@ -165,7 +165,7 @@ def test_a_miss_is_no_failure_of_the_service_and_cannot_be_passed_over(caught: t
 
     assert result.verdict == "culprit"
     assert result.first is not None
-    assert "EffectMiss: miss at call 0" in result.first.got
+    assert "EffectMiss: miss at effect 0" in result.first.got
 
 
 def test_a_miss_cannot_hide_behind_the_error_that_was_recorded() -> None:
@@ -187,7 +187,7 @@ def test_a_miss_cannot_hide_behind_the_error_that_was_recorded() -> None:
     result = again(ran, asking("B")).result
     assert result.verdict == "culprit"
     assert result.first is not None
-    assert "EffectMiss: miss at call 0" in result.first.got
+    assert "EffectMiss: miss at effect 0" in result.first.got
 
 
 GRID = np.arange(6, dtype=np.float32).reshape(2, 3)

@@ -21,6 +21,7 @@ from dataflow.execution.runner import OperatorRunner
 from dataflow.graph.model import Live, Node, Restart
 from dataflow.records.firing import FiringRecord
 from dataflow.records.repetition import Repetition, look_at
+from dataflow.records.spacing import StateSpacing
 from dataflow.sync import Entry, Firing
 
 STREAM = "t/s/x"
@@ -35,7 +36,7 @@ def live_run(made: Node, messages: Iterable[Entry], version: int, gains: Iterabl
     """A live run with a jump of the clock, parameters that change, and snapshots, whose generators are seeded by
     `version`."""
     collector = Collector()
-    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 10**6, snapshots=1)
+    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 10**6, snapshots=StateSpacing(1))
     runner.calls.version = version
     runner.setup()
     left = iter(gains)
@@ -142,7 +143,7 @@ def test_an_operator_that_was_restarted_with_changed_parameters_is_identical() -
 def test_runs_live_runs_and_re_executions_draw_alike() -> None:
     messages = MESSAGES[:2]
     collector = Collector()
-    runner = OperatorRunner(dice(shared=True), collector, static=frozenset(), snapshots=1)
+    runner = OperatorRunner(dice(shared=True), collector, static=frozenset(), snapshots=StateSpacing(1))
     runner.setup()
     for message in messages:
         runner.push(STREAM, message)

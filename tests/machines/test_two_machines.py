@@ -83,6 +83,7 @@ operators:
 """
 
 
+@pytest.mark.long
 def test_stamps_of_a_machine_whose_clock_is_wrong_are_corrected_where_the_graph_asks(tmp_path: Path) -> None:
     shutil.copytree(HERE, tmp_path / "code")
     (tmp_path / "code" / "sitecustomize.py").write_text(SET)

@@ -27,8 +27,8 @@ def test_the_families_cover_what_a_robot_needs() -> None:
         Image Image16 CompressedImage CompressedVideo DepthImage CompressedDepth RelativeDepth CameraInfo
         PointCloud Imu MagneticField LaserScan RadarScan RangeReading NavSatFix Point Pose Transforms Odometry Twist
         WheelTicks JointState Detections2D Keypoints2D Boxes3D
-        SegmentationMap Tracks FeatureVector SceneGraph Activity Diagnostics LandmarkSightings Path OccupancyGrid Mesh
-        Planes Rooms Clusters Classification ParticleSet Number Measurement Text Switch Alarm"""
+        SegmentationMap Tracks FeatureVector SceneGraph Activity Diagnostics LandmarkSightings Path OccupancyGrid Rooms
+        Mesh Planes Clusters Classification ParticleSet Number Measurement Text Switch Alarm"""
     assert {cls.SCHEMA for cls in TYPES} == set(wanted.split())
     assert {cls.SCHEMA for cls in TYPES} <= set(dataflow.messages.__all__)
 

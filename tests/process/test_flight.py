@@ -68,10 +68,16 @@ def flown(
     each: Any = lambda stamp: None,
     ahead: int = 0,
     late: int = 0,
+    lag: int = 0,
     **more: Any,
 ) -> Any:
     """Gives a flight recorder what a recorder was given; `asks`: stamps (s) at which it is triggered, by a
-    clock that is `ahead` (ns); `late`: by how much firing records are (ns)."""
+    clock that is `ahead` (ns); `late`: by how much firing records are (ns); `lag`: by how much all of the operators is
+    behind the sources (ns)."""
+
+    def due(node: str, stamp: int) -> int:
+        return stamp if node == "left" or not lag else max(stamp, SECOND) + lag
+
     flight = replace(graph.record.flight, when=when, **more)  # type: ignore[type-var]
     made = replace(graph, record=replace(graph.record, flight=flight))
     history: list[tuple[int, int]] = []
@@ -81,10 +87,10 @@ def flown(
         options = {"metadata": metadata, "compression": "zstd", "overwrite": True, "label": "ring", "settle": 0.0}
         options["storage"] = Storage(on_failure="go_on")
         sink = FlightSink(folder, made, list(made.record.streams), options)
-        records = _records(recording)
+        records = iter(sorted(_records(recording), key=lambda record: due(record.operator, record.stamp)))
         at = next(records, None)
-        for found in recording.messages():
-            while at is not None and at.stamp < found.stamp - late:
+        for found in sorted(recording.messages(), key=lambda m: due(m.stream.split("/")[1], m.stamp)):
+            while at is not None and due(at.operator, at.stamp) < due(found.stream.split("/")[1], found.stamp) - late:
                 sink.firings(at.operator, [at], encode_batch([at]))
                 at = next(records, None)
             each(found.stamp / SECOND)
@@ -161,6 +167,15 @@ def test_firing_records_that_are_late_are_waited_for(recorded: Path, graph: Grap
 
     with Recording(one["path"]) as kept:
         assert max(m.stamp for m in kept.messages(["test/left/fast"])) >= 12 * SECOND - 60_000_000
+
+
+def test_operators_are_waited_for_of_which_nothing_has_come(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    """As at the beginning of a run, of a recorder that is behind."""
+    sink, _ = flown(recorded, graph, tmp_path, asks=[1.5], lag=6 * SECOND)
+    (one,) = sink.close("complete")["kept"]
+
+    report = verify(Path(one["path"]))
+    assert {v.operator: v.verdict for v in report.operators} == dict.fromkeys(("first", "second", "slow"), "identical")
 
 
 def test_a_pause_of_the_recorder_is_no_time_in_which_firing_records_would_have_come(

@@ -162,6 +162,21 @@ def test_a_recorder_that_is_asked_for_its_state_says_first_that_it_has_ended() -
     assert len(recorder.channel.of("ended")) == 1
 
 
+def test_a_recorder_that_stores_what_it_is_given_makes_progress_though_one_stream_is_behind() -> None:
+    """On a slow disk: the run is not stuck."""
+    recorder = Recorder()
+    recorder.process.frontiers[STREAM] = 0
+
+    for second in range(3):
+        recorder.process._report(second)
+        recorder.process._report(second + 0.5)
+        recorder.arrives((0, second))
+    recorder.process._report(9.0)
+    recorder.process._report(11.0)
+
+    assert [fields["done"] for fields in recorder.channel.of("progress")] == [{"@recorder": 0}] * 4
+
+
 def test_records_of_an_operator_are_stored_in_the_order_of_its_calls_though_no_message_comes(tmp_path: Path) -> None:
     graph = load_text(GRAPH)
     options = {"metadata": {}, "compression": "zstd", "overwrite": False}

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import struct
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -223,3 +226,29 @@ def test_numbers_that_overflow_are_refused_as_unreadable() -> None:
 def test_types_without_a_counterpart_are_refused_by_typed_sources() -> None:
     with pytest.raises(RecordingError, match="Ros2Source passes it on"):
         reader_for("/b", "sensor_msgs/msg/BatteryState", "jazzy")
+
+
+PYTERFACES = """
+import importlib, json, pkgutil
+import ros2_pyterfaces.core as core
+
+found = {}
+for package in pkgutil.iter_modules(core.__path__):
+    if package.ispkg and importlib.util.find_spec(f"ros2_pyterfaces.core.{package.name}.msg"):
+        module = importlib.import_module(f"ros2_pyterfaces.core.{package.name}.msg")
+        named = [each for each in vars(module).values() if isinstance(each, dict) and "__typename" in each]
+        found |= {core.get_type_name(each): core.hash_rihs01(each) for each in named}
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.parametrize("distro", HASHED)
+def test_hashes_are_those_of_definitions_that_others_wrote_down(distro: Distro) -> None:
+    pytest.importorskip("ros2_pyterfaces", reason="ros2-pyterfaces is not installed: pip install ros2-pyterfaces")
+    command = [sys.executable, "-c", PYTERFACES]
+    variables = {**os.environ, "DISTRO": distro}
+    told = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60, env=variables).stdout
+    theirs = json.loads(told)
+    both = [type_ for type_ in CONVERSIONS if type_ in theirs and type_hash(type_, distro) is not None]
+    assert len(both) >= 44  # it lacks tf2_msgs, vision_msgs, and those of Foxglove and FFmpeg
+    assert {type_: type_hash(type_, distro) for type_ in both} == {type_: theirs[type_] for type_ in both}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.graph import Graph, load_graph
+from dataflow.graph import Graph, load_graph, load_text
 from dataflow.recording import LogLine, Recording, RecordingWriter
 from dataflow.recording.layout import RESERVED_METADATA
 from dataflow.recording.streams.diff import diff
@@ -90,6 +90,26 @@ def test_a_graph_that_records_its_sensors_only_gives_a_thin_recording_that_can_b
     with Recording(out) as recording:
         assert recording.digests() == full.digests()
     assert replay_recording(out, placement="one_process").digests() == full.digests()
+
+
+def test_what_acts_on_the_world_needs_nothing_to_complete_a_recording(tmp_path: Path) -> None:
+    """It does not act again, so what it alone took may be missing."""
+    graph = load_text("""
+graph: acting
+namespace: test
+operators:
+  left: {use: runtime_operators:Counter, params: {count: 10}}
+  act: {use: runtime_operators:Act, inputs: {x: left/fast}}
+  sum: {use: runtime_operators:Sum, inputs: {x: left/slow}}
+record: {exclude: [left/fast]}
+""")
+    path, out = tmp_path / "thin.mcap", tmp_path / "out.mcap"
+    run(graph, placement="one_process", record=path)
+
+    assert complete(path, out).whole
+
+    with Recording(path) as a, Recording(out) as b:
+        assert diff(a, b).same
 
 
 def _recording_sensors_only(graph: Graph) -> Graph:

@@ -17,7 +17,8 @@ pytest.importorskip("greenlet", reason="simulated runs need the package greenlet
 from simulation import bindings
 from simulation import check as checks
 from simulation.check import check
-from simulation.keeping import check_losses_of_files
+from simulation.flights import Flown
+from simulation.keeping import Keeping, check_losses_of_files
 from simulation.mutants import MUTANTS, Mutant
 from simulation.pipes import journey_of, travel
 from simulation.run import Happening, Machine, Outcome, simulate
@@ -25,7 +26,8 @@ from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
-from dataflow.supervision.core.report import RunReport
+from dataflow.recording.parts import Storage
+from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan
 
 PLAIN = Scenario(
@@ -122,6 +124,14 @@ def test_nothing_reads_the_clock_past_the_simulation() -> None:
 # Runs
 
 
+def test_ticks_that_came_due_during_a_pause_are_given_the_time_of_those_of_a_freeze() -> None:
+    ticks = replace(PLAIN, graph=TICKING, live=True, work=0.05)
+    frozen, paused = (
+        replace(ticks, happenings=(Happening(0.1, kind, "left", {"span": 6.0}),)) for kind in ("freeze", "pause")
+    )
+    assert paused.limit >= frozen.limit
+
+
 def test_a_seed_gives_one_course(memory: Path) -> None:
     scenario = scenario_of(3)
     courses = []
@@ -154,6 +164,17 @@ def test_a_full_disk_ends_the_run_and_leaves_a_readable_recording(memory: Path) 
 
     assert result.outcome.disk_full
     assert "No space left on device" in str(result.outcome.failure)
+
+
+def test_a_disk_that_is_full_at_the_beginning_refuses_the_run(memory: Path) -> None:
+    keeping = Keeping(storage=Storage(on_failure="go_on"), flight=True)
+    scenario = replace(PLAIN, live=True, keeping=keeping, machine=Machine(1, room=2_000))
+
+    result = check(scenario, memory)
+
+    told = str(result.outcome.failure)
+    assert told.startswith("not ready within 20 s: process '@recorder', which failed")
+    assert "No space left on device" in told
 
 
 def test_a_frozen_process_is_not_waited_for_without_end(memory: Path) -> None:
@@ -209,6 +230,19 @@ def test_seeds(first: int, memory: Path) -> None:
             pytest.fail(f"{scenario.describe()}\n{violation}")
 
 
+def test_a_recording_without_what_only_the_outside_world_took_is_completed_and_not_replayed(memory: Path) -> None:
+    parts = (
+        "left: {SOURCE}",
+        "arm: {use: simulation.operators:Arm, inputs: {x: left/fast}}",
+        "relay: {use: simulation.operators:Relay, inputs: {x: left/slow}}",
+    )
+    scenario = replace(PLAIN, graph=DRAWN, parts=parts, keeping=Keeping("exclude: ['left/fast']"))
+
+    result = check(scenario, memory)
+
+    assert (result.verdict, result.replayed) == ("identical", False)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [23_000_041, 23_000_109, 23_000_334, 23_000_461, 23_000_570, 23_000_869])
 def test_seeds_that_broke_a_promise_once(seed: int, memory: Path) -> None:
@@ -220,6 +254,11 @@ def test_links_between_machines(first: int) -> None:
     """Frames arrive once and in order, whatever becomes of the link; clocks are known to half the delay."""
     for seed in range(first, first + 10):
         travel(journey_of(seed))
+
+
+def test_two_machines_that_say_nothing_are_given_the_time_to_measure_their_clocks() -> None:
+    """A beat and its answer take longer than a second here."""
+    travel(journey_of(25_002_417))
 
 
 # Planted faults
@@ -288,7 +327,9 @@ def test_a_planted_fault_is_found_and_its_plan_shrunk(name: str, memory: Path) -
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("name", "seed"), [("part", 36), ("state", 26), ("reload", 37)])
+@pytest.mark.parametrize(
+    ("name", "seed"), [("part", 36), ("state", 26), ("reload", 79), ("again", 4), ("drops", 173), ("half", 11)]
+)
 def test_a_fault_of_what_is_recorded_is_found(name: str, seed: int, memory: Path) -> None:
     check(scenario_of(seed), memory, replay=False)
 
@@ -301,6 +342,29 @@ def test_a_pipe_that_does_not_notice_what_its_link_lost_is_found() -> None:
 
     with MUTANTS["link"].planted(), pytest.raises(Violation, match="did not come"):
         travel(journey_of(3))
+
+
+def test_a_graph_is_shrunk_only_to_graphs(memory: Path) -> None:
+    """One that leaves out a stream by its name does not load without the operator that publishes it."""
+    relay = "relay: {use: simulation.operators:Relay, inputs: {x: right/fast}}"
+    parts = ("left: {SOURCE}", "right: {SOURCE}", relay)
+    scenario = replace(PLAIN, graph=DRAWN, parts=parts, keeping=Keeping("exclude: ['left/fast']"))
+
+    def run(tried: Scenario, folder: Path) -> None:
+        if "left/fast" not in tried.load().record.streams and tried.keeping.topics:
+            raise Violation("it is left out")
+
+    small, said = shrink(scenario, memory, Violation("broken"), run=run)
+
+    assert said == "it is left out"
+    assert small.count == 1
+
+
+def test_what_fails_otherwise_is_a_broken_promise_of_its_seed(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("simulation.check._verify", lambda *_: 1 // 0)
+
+    with pytest.raises(Violation, match="ZeroDivisionError"):
+        check(PLAIN, memory)
 
 
 def test_planting_a_fault_leaves_nothing_behind() -> None:
@@ -320,13 +384,19 @@ def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The checks themselves: of files, of a completed recording, and of a flight recorder."""
-    streams, files = {"robot/nothing/out": (5, "")}, {"@recorder": {"kept": []}}
+    streams, files = {"robot/nothing/out": (5, "")}, {"@recorder": {"kept": [], "not_kept": 0}}
     report = RunReport("robot", streams, {}, {}, {}, {}, files, 0, 1, 0.0, interrupted=False, notes=())
     with pytest.raises(Violation, match="of 5 messages of robot/nothing/out 0 are stored"):
         check_losses_of_files(report, RUN)
     monkeypatch.setattr("simulation.check.complete", lambda *_, **__: SimpleNamespace(whole=True))
     with pytest.raises(Violation, match="lacks messages of robot/nothing/out"):
-        checks._check_completion(RUN, RUN, report)
-    assert checks._check_flight(Outcome(report)) == "nothing kept"
+        checks._check_completion(RUN, RUN, PLAIN.load(), report)
+    graph = replace(PLAIN, keeping=Keeping(flight=True)).load()
+    assert checks._check_flight(Outcome(report), graph, tmp_path) == "nothing kept"
     with pytest.raises(Violation, match="nothing is kept, though left failed"):
-        checks._check_flight(Outcome(replace(report, restarts={"left": 1})))
+        checks._check_flight(Outcome(replace(report, restarts={"left": 1})), graph, tmp_path)
+    asked = Flown(asked=[(("drops", "left", 7), 7)])
+    with pytest.raises(Violation, match=r"was asked .*'drops', 'left', 7.* and kept \[\]"):
+        checks._check_flight(Outcome(report, flown=asked), graph, tmp_path)
+    with pytest.raises(Violation, match="its end is not kept: a call failed"):
+        checks._check_flight(Outcome(failure=RunFailed("a call failed")), graph, tmp_path)

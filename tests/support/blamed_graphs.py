@@ -18,6 +18,7 @@ from dataflow.messages import FeatureVector, Message
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 
 STEPS, SLOW, WINDOW, HALF = 60, 6, 3, 60.0
+LOW, HIGH = 31.0, 95.0
 SENSORS = ("a", "b", "c", "d")
 STAMP, STEP = 10**18, 100_000_000
 Sensed = tuple[str, int]
@@ -101,6 +102,24 @@ class Keep(Operator):
         if number(flag) >= HALF:
             self.state.value = number(x)
         return vector(x.stamp, self.state.value)
+
+
+@dataclass
+class Opened:
+    open: bool = True
+
+
+class Latch(Operator):
+    """Open from a large reading on until a small one, and at first."""
+
+    x: In[FeatureVector]
+    out: Out[FeatureVector]
+    state: Opened
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        if not LOW <= number(x) <= HIGH:
+            self.state.open = number(x) > HIGH
+        return vector(x.stamp, float(self.state.open))
 
 
 class KeepHalf(Keep):

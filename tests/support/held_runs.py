@@ -22,6 +22,7 @@ from dataflow.messages import FeatureVector, Message
 from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 from dataflow.recording import Recording
 from dataflow.records.firing import Emission, FiringRecord
+from dataflow.records.spacing import StateSpacing
 from dataflow.sync import NEVER, Entry
 
 STAMP, MS = 10**18, 1_000_000
@@ -138,6 +139,15 @@ class Count(Operator):
         return vector(step.stamp, self.state.value)
 
 
+class Brittle(Smooth):
+    """Raises at one message."""
+
+    def process(self, at: FeatureVector) -> FeatureVector:
+        if at.stamp == STAMP + 2000 * MS:
+            raise ValueError("not this one")
+        return super().process(at)
+
+
 class HalfSmooth(Smooth):
     """Another version, which gives something else."""
 
@@ -239,7 +249,7 @@ def recorded(graph: Graph, faults: Faults, path: Path, played: Recording | None 
                 emitter,
                 static=graph.static,
                 seed=graph.seed,
-                snapshots=graph.record.snapshots,
+                snapshots=None if (apart := graph.record.snapshots) is None else StateSpacing(apart),
                 clock=lambda: clock[0],
                 event_clock=lambda: STAMP + round(clock[0] * 1e9),
             )

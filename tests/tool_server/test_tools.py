@@ -16,9 +16,9 @@ from dataflow.graph import load_text
 from dataflow.recording import Recording
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog
-from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
 from dataflow.text import json_text
-from dataflow.tool_server.tools import ToolError, _call_of, answer
+from dataflow.tool_server.tools import ToolError, answer
 
 SKIPPED, DEGREES = 613, 640
 """The first calls of `sum` and `sine` that the bugs change."""
@@ -36,19 +36,17 @@ def test_verify_names_culprits_with_their_first_call(bugs: dict[str, str]) -> No
     assert sorted(told["culprits"]) == ["sine", "sum"]
     assert {each["operator"] for each in told["operators"]} == {"sine", "sum"}
     assert all(each["first"]["stamp"] for each in told["operators"])
-    assert {each["operator"]: each["call"] for each in told["operators"]} == {"sum": SKIPPED, "sine": DEGREES}
+    assert {each["operator"]: each["first"]["call"] for each in told["operators"]} == {"sum": SKIPPED, "sine": DEGREES}
 
 
 def test_a_recorded_state_is_of_the_call_behind_which_it_was_taken(bugs: dict[str, str]) -> None:
     with Recording(Path(bugs["right"])) as recording:
-        records = FiringLog.read(recording).of("sum")
-    state = [record.kind for record in records].index("snapshot", 100)
-    before = sum(record.kind in CALLS for record in records[:state])
+        log, node = FiringLog.read(recording), graph_that_is_here(recording)[0].nodes["sum"]
+        records = list(log.ordered(node))
+        state = [record.kind for record in records].index("snapshot", 100)
+        before = sum(record.kind in CALLS for record in records[:state])
 
-    places = {n: _call_of(Path(bugs["right"]), "sum", {"incarnation": 0, "index": n}) for n in (0, state, state + 1)}
-
-    assert records[0].kind == "setup"
-    assert places == {0: {}, state: {"call": before - 1}, state + 1: {"call": before}}
+        assert [log.call_at(node, (0, n)) for n in (0, state, state + 1)] == [None, before - 1, before]
 
 
 def test_a_call_is_shown_with_its_difference(bugs: dict[str, str]) -> None:

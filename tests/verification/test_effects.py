@@ -92,7 +92,7 @@ def test_a_changed_prompt_is_a_miss_with_call_and_line(asked: Path, tmp_path: Pa
     assert found.first is not None
     source = Path(vision_language.__file__).read_text().splitlines()
     line = next(n for n, text in enumerate(source, 1) if "self.effect(" in text)
-    assert f"miss at call 0 (vision_language.py:{line}), ask: argument 1 differs" in found.first.got
+    assert f"miss at effect 0 (vision_language.py:{line}), ask: argument 1 differs" in found.first.got
 
 
 def test_the_debugger_goes_to_a_miss_and_asks_on_demand(asked: Path) -> None:
@@ -102,7 +102,7 @@ def test_the_debugger_goes_to_a_miss_and_asks_on_demand(asked: Path) -> None:
         found = debugger.first_difference()
         assert found is not None
         assert found.number == 0
-        assert "EffectMiss: miss at call 0" in (found.error or "")
+        assert "EffectMiss: miss at effect 0" in (found.error or "")
         live = Debugger(recording, "describe", changed, live_effects=True).goto(0)
         [made] = live.made
         assert "URLError" in made.here.text  # type: ignore[union-attr]

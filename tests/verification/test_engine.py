@@ -42,7 +42,7 @@ def test_verification_opens_no_network_connection_whatever_the_graph_says(
 def test_an_operator_that_ends_its_process_is_named_with_firing_and_stamp(kept: Path) -> None:
     with pytest.raises(
         RunFailed,
-        match=r"operator 'busy' ended its process with code 7 in firing 10 \(fire\) at stamp 1700000000090000000",
+        match=r"operator 'busy' ended its process with code 7 in call 9 \(fire\) at stamp 1700000000090000000",
     ) as raised:
         verify(kept, graph=with_busy(kept, "Fatal"), jobs=2)
 

@@ -102,7 +102,7 @@ def debug(
         recording = existing_recording(recording)
         if dap is not None and (do or json or view):
             raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
-        loaded = begin_again(recording, graph, settings, path)
+        loaded = begin_again(recording, graph, settings, path, operator.partition("@")[0])
         _debug(recording, operator, loaded, do, live_effects=live_effects, view=view, dap=dap, json=json)
 
 

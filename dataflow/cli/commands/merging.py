@@ -62,16 +62,20 @@ def merge(
     from contextlib import ExitStack
 
     from dataflow.editing.merge import merge as merge_all
+    from dataflow.recording.streams.part_folder import NOTHING_IN_IT
 
     with friendly_errors(), ExitStack() as stack:
         if len(recordings) < 2:
             raise fail("nothing to merge: name two recordings or more")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
         refuse_itself(output, recordings)
+        empty = [path for path in recordings if path.is_file() and not path.stat().st_size]
+        recordings = [path for path in recordings if path not in empty]
         prefixes = _prefixes(prefix or (), recordings)
         origins = [stack.enter_context(opened_material(path)) for path in recordings]
         watch = stack.enter_context(copying("merging", quiet or json))
         done = merge_all(origins, output, prefixes=prefixes, compression=compression, overwrite=overwrite, watch=watch)
+        done.notes += [f"{path} {NOTHING_IN_IT}" for path in empty]
     if json:
         print_json(done.as_json())
     else:

@@ -29,7 +29,7 @@ from dataflow.cli.support.arguments import (
     span,
     window,
 )
-from dataflow.cli.support.execution import checked_outputs, execute, plan_options
+from dataflow.cli.support.execution import Outputs, checked_outputs, execute, plan_options
 from dataflow.cli.support.output import DIFFERENT, err, fail, friendly_errors, out, print_json, say
 from dataflow.cli.support.run_options import (
     OUTPUT,
@@ -54,6 +54,7 @@ from dataflow.cli.support.storage import KeepDisk, OnFailure, Readable, SplitEve
 if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.recording import Recording
+    from dataflow.supervision.core.report import RunReport, Watch
 
 
 def replay(
@@ -145,10 +146,7 @@ def replay(
         existing_recording(recording)
         if record is not None and record.exists() and record.samefile(recording):
             raise fail(f"--record {record} is the recording that is being replayed; name another file")
-        if loop < 0:
-            raise fail(f"--loop {loop}: expected 1 or more, or 0 for no end")
-        if loop != 1 and (record is not None or view is not None or complete is not None):
-            raise fail("--loop makes the same in each pass: it does not go with --record, --view or --complete")
+        _check_loop(loop, written=(record, view, complete) != (None,) * 3)
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
         if compression is not None and record is None:
@@ -158,82 +156,94 @@ def replay(
         find_modules_in(path)
         early = None if complete is not None else stack.enter_context(early_nursery())
         from dataflow.graph import load_graph
-        from dataflow.interop.opening import is_foreign, open_bag
+        from dataflow.interop.opening import is_foreign
         from dataflow.recording import Recording
-        from dataflow.recording.mcap.index import NO_END
-        from dataflow.recording.streams.cutting import cut_of
-        from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
-        from dataflow.supervision.replay import plan_replay
         from dataflow.supervision.run import replay as replay_recording
 
+        def planned(loaded: Graph) -> tuple[Outputs, dict[str, Any]]:
+            outputs = checked_outputs(record, view, open_view, overwrite, storage)
+            options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
+            return outputs, options | {"early": early, "paused": step, "controls": keys(quiet or json), **packing}
+
+        given = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
         if maps or is_foreign(recording):
             from dataflow.cli.support.bags import replay_bag
 
-            if graph is None:
-                open_bag(recording).close()
-                raise fail(f"{recording} does not hold the graph that made it: name one with --graph")
-            if complete is not None:
-                raise fail("--complete needs the firing records of a run, which bags do not hold")
-            loaded = load_graph(graph_file(graph), settings=settings or ())
-            outputs = checked_outputs(record, view, open_view, overwrite, storage)
-            options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-            options |= {"early": early, "paused": step, "controls": keys(quiet or json), **packing}
+            given = _graph_of_bag(recording, given, completed=complete is not None)
+            outputs, options = planned(given)
             if storage.splitting.splits:
                 raise fail("of a bag no split recording is made; split it afterwards: dataflow split FILE.mcap")
             if loop != 1:
                 raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
-            words = (recording, loaded, maps or (), clock, start, end, outputs, options)
+            words = (recording, given, maps or (), clock, start, end, outputs, options)
             replay_bag(*words, strict=strict, began=began, json=json, quiet=quiet, verbose=verbose)
             return
         with Recording(recording) as opened:
-            if graph is None:
-                recorded = graph_as_recorded(opened)
-                loaded = recorded if network else isolated(recorded)
-                if loaded.network != recorded.network:
-                    say_network_ignored(recording)
-            else:
-                loaded = load_graph(graph_file(graph), settings=settings or ())
+            loaded = _recorded_graph(opened, network=network) if given is None else given
             if complete is not None:
-                alone = (start, end, rate, record, view, place) == (None,) * 6
-                if not alone or open_view or one_process or process_each or paranoid:
+                others = (start, end, rate, record, view, place)
+                if others != (None,) * 6 or any((open_view, one_process, process_each, paranoid)):
                     raise fail(
                         "--complete repeats a run as it was, in one process: of the other options only --graph, "
                         "--set, --overwrite, --quiet and --json go with it"
                     )
                 _complete(recording, loaded, complete, overwrite=overwrite, json=json, quiet=quiet)
                 return
-            whole = span(opened, plan_replay(opened, loaded).streams)
-            begin, finish = window(whole, start, end, recording)
-            if opened.torn:
-                name = escape(str(recording))
-                say(f"[yellow]{name} {escape(NO_END)}[/]")
-            part = cut_of(opened.metadata)
-            begin = part.start if begin is None and part is not None else begin
-            if begin is not None:
-                _say_what_begins_fresh(opened, loaded, begin)
-        outputs = checked_outputs(record, view, open_view, overwrite, storage)
-        options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-        shown = None
-        if whole is not None:
-            shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
-        options |= {"paused": step, "controls": keys(quiet or json), **packing}
+            shown = _shown(opened, loaded, start, end)
+        outputs, options = planned(loaded)
 
-        def once() -> dict[str, Any]:
-            report = execute(
-                lambda watch: replay_recording(
-                    recording, graph=loaded, start=start, end=end, watch=watch, early=early, **options
-                ),
-                loaded,
-                outputs,
-                shown,
-                began=began,
-                json=json,
-                quiet=quiet,
-                verbose=verbose,
-            )
-            return dict(report.streams)
+        options |= {"graph": loaded, "start": start, "end": end}
+        told: dict[str, Any] = {"began": began, "json": json, "quiet": quiet, "verbose": verbose}
 
-        looped(loop, once)
+        def playing(watch: Watch | None) -> RunReport:
+            return replay_recording(recording, watch=watch, **options)
+
+        looped(loop, lambda: dict(execute(playing, loaded, outputs, shown, **told).streams))
+
+
+def _check_loop(loop: int, *, written: bool) -> None:
+    if loop < 0:
+        raise fail(f"--loop {loop}: expected 1 or more, or 0 for no end")
+    if loop != 1 and written:
+        raise fail("--loop makes the same in each pass: it does not go with --record, --view or --complete")
+
+
+def _graph_of_bag(bag: Path, graph: Graph | None, *, completed: bool) -> Graph:
+    from dataflow.interop.opening import open_bag
+
+    if graph is None:
+        open_bag(bag).close()
+        raise fail(f"{bag} does not hold the graph that made it: name one with --graph")
+    if completed:
+        raise fail("--complete needs the firing records of a run, which bags do not hold")
+    return graph
+
+
+def _recorded_graph(recording: Recording, *, network: bool) -> Graph:
+    from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
+
+    recorded = graph_as_recorded(recording)
+    graph = recorded if network else isolated(recorded)
+    if graph.network != recorded.network:
+        say_network_ignored(recording.path)
+    return graph
+
+
+def _shown(recording: Recording, graph: Graph, start: float | None, end: float | None) -> tuple[int, int] | None:
+    """Returns the stamps between which is replayed, ns; prints what such a part cannot have as it was."""
+    from dataflow.recording.mcap.index import NO_END
+    from dataflow.recording.streams.cutting import cut_of
+    from dataflow.supervision.replay import plan_replay
+
+    whole = span(recording, plan_replay(recording, graph).streams)
+    begin, finish = window(whole, start, end, recording.path)
+    if recording.torn:
+        say(f"[yellow]{escape(str(recording.path))} {escape(NO_END)}[/]")
+    part = cut_of(recording.metadata)
+    begin = part.start if begin is None and part is not None else begin
+    if begin is not None:
+        _say_what_begins_fresh(recording, graph, begin)
+    return None if whole is None else (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
 
 
 def say_network_ignored(recording: Path) -> None:

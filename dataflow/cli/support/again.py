@@ -12,15 +12,23 @@ from dataflow.cli.support.arguments import find_modules_in, graph_file
 from dataflow.cli.support.output import fail, out
 
 if TYPE_CHECKING:
+    from dataflow.environments import Environment
     from dataflow.graph import Graph
+    from dataflow.recording import Recording
 
 
 def begin_again(
-    recording: Path, graph: Path | None, settings: Sequence[str] | None, folders: Sequence[Path] | None
+    recording: Path,
+    graph: Path | None,
+    settings: Sequence[str] | None,
+    folders: Sequence[Path] | None,
+    operator: str = "",
 ) -> Graph | None:
     """Makes operators importable, and this process one like those of the run; returns the graph that `--graph` names.
 
-    Raises `GraphError`, and ends the command where `--set` has no graph file to change.
+    `operator`: the one whose calls are made, in its environment where it has one (`env:`).
+
+    Raises `GraphError`, `EnvError`, `ReplayError`, and ends the command where `--set` has no graph file to change.
     """
     if graph is None and settings:
         raise fail("--set changes a graph file: name it with --graph")
@@ -30,21 +38,37 @@ def begin_again(
 
     with Recording(recording) as opened:
         recorded = resolved_graph(opened)
-    take_environment(1 if recorded is None else recorded.threads)
+        env = None if recorded is None else _env_of(opened, recorded, operator)
+    take_environment(1 if recorded is None else recorded.threads, env)
     from dataflow.graph import load_graph
 
     return None if graph is None else load_graph(graph_file(graph), settings=settings or ())
 
 
-def take_environment(threads: int) -> None:
-    """Begins anew with the environment of operators where this process has another one: libraries read the number of
-    their threads, and Python the salt of hashes, when they begin."""
+def _env_of(recording: Recording, graph: Graph, operator: str) -> Environment | None:
+    """The environment of an operator and of those that are repeated for its calls."""
+    names = [n for n, node in graph.nodes.items() if n == operator or (operator and n.endswith(f"/{operator}"))]
+    if not any(graph.nodes[name].env for name in names):
+        return None
+    from dataflow.environments import environment_of
+    from dataflow.reexecution.engine import plan_feeding
+    from dataflow.verification.choice import env_of
+
+    env = env_of(graph, plan_feeding(recording, graph, names).operators, recording.streams.keys())
+    return None if env is None else environment_of(env)
+
+
+def take_environment(threads: int, env: Environment | None = None) -> None:
+    """Begins anew with the environment of operators where this process has another one, or in `env`: libraries read the
+    number of their threads, and Python the salt of hashes, when they begin."""
     from dataflow.cli import start
     from dataflow.execution.threads import environment
 
-    wanted = environment(threads)
+    wanted, python = environment(threads), sys.executable
+    if env is not None:
+        wanted, python = env.variables(wanted), env.python
     if start.words is not None and any(
         os.environ.get(name) != value for name, value in wanted.items() if name != "PYTHONPATH"
     ):
         out.file.flush()
-        os.execve(sys.executable, [sys.executable, "-P", "-m", "dataflow.cli.main", *start.words], wanted)
+        os.execve(python, [python, "-P", "-m", "dataflow.cli.main", *start.words], wanted)

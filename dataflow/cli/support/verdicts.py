@@ -10,6 +10,7 @@ from rich.text import Text
 from dataflow.cli.support.output import count, plural, seconds, size, table
 from dataflow.recording.streams.diff import FieldDifference
 from dataflow.records.comparison import Difference, Verification
+from dataflow.records.firing import CALLS
 from dataflow.sync.stamps import format_stamp
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.complete import Completion
@@ -308,22 +309,30 @@ def fact_lines(report: VerifyReport) -> Iterator[str]:
 
 def _difference(v: Verification, first: Difference, compared: OutputComparison | None) -> Iterator[str]:
     port = f", port {first.port}" if first.port else ""
-    again = f" of incarnation {first.incarnation}" if first.incarnation else ""
-    when = f"{format_stamp(first.stamp)} ({first.stamp})"
-    yield f"{v.operator}: first difference in firing {first.index}{again} ({first.kind}) at {when}{port}"
+    where = _call(first.call, first.kind)
+    if first.kind != "setup":
+        where += f" at {format_stamp(first.stamp)} ({first.stamp})"
+    yield f"{v.operator}: first difference in {where}{port}"
     yield f"  recorded  {first.expected}"
     yield f"  here      {first.got}"
     if compared is None:
         return
     for output in compared.first:
         if (output.index, output.incarnation) != (first.index, first.incarnation):
-            yield f"  compared in firing {output.index} ({output.kind}) at {format_stamp(output.firing)}:"
+            yield f"  compared in {_call(output.call, output.kind)} at {format_stamp(output.firing)}:"
         if output.note:
             yield f"  {output.port}: {output.note}, so only digests can be compared"
         for found in output.fields[:FIELDS_SHOWN]:
             yield f"  {output.port}.{difference_text(found)}"
         if len(output.fields) > FIELDS_SHOWN:
             yield f"  {output.port}: {len(output.fields) - FIELDS_SHOWN} more fields differ"
+
+
+def _call(number: int | None, kind: str) -> str:
+    """The place of a record among an operator's calls, in words."""
+    if kind in CALLS:
+        return f"call {number} ({kind})"
+    return kind if number is None else f"{kind} behind call {number}"
 
 
 def difference_text(found: FieldDifference) -> str:

@@ -87,7 +87,7 @@ class RecordedJournal(Journal):
             return Answer.of(key.name, call, args, kwargs, MAX_EFFECT_BYTES).value()
         why = key.differing([recorded for recorded, _ in self._left])
         number = self._before + self.asked - 1
-        self.missed = EffectMiss(f"miss at call {number} ({_caller()}), {key.name}: {why}")
+        self.missed = EffectMiss(f"miss at effect {number} ({_caller()}), {key.name}: {why}")
         raise self.missed
 
 

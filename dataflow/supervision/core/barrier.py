@@ -75,7 +75,7 @@ class Barrier:
     def _fail(self, processes: list[Supervised]) -> None:
         timeout = self.run.plan.start_timeout
         if late := _late(processes):
-            names = "; ".join(p.describe() for p in late)
+            names = "; ".join(p.describe() + (f", which {p.cause}" if p.cause else "") for p in late)
             raise RunFailed(f"not ready within {timeout:g} s: {names}", self.run.last_words(late))
         silent = [f"{key} → {p.label}" for p in processes for key in sorted(p.unseen)]
         raise RunFailed(f"no connection within {timeout:g} s on: {', '.join(silent)}")

@@ -9,7 +9,6 @@ import contextlib
 import ctypes
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,6 +17,7 @@ from typing import IO
 from dataflow.execution.threads import THREADS, environment
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.polling import readable
+from dataflow.process.start import Process, start
 
 LEAVE_WITHIN = 10.0
 MOST_EARLY = 2
@@ -30,7 +30,7 @@ class Started:
 
     def __init__(self) -> None:
         self.pid = 0
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Process | None = None
         self.letter, self.board = os.memfd_create("call"), os.memfd_create("board")
         self.words: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         self.channel, self.theirs = Channel.pair()
@@ -78,22 +78,14 @@ def _await_end(pid: int) -> None:
         os.close(handle)
 
 
-def _spawn(
-    workers: list[Started], variables: Mapping[str, str], python: str = sys.executable
-) -> subprocess.Popen[bytes]:
+def _spawn(workers: list[Started], variables: Mapping[str, str], python: str = sys.executable) -> Process:
     """Starts the process of one worker; or one that forks itself for each, and ends: they are this process's then."""
     handed = [worker.handed() for worker in workers]
     slots = [",".join(map(str, each)) for each in handed]
     try:
-        return subprocess.Popen(
-            [python, "-P", "-m", "dataflow.verification.workers.worker", *slots],
-            pass_fds=[descriptor for each in handed for descriptor in each],
-            env=variables,
-            stdin=subprocess.DEVNULL,
-            stdout=workers[0].words,
-            stderr=subprocess.STDOUT,
-            process_group=0,
-        )
+        descriptors = [descriptor for each in handed for descriptor in each]
+        words = workers[0].words.fileno()
+        return start("dataflow.verification.workers.worker", slots, descriptors, variables, python, words)
     finally:
         for worker in workers:
             os.close(worker.theirs)  # the worker has its own; with ours open its death would go unseen
@@ -110,7 +102,7 @@ class EarlyWorkers:
     def __init__(self, count: int) -> None:
         self._environment = environment(1)
         self._waiting: list[Started] = []
-        self._maker: subprocess.Popen[bytes] | None = None
+        self._maker: Process | None = None
         if not _adopts(True):
             return
         with contextlib.suppress(OSError):  # a caller that needs one tries again, and reports the error

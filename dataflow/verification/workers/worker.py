@@ -116,8 +116,13 @@ def _end_with(channel: Channel) -> None:
         os.killpg(0, signal.SIGKILL)
 
 
+def run(words: Sequence[str]) -> int:
+    """Serves the slots that words name; returns the exit code."""
+    return main([tuple(map(int, slot.split(","))) for slot in words])
+
+
 if __name__ == "__main__":
-    exit_code = main([tuple(map(int, slot.split(","))) for slot in sys.argv[1:]])
+    exit_code = run(sys.argv[1:])
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(exit_code)  # libraries' threads must not be able to hold up the end

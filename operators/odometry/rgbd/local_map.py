@@ -47,6 +47,10 @@ class LocalMap(Remembered):
         """The keyframes of older segments."""
         return [k for k in self.keyframes if k.segment != self.newest.segment]
 
+    def of_segment(self, segment: int) -> list[Keyframe]:
+        """Returns the keyframes of a segment."""
+        return [k for k in self.keyframes if k.segment == segment]
+
     @property
     def unused_segment(self) -> int:
         """The number of a segment that no keyframe is of."""

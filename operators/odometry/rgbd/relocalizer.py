@@ -26,6 +26,7 @@ from operators.odometry.rgbd.fitting import Fit, Fitter, Sighting
 from operators.odometry.rgbd.frame import Frame
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import LocalMap
+from operators.odometry.rgbd.standing import standing
 from operators.odometry.rgbd.surface import DepthNoise, Surface
 from operators.odometry.rgbd.uniqueness import unique
 
@@ -79,9 +80,9 @@ def recognised(
     seen = Landmarks.of(describe(frame.gray), frame.surface, fitter.camera)
     for segment in sorted({k.segment for k in chosen}):
         keyframes = [k for k in chosen if k.segment == segment]
-        there = [k for k in known.keyframes if k.segment == segment]
+        there = known.of_segment(segment)
         first: tuple[Fit, Keyframe] | None = None
-        for sighting in common(seen, keyframes, fitter.camera):
+        for sighting in common(seen, keyframes, fitter):
             found = _refined(frame, sighting, fitter, motion, T_predicted, there)
             if found is None and first is None:
                 break  # what fewer features say is no better founded
@@ -92,7 +93,7 @@ def recognised(
         if first is None:
             continue
         others = [k for k in there if not any(k is one for one in keyframes)]
-        sightings = common(seen, others, fitter.camera)[:RIVALS]
+        sightings = common(seen, others, fitter)[:RIVALS]
         rivals = [_refined(frame, sighting, fitter, motion, T_predicted, there) for sighting in sightings]
         if not any(rival is not None and _apart(rival[0], first[0]) for rival in rivals):
             yield first
@@ -127,6 +128,15 @@ def believed(
     return views[-1] if unique(frame, T_world_camera, views, camera, noise) else None
 
 
+def support(
+    frame: Frame, T_world_camera: Matrix, keyframes: Sequence[Keyframe], camera: RgbdCamera, noise: DepthNoise
+) -> float:
+    """Returns how much shape and brightness of what a view and keyframes both see speak for its pose, 0 to 2."""
+    views = seeing(frame.surface.points(SPARSE), T_world_camera, keyframes, VIEWS)
+    found = gathered(frame, T_world_camera, views, camera, noise)
+    return found.agreement + found.likeness
+
+
 def contradicted(
     frame: Frame, T_world_camera: Matrix, keyframes: Sequence[Keyframe], camera: RgbdCamera, noise: DepthNoise
 ) -> bool | None:
@@ -136,11 +146,14 @@ def contradicted(
     return found.agreement < CONTRADICTED if found.overlap >= SHARED else None
 
 
-def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> list[Sighting]:
-    """Returns the poses in which a view's features lie where keyframes of one segment have them, most of them first."""
+def common(seen: Landmarks, keyframes: Sequence[Keyframe], fitter: Fitter) -> list[Sighting]:
+    """Returns the poses in which a view's features lie where keyframes of one segment have them, most of them first.
+
+    What has moved since between them does not count.
+    """
     known, names = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for keyframe in keyframes:
-        landmarks = Landmarks.of(keyframe.description, keyframe.surface, camera)
+        landmarks = Landmarks.of(keyframe.description, keyframe.surface, fitter.camera)
         pairs = match_of_size(landmarks.descriptors, seen.descriptors, landmarks.sizes, seen.sizes, PAIRS)
         known.append(transform_points(keyframe.T_world_camera, landmarks.points[pairs[:, 0]]))
         names.append(pairs[:, 1])
@@ -148,8 +161,10 @@ def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -
     sightings = []
     for found in consensus(points, seen.points[which], which):
         if found.count >= FEWEST:
-            pixels, ages = seen.pixels[which[found.agree]], np.zeros(np.count_nonzero(found.agree), np.int64)
-            sightings.append(Sighting(found.T_a_b, points[found.agree], pixels, ages, len(points), recognised=True))
+            named = which[found.agree]
+            ages = np.zeros(len(named), np.int64)
+            all_ = Sighting(found.T_a_b, points[found.agree], seen.pixels[named], ages, len(points), recognised=True)
+            sightings.append(standing(all_, seen.points[named], fitter, FEWEST))
     return sightings
 
 

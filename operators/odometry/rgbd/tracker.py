@@ -26,7 +26,7 @@ from operators.odometry.rgbd.keyframe import Keyframe, carried
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.noise import Noise
-from operators.odometry.rgbd.relocalizer import believed, contradicted, recognised
+from operators.odometry.rgbd.relocalizer import believed, contradicted, recognised, support
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.trial import Trial, taken_back, with_trial
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
@@ -78,9 +78,9 @@ class RgbdOdometry:
         sighting = self._follow(frame, T_predicted)
         # 4. Refine with the depth image, against the surfaces of nearby keyframes.
         fit = self._refine(frame, sighting, T_predicted, self.state.map.newest)
-        # 5. Failing that, or in a new map, recognise the view by its descriptors.
+        # 5. Failing that, after a gap, or in a new map, recognise the view by its descriptors.
         measured = self._measured(frame, fit)
-        recalled = self._recall(frame, T_predicted, measured=measured)
+        recalled = self._recall(frame, fit if measured else None, T_predicted)
         # 6. Decide what the pose rests on, and remember it.
         if recalled is not None:
             return self._relocalised(frame, fit if measured else None, T_predicted, *recalled)
@@ -124,32 +124,50 @@ class RgbdOdometry:
         assert self.state.motion is not None
         return self._fitter.refine(frame, sighting, self.state.motion, T_predicted, self.state.map, known.segment)
 
-    def _measured(self, frame: Frame, fit: Fit) -> bool:
-        """Returns whether a fit counts: after a gap, when it may be at a place that looks alike, with more evidence."""
+    def _after_gap(self, frame: Frame) -> bool:
+        """Returns whether the camera was blind for so long that it may be at a place that looks alike."""
         assert self.state.motion is not None
-        gap = self.state.motion.blind_s + (frame.stamp - self.state.motion.stamp) * 1e-9 > self.config.patience_s
-        if gap and frame.image_flaw is None and frame.depth_flaw is None:
-            there = [k for k in self.state.map.keyframes if k.segment == self.state.map.newest.segment]
-            return believed(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise) is not None
+        return self.state.motion.blind_s + (frame.stamp - self.state.motion.stamp) * 1e-9 > self.config.patience_s
+
+    def _measured(self, frame: Frame, fit: Fit) -> bool:
+        """Returns whether a fit counts: after a gap with more evidence."""
+        if self._after_gap(frame) and frame.image_flaw is None and frame.depth_flaw is None:
+            there = self.state.map.of_segment(self.state.map.newest.segment)
+            return believed(frame, fit.T_world_camera, there, self._working, self.config.depth_noise) is not None
         return fit.inliers >= self.config.min_inliers or (fit.depth_agrees and fit.weakest_sigma < 0.05)
 
-    def _recall(self, frame: Frame, T_predicted: Matrix, *, measured: bool) -> tuple[Fit, Keyframe] | None:
-        """Looks for the view in the map: always while nothing is measured, now and then in a new map."""
+    def _recall(self, frame: Frame, tracked: Fit | None, T_predicted: Matrix) -> tuple[Fit, Keyframe] | None:
+        """Looks for the view in the map: while nothing is tracked, once after a gap, and now and then in a new map.
+
+        What is tracked after a gap was looked for around a prediction: a place that more speaks for takes its place.
+        """
         assert self.state.motion is not None
-        if measured and self.state.apart_since is None:
+        steady = tracked is not None and not self._after_gap(frame)
+        if steady and self.state.apart_since is None:
             self.state.recalls = 0
             return None
         self.state.recalls += 1
-        waits = measured and not recall_due(frame.stamp, self.state.apart_since, self.state.recalls)
+        waits = steady and not recall_due(frame.stamp, self.state.apart_since, self.state.recalls)
         if frame.image_flaw is not None or waits:
             return None
-        others = self.state.map.elsewhere if measured else self.state.map.keyframes
+        newest = self.state.map.newest.segment
+        others = self.state.map.elsewhere if steady else self.state.map.keyframes
         chosen = candidates(others, T_predicted, RECALL_NEAR, RECALL_OTHERS, self.state.recalls)
         for found, known in recognised(frame, chosen, self._fitter, self.state.motion, T_predicted, self.state.map):
-            here = known.segment == self.state.map.newest.segment
-            if not here or self._plausible(frame.stamp, found.T_world_camera, T_predicted):
+            if known.segment != newest:
+                return found, known
+            if tracked is not None and not self._likelier(frame, found, tracked):
+                continue
+            if self._plausible(frame.stamp, found.T_world_camera, T_predicted):
                 return found, known
         return None
+
+    def _likelier(self, frame: Frame, found: Fit, tracked: Fit) -> bool:
+        """Returns whether more speaks for one pose in the newest segment than for another."""
+        there = self.state.map.of_segment(self.state.map.newest.segment)
+        poses, noise = (found.T_world_camera, tracked.T_world_camera), self.config.depth_noise
+        one, other = (support(frame, T, there, self._working, noise) for T in poses)
+        return one > other
 
     def _followed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Takes up a pose that was measured against the newest keyframes."""
@@ -203,7 +221,7 @@ class RgbdOdometry:
         for trial in self.state.trials:
             if not trial.over(frame.stamp):
                 there = [k for k in self.state.map.keyframes if k.segment == segment and k.stamp < trial.since]
-                says = contradicted(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise)
+                says = contradicted(frame, fit.T_world_camera, there, self._working, self.config.depth_noise)
                 heard.append(trial if says is None else trial.heard(says))
         self.state.trials = tuple(heard)
         first = next((k for k, trial in enumerate(heard) if trial.failed), len(heard))
@@ -246,7 +264,11 @@ class RgbdOdometry:
     # -- keyframes ---------------------------------------------------------------------------------------
 
     def _new_keyframe(self, frame: Frame, fit: Fit, sunk: Vector) -> bool:
-        """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest."""
+        """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest.
+
+        A recognised frame is due: the corners of the newest keyframe may lie elsewhere, and the next frames would be
+        held by their depth alone.
+        """
         newest, surface = self.state.map.newest, fit.movers.left_out_of(frame.surface)
         baseline = view_distance(newest.T_world_camera, fit.T_world_camera, surface.typical_depth)
         expected = newest.surface.coverage * fit.offered  # what meets a hole of the keyframe has not left its view
@@ -258,7 +280,8 @@ class RgbdOdometry:
             return False
         candidate = self._keyframe(frame, fit)
         richer = len(candidate.points) > 1.5 * fit.inliers + self.config.min_inliers
-        due = richer or ((moved or better) and len(candidate.points) >= fit.inliers)
+        found_again = fit.recognised and frame.depth_flaw is None and len(candidate.points) >= self.config.min_inliers
+        due = found_again or richer or ((moved or better) and len(candidate.points) >= fit.inliers)
         if due:
             self.state.map.add(replace(candidate, sunk=sunk))
         return due

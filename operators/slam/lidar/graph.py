@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dataflow.messages.geometry import invert
+from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.lidar.search import apart
 from operators.odometry.tracking import moved_covariance
@@ -21,6 +22,8 @@ DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # errors of odometry beyond i
 STEP = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # and at each keyframe
 ASIDE, RIVALS = 2.5, 12  # metres from a place, and views beyond these that are looked at before it is believed
 RIVAL = 0.1  # by which the score of another place may be less than that of the best where it explains a scan as well
+BETWEEN = 1.0  # metres between these
+LOOKS = 2  # views that a scan is compared with at each call while the map is searched for
 AMBIGUOUS = "ambiguous: another place explains the scan as well"
 LEAST = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # of a sight: noise and calibration err alike in all
 
@@ -46,6 +49,20 @@ class LidarSettings(PlaceSettings):
     least: Matrix = field(default_factory=LEAST.copy)
 
 
+@dataclass(eq=False)
+class Search:
+    """A scan that is looked for in the map: views that it is yet to be compared with, and those that it saw again.
+
+    Once it is `found`, what is left are the `rivals`: views elsewhere that may explain it as well.
+    """
+
+    number: int
+    candidates: list[int]
+    sights: list[tuple[int, LidarSight]] = field(default_factory=list)
+    found: bool = False
+    rivals: list[int] = field(default_factory=list)
+
+
 class _Contexts:
     """The place index of scans."""
 
@@ -66,10 +83,12 @@ class LidarGraph(PlaceGraph[LidarView]):
     """The map that a LiDAR makes."""
 
     graph: KeyframeGraph[LidarView]
+    search: Search | None  # of a scan in the map, while the place is not known
 
     def __init__(self, settings: LidarSettings, eyes: LidarEyes) -> None:
         super().__init__(settings, _Contexts, between)
         self._eyes = eyes
+        self.search = None
 
     def add(
         self, stamp: int, T_odom: Matrix, covariance: Matrix, view: LidarView, segment: int, found_again: bool
@@ -79,6 +98,7 @@ class LidarGraph(PlaceGraph[LidarView]):
         `segment` is the number of the odometry's map; `found_again`: it found this map again after a loss.
         """
         added = self.grow(stamp, T_odom, covariance, segment, found_again, self._eyes, lambda: view)
+        self._continue(added)
         newest = self.newest
         if added.node and newest is not None:
             newest.covariance = self._lesser(newest.covariance, newest.covariance_odom)
@@ -100,38 +120,83 @@ class LidarGraph(PlaceGraph[LidarView]):
     def _recognised(
         self, number: int, candidates: Sequence[int], eyes: Eyes[LidarView], added: Added
     ) -> list[tuple[int, Sighting]]:
-        """Returns the loop to the view that looks most alike, if all that are believed say the same.
+        """Begins to look for a scan in views that look alike, unless another is looked for: see `_continue`."""
+        if self.search is None and candidates:
+            self.search = Search(number, list(candidates))
+        return []
 
-        A map is not found where another part of it explains the scan as well.
-        """
-        sights = self._sights(number, candidates, eyes, False, added)
-        poses = [self.nodes[k].T @ seen.T_known_seen for k, seen in sights]
+    def _continue(self, added: Added) -> None:
+        """Goes on with the search, by a bounded number of views: each look takes a good part of a second."""
+        for _ in range(LOOKS):
+            if self.search is not None:
+                self._advance(self.search, added)
+
+    def _advance(self, search: Search, added: Added) -> None:
+        """Looks at one more view, and ends the search where that decides it."""
+        if search.candidates:
+            seen = self._sights(search.number, [search.candidates.pop(0)], self._eyes, False, added)
+            search.sights += [(k, sight) for k, sight in seen if isinstance(sight, LidarSight)]
+        elif search.rivals and self._fits(search, search.rivals.pop(0)):
+            self._refuse(added)
+            return
+        if search.candidates or search.rivals:
+            return
+        if search.found:
+            self.search = None
+            self._take(search, added)
+            return
+        poses = [self.nodes[k].T @ seen.T_known_seen for k, seen in search.sights]
         if not all(alike(poses[0], T) for T in poses[1:]):
-            added.refused.append(AMBIGUOUS)
-            return []
-        loops = self._weighed(number, sights[:1])
-        if loops and not self.located and self._elsewhere(number, *sights[0], eyes):
-            added.refused.append(AMBIGUOUS)
-            return []
-        return loops
+            self._refuse(added)
+            return
+        search.found = bool(self._weighed(search.number, search.sights[:1]))
+        search.rivals = self._rivals(search) if search.found else []
+        if not search.rivals:
+            self.search = None
+            if search.found:
+                self._take(search, added)
 
-    def _elsewhere(self, number: int, known: int, best: Sighting, eyes: Eyes[LidarView]) -> bool:
-        """Returns whether a scan may have been taken elsewhere as well, by the views there that look most like it.
+    def _refuse(self, added: Added) -> None:
+        added.refused.append(AMBIGUOUS)
+        self.search = None
 
-        Those that look most alike of all may be at one of two places that are alike.
+    def _take(self, search: Search, added: Added) -> None:
+        """Closes the loop to the view that looks most alike: all that are believed say the same, and none elsewhere."""
+        loops = search.sights[:1]
+        added.loops += len(loops)
+        self.loops += len(loops)
+        added.found = self._close(search.number, loops)
+        newest = self.newest
+        assert newest is not None
+        self.T_map_odom = se3.orthonormalised(newest.T @ invert(newest.T_odom))
+
+    def _rivals(self, search: Search) -> list[int]:
+        """Returns views elsewhere, by which a scan may have been taken as well: those that look most like it.
+
+        Those that look most alike of all may be at one of two places that are alike. A look reaches beyond its view, so
+        of views beside each other one is enough.
         """
-        view, T = self.nodes[number].view, self.nodes[known].T @ best.T_known_seen
+        view, (known, best) = self.nodes[search.number].view, search.sights[0]
         assert view is not None
-        assert isinstance(best, LidarSight)
-        least = best.registered.score - RIVAL
+        T = self.nodes[known].T @ best.T_known_seen
         likeness = self._index.likeness(view)
-        others = [k for k in self._old(number) if np.linalg.norm((self.nodes[k].T - T)[:3, 3]) > ASIDE]
-        chosen = sorted(others, key=lambda k: -likeness[k])[:RIVALS]
-        return any(  # each look takes most of a second: the first rival ends them
-            isinstance(seen := eyes.sight(self.nodes, k, number, False), LidarSight)
-            and seen.registered.score > least
-            and apart(T, self.nodes[k].T @ seen.T_known_seen)
-            for k in chosen
+        chosen = list[int]()
+        for k in sorted(self._old(search.number), key=lambda k: -likeness[k]):
+            place = self.nodes[k].T[:3, 3]
+            near = any(np.linalg.norm(place - self.nodes[other].T[:3, 3]) < BETWEEN for other in chosen)
+            if np.linalg.norm(place - T[:3, 3]) > ASIDE and not near:
+                chosen.append(k)
+        return chosen[:RIVALS]
+
+    def _fits(self, search: Search, k: int) -> bool:
+        """Returns whether a view elsewhere explains a scan as well as the place where it was found."""
+        known, best = search.sights[0]
+        seen = self._eyes.sight(self.nodes, k, search.number, False)
+        return (
+            isinstance(seen, LidarSight)
+            and isinstance(best, LidarSight)
+            and seen.registered.score > best.registered.score - RIVAL
+            and apart(self.nodes[known].T @ best.T_known_seen, self.nodes[k].T @ seen.T_known_seen)
         )
 
 

@@ -96,6 +96,7 @@ def test_a_frozen_sensor_repeats_its_last_measurement(
         assert message == right[3 if k in (4, 5, 6) else k].replace(stamp=message.stamp)
 
 
+@pytest.mark.long
 def test_a_fault_is_there_in_its_span_and_nowhere_else(
     healthy: dict[str, list[Any]], faulty: dict[str, list[Any]]
 ) -> None:

@@ -129,6 +129,7 @@ def test_a_sensor_measures_the_same_alone_and_beside_all_others(
         assert alone[port] == everything[port], port
 
 
+@pytest.mark.long
 def test_the_camera_and_its_truth_are_the_same_alone_and_beside_all_others(
     everything: dict[str, list[Message]],
 ) -> None:
@@ -228,6 +229,7 @@ def test_black_depth_frames_have_no_return_and_black_pairs_no_light() -> None:
     assert all(m.data.mean() < 5 for port in ("left", "right") for m in dark[port])  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_black_frames_come_with_their_probability() -> None:
     images = camera_only(duration="4s", color_camera={**SMALL, "black": 0.5})["image"]
     dark = [m.data.mean() < 5 for m in images]  # type: ignore[attr-defined]

@@ -31,6 +31,7 @@ def pair(folder: Path, variation: Variation | None = None) -> PairTask:
     return PairTask(boxes, masks, SIZE, width=0.25, variation=variation)
 
 
+@pytest.mark.long
 def test_rendered_worlds_are_data_for_both_networks(worlds: Path) -> None:
     boxes, masks = read_detection_data(worlds, 0), read_segmentation_data(worlds, 0)
     assert [len(part) for part in (boxes.training, boxes.validation)] == [4, 4]

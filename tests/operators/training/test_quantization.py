@@ -68,6 +68,7 @@ def test_the_answers_differ_little_and_keep_their_precision(trained: Path, world
             assert (before == after).mean() > 0.9
 
 
+@pytest.mark.long
 def test_the_same_images_give_the_same_bytes(trained: Path, worlds: Path, tmp_path: Path) -> None:
     for name in ("a.onnx", "b.onnx"):
         quantize_network(trained / "detector.onnx", views(worlds), tmp_path / name)

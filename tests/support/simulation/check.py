@@ -35,6 +35,7 @@ from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.processes import Call
 from simulation import reloading
 from simulation.bindings import bound
+from simulation.flights import check_reasons, check_spans
 from simulation.keeping import check_losses_of_files, files_of, joined, kept_by_flight
 from simulation.run import Machine, Outcome, simulate
 from simulation.scenario import PATIENCE, TICKING, TIMEOUT, Scenario
@@ -56,7 +57,12 @@ def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
     for old in folder.rglob("*.mcap"):
         old.unlink()
     with reloading.fresh_files():
-        return _check(scenario, folder, replay=replay)
+        try:
+            return _check(scenario, folder, replay=replay)
+        except Violation:
+            raise
+        except Exception as error:
+            raise Violation(f"{type(error).__name__}: {error}") from error
 
 
 def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
@@ -64,12 +70,13 @@ def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
     plan = _plan(scenario, graph, folder)
     outcome = simulate(plan, scenario.machine, scenario.happenings, limit=scenario.limit)
     report = outcome.report
-    if outcome.failure is not None and not scenario.may_fail:
+    refused = outcome.disk_full and "not ready within" in str(outcome.failure)  # a disk that was full at the beginning
+    if outcome.failure is not None and not (scenario.may_fail or refused):
         raise Violation(f"the run failed: {outcome.failure}\n{outcome.failure.details}")
     if scenario.only_paused:
         _check_pauses(outcome)
     if scenario.keeping.flight:
-        return Result(outcome, _check_flight(outcome))
+        return Result(outcome, _check_flight(outcome, graph, folder / "flight"))
     path = _joined(scenario, folder, outcome)
     verdict = _verify(path, outcome, scenario)
     if scenario.keeping.states and verdict == "identical" and not scenario.keeping.topics:
@@ -80,7 +87,7 @@ def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
         if not scenario.live:
             _check_window(path, graph, scenario, report)
     if report is not None and verdict == "identical" and scenario.keeping.topics:
-        _check_completion(path, folder / "complete.mcap", report)
+        _check_completion(path, folder / "complete.mcap", graph, report)
     replayed = replay and report is not None and verdict == "identical" and _may_replay(scenario, report)
     if replayed:
         assert report is not None
@@ -124,6 +131,8 @@ def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
     try:
         path = joined(files, folder / "joined.mcap")
     except RecordingError as error:
+        if outcome.failure is not None and "nothing is in any" in str(error):
+            return folder / "joined.mcap"
         raise Violation(f"its parts cannot be joined: {error}") from error
     if outcome.report is not None and "@recorder" not in outcome.killed:
         deleted = outcome.report.files["@recorder"]["deleted"]
@@ -132,15 +141,25 @@ def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
     return path
 
 
-def _check_flight(outcome: Outcome) -> str:
-    """What a flight recorder has kept re-executes as far as its states are known."""
-    if outcome.report is None:
-        return "no recording"
-    kept = kept_by_flight(outcome.report)
+def _check_flight(outcome: Outcome, graph: Graph, folder: Path) -> str:
+    """What a flight recorder has kept is what it was asked for, and re-executes as far as its states are known."""
+    if outcome.failure is not None:
+        files = sorted(folder.glob("*.mcap"))
+        for file in files:
+            _unchanged(file, lacks=True)
+        if not files and not (outcome.failure.interrupted or outcome.disk_full or "@recorder" in outcome.killed):
+            raise Violation(f"the run failed, and its end is not kept: {outcome.failure}")
+        return "kept" if files else "nothing kept"
+    assert outcome.report is not None
+    kept = kept_by_flight(outcome.report, full=outcome.disk_full)
     for one in kept:
         _unchanged(Path(one["path"]), lacks=not _holds_all(outcome))
     if outcome.report.restarts and not kept and _holds_all(outcome):
         raise Violation(f"nothing is kept, though {', '.join(outcome.report.restarts)} failed and was started again")
+    if _holds_all(outcome):
+        facts = outcome.report.files["@recorder"]
+        check_reasons(outcome.flown, facts)
+        check_spans(outcome.flown, graph, facts)
     return "kept" if kept else "nothing kept"
 
 
@@ -156,15 +175,17 @@ def _unchanged(path: Path, *, lacks: bool) -> None:
         raise Violation(f"{path.name} is verified as different:\n{_explained(report)}")
 
 
-def _check_completion(path: Path, out: Path, report: RunReport) -> None:
-    """A thin recording is completed to the streams of the run."""
+def _check_completion(path: Path, out: Path, graph: Graph, report: RunReport) -> None:
+    """A thin recording is completed to the streams of the run, but for those of sources that it leaves out."""
     with bound({("dataflow.verification.complete", "call_workers"): _call_here}):
         made = complete(path, out, overwrite=True)
     if not made.whole:
         raise Violation(f"a thin recording cannot be completed: {made}")
     with Recording(out) as recording:
         stored = {name: stream.count for name, stream in recording.streams.items()}
-    lacking = [stream for stream, (number, _) in report.streams.items() if stored.get(stream, 0) != number]
+    left_out = _sourced(graph) - set(graph.record.streams)
+    expected = {stream: number for stream, (number, _) in report.streams.items() if stream not in left_out}
+    lacking = [stream for stream, number in expected.items() if stored.get(stream, 0) != number]
     if lacking and not report.restarts:
         raise Violation(f"completed, a thin recording lacks messages of {', '.join(lacking)}")
 
@@ -205,7 +226,7 @@ def _verify(path: Path, outcome: Outcome, scenario: Scenario) -> str:
         raise Violation(f"verified as different:\n{_explained(report)}")
     if any(v.first is not None for v in report.operators) or report.changed:
         raise Violation(f"of a failed run, verified as different:\n{_explained(report)}")
-    if scenario.live and "@recorder" not in outcome.killed:
+    if scenario.live and "@recorder" not in outcome.killed and not outcome.disk_full:
         lost = [v for v in report.operators if v.lost_records or v.after_cut]
         if lost:
             raise Violation(f"records of a live run are lost:\n{_explained(report)}")
@@ -214,8 +235,11 @@ def _verify(path: Path, outcome: Outcome, scenario: Scenario) -> str:
 
 def _has_sources(graph: Graph) -> bool:
     """Whether a recording has all that cannot be made again."""
-    given = {s for s, made in graph.streams.items() if graph.nodes[made.node].source}
-    return given <= set(graph.record.streams)
+    return _sourced(graph) <= set(graph.record.streams)
+
+
+def _sourced(graph: Graph) -> set[str]:
+    return {stream for stream, made in graph.streams.items() if graph.nodes[made.node].source}
 
 
 def _missed_by_recorder(report: RunReport | None) -> int:
@@ -400,13 +424,17 @@ MOST_OF_A_STEP = 2
 
 
 def _may_replay(scenario: Scenario, report: RunReport) -> bool:
-    """Whether a replay is to give the same: not of a run that was stopped, of one whose clock went back, nor of one of
-    which parameters were set.
+    """Whether a replay is to give the same: not of a run that was stopped, of one whose clock went back, or of which
+    parameters were set, nor of a recording without a source's stream that an operator takes, if only an external one.
 
     Nor is one run whose timer would make up for a long silence: it makes more ticks than a simulated run has time for.
     """
     silent = any(happening.fields.get("span", 0) > PATIENCE for happening in scenario.happenings)
     if scenario.graph == TICKING and silent:
+        return False
+    graph = scenario.load()
+    taken = {stream for node in graph.nodes.values() for stream in node.taken}
+    if not taken & _sourced(graph) <= set(graph.record.streams):
         return False
     changed = any(happening.kind == "set" for happening in scenario.happenings)
     went_back = any(fault.kind == "jump" for fault in scenario.faults) or any("PAIR" in p for p in scenario.parts)

@@ -14,6 +14,7 @@ from dataflow.recording import Recording
 from dataflow.recording.parts import WHOLE, OnFailure, Splitting, Storage, parts_of
 from dataflow.recording.streams.copying import Origin
 from dataflow.supervision.core.report import RunReport
+from simulation.flights import RECORDED
 from simulation.world import Violation
 
 EVERYTHING = ""
@@ -21,9 +22,6 @@ ONE_FILE = Storage(on_failure="end")
 SOURCES = "topics: ['*/fast', '*/slow', '*/constant']"
 CHOICES = (SOURCES, "topics: []", "exclude: ['*/y']", "exclude: ['left/fast']", "exclude: ['**/y', '*/half']")
 STATES = ("", "", "snapshots: 60ms", "snapshots: cpu")
-FLIGHT = (
-    "keep: 200ms, after: 60ms, snapshots: 30ms, when: [raise, {drops: 5}, {stream: left/slow, field: model, equals: x}]"
-)
 MILLISECONDS = 1_000_000
 
 
@@ -40,7 +38,7 @@ class Keeping:
     @property
     def section(self) -> str:
         """The line of the graph's file."""
-        fields = [FLIGHT] if self.flight else [field for field in (self.topics, self.states) if field]
+        fields = [RECORDED] if self.flight else [field for field in (self.topics, self.states) if field]
         return f"record: {{{', '.join(fields)}}}\n" if fields else ""
 
     @property
@@ -89,7 +87,7 @@ def joined(files: list[Path], out: Path) -> Path:
     if len(files) == 1:
         return files[0]
     with ExitStack() as stack:
-        origins = [stack.enter_context(Origin(file)) for file in files]
+        origins = [stack.enter_context(Origin(file)) for file in files if file.stat().st_size]
         merge(origins, out, overwrite=True)
     return out
 
@@ -113,10 +111,10 @@ def check_losses_of_files(report: RunReport, path: Path) -> None:
             )
 
 
-def kept_by_flight(report: RunReport) -> list[dict[str, Any]]:
-    """What a flight recorder says that it has kept. Raises `Violation` where it could not."""
+def kept_by_flight(report: RunReport, *, full: bool) -> list[dict[str, Any]]:
+    """What a flight recorder says that it has kept. Raises `Violation` where it could not, and no disk was `full`."""
     kept: list[dict[str, Any]] = list(report.files["@recorder"]["kept"])
     for one in kept:
-        if "error" in one and not report.files["@recorder"].get("lost"):
+        if "error" in one and not full:
             raise Violation(f"the flight recorder could not keep what was asked for: {one['error']}")
     return [one for one in kept if "error" not in one]

@@ -11,13 +11,16 @@ from dataflow.execution.admission import AdmissionQueue, Patience
 from dataflow.execution.calls import Calls
 from dataflow.execution.feeds.window import Window
 from dataflow.execution.live import LiveRunner
+from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import OutputPorts
 from dataflow.execution.runner import OperatorRunner
 from dataflow.machines.pipe import _FRAME, Pipe
 from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import ChannelClosed, QueuedChannel
 from dataflow.process.streams.losses import LossTold
+from dataflow.sinks.flight_recorder import FlightSink, Wanted
 from dataflow.sinks.parts import PartsSink
+from dataflow.sinks.triggers import Triggers
 from dataflow.sync import FOREVER, NEVER
 
 
@@ -251,19 +254,46 @@ class NotRestored(Mutant):
     said = "a reload does not record the state that it keeps"
 
     def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
-        return {(LiveRunner, "reload"): _unrecorded(LiveRunner.reload)}
+        right = FiringLog.add
+
+        def add(self: FiringLog, kind: Any, *args: Any, **fields: Any) -> None:
+            if kind != "restore":
+                right(self, kind, *args, **fields)
+
+        return {(FiringLog, "add"): add}
 
 
-def _unrecorded(reload: Callable[[LiveRunner], Any]) -> Callable[[LiveRunner], Any]:
-    def without(self: LiveRunner) -> Any:
-        add = self.records.add
-        self.records.add = lambda kind, *args, **fields: None if kind == "restore" else add(kind, *args, **fields)  # type: ignore[method-assign]
-        try:
-            return reload(self)
-        finally:
-            self.records.add = add  # type: ignore[method-assign]
+class ToldTwice(Mutant):
+    """A trigger of a flight recorder asks again with each message while its condition holds."""
 
-    return without
+    said = "a trigger asks again while it holds"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        return {(Triggers, "_begins"): lambda self, trigger, name, holds: holds}
+
+
+class DeafToDrops(Mutant):
+    """A flight recorder is not triggered by what operators drop."""
+
+    said = "a trigger by drops does nothing"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        return {(Triggers, "diagnostics"): lambda self, message: ()}
+
+
+class ShortMemory(Mutant):
+    """A flight recorder keeps half of what was before a trigger."""
+
+    said = "a flight recorder keeps half of the time"
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        right = FlightSink._keep
+
+        def keep(self: FlightSink, wanted: Wanted, outcome: str = "") -> None:
+            wanted.start += self.flight.keep // 2
+            right(self, wanted, outcome)
+
+        return {(FlightSink, "_keep"): keep}
 
 
 MUTANTS: Mapping[str, Mutant] = {
@@ -280,5 +310,8 @@ MUTANTS: Mapping[str, Mutant] = {
     "part": NotIntroduced(),
     "state": StateBefore(),
     "reload": NotRestored(),
+    "again": ToldTwice(),
+    "drops": DeafToDrops(),
+    "half": ShortMemory(),
     "link": GapTaken(),
 }

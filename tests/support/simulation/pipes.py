@@ -237,7 +237,8 @@ def _frame(number: int, size: int) -> bytes:
 
 def _settled(pipes: list[Pipe], taken: tuple[list[bytes], list[bytes]], journey: Journey) -> bool:
     there = [len(taken[1 - k]) + pipes[k].dropped == len(journey.sent[k]) for k in range(2)]
-    return all(there) and not any(pipe._sent or pipe._waiting for pipe in pipes)
+    measured = all(pipe.clocks.best is not None for pipe in pipes)
+    return all(there) and measured and not any(pipe._sent or pipe._waiting for pipe in pipes)
 
 
 def _check(journey: Journey, pipes: list[Pipe], taken: tuple[list[bytes], list[bytes]]) -> None:

@@ -19,6 +19,7 @@ from dataflow.transport import make_ring
 from dataflow.transport.keys import local_key, runtime_key
 from simulation import bindings, machine, memory, network, operators
 from simulation.disk import Disk
+from simulation.flights import Flown, Witness
 from simulation.processes import SUPERVISOR, Nursery
 from simulation.reloading import Files, imported
 from simulation.sleep import watched
@@ -28,7 +29,7 @@ LIMIT = 200.0
 """Simulated seconds after which a run hangs: far above the sum of all timeouts, and of what work takes."""
 MEGABYTES = 50_000_000
 QUICKER = {
-    ("dataflow.execution.runner", "CPU_SPACING"): 20_000_000,
+    ("dataflow.records.spacing", "CPU_SPACING"): 20_000_000,
     ("dataflow.sinks.flight_recorder", "SHORTEST"): 20_000_000,
     ("dataflow.sinks.outage", "FIRST_PAUSE"): 0.1,
 }
@@ -36,6 +37,8 @@ QUICKER = {
 recorder's files (ns of event time), before a full disk is tried again (s)."""
 SPLIT_FLUSHES = {("dataflow.sinks.sink", "FLUSH_EVERY"): 0.05}
 """What is written decides when a file is full: here that has to be soon."""
+DIAGNOSED = {("dataflow.supervision.core.watchers.diagnostics", "DIAGNOSE_EVERY"): 0.1}
+"""How operators fare is told often enough (s) for a flight recorder that is triggered by it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +91,7 @@ class Outcome:
     killed: set[str] = field(default_factory=set)
     """Processes that died before their time, whoever killed them."""
     disk_full: bool = False
+    flown: Flown = field(default_factory=Flown)
 
 
 def simulate(
@@ -125,6 +129,8 @@ class Simulation:
             stack.enter_context(bindings.bound(self._bindings()))
             if self._plan.storage.splitting.size is not None:
                 stack.enter_context(bindings.bound(SPLIT_FLUSHES))
+            if self._plan.flight is not None:
+                stack.enter_context(bindings.bound(DIAGNOSED))
             stack.enter_context(watched(self.world))
             stack.enter_context(contextlib.redirect_stderr(_Words(self)))
             stack.enter_context(contextlib.redirect_stdout(_Words(self)))
@@ -215,6 +221,7 @@ class Simulation:
             ("dataflow.recording.parts", "os"): self.disk,
             ("dataflow.sinks.outage", "os"): self.disk,
             ("dataflow.graph.model", "import_operator"): imported,
+            ("dataflow.sinks.flight_recorder", "FlightSink"): functools.partial(Witness, self.outcome.flown),
             ("dataflow.sinks.flight_files", "queue"): machine.Queue(world),
             ("dataflow.sinks.flight_files", "threading"): threads,
             **QUICKER,

@@ -146,10 +146,11 @@ class Scenario:
 
     @property
     def limit(self) -> float:
-        """Simulated seconds after which the run hangs: ticks that came due during a freeze are all made up for."""
+        """Simulated seconds after which the run hangs: ticks that came due while processes stood still are all made up
+        for."""
         spans: float = sum(min(h.fields["span"], TIMEOUT) for h in self.happenings if h.kind == "freeze")
         pauses: float = sum(h.fields["span"] for h in self.happenings if h.kind == "pause")
-        return LIMIT + pauses + (spans / TICK * self.work if self.graph == TICKING else 0.0)
+        return LIMIT + pauses + ((spans + pauses) / TICK * self.work if self.graph == TICKING else 0.0)
 
     def describe(self) -> str:
         """Tells what is run, and what happens, one line each."""

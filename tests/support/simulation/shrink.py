@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from dataflow.graph import GraphError
 from simulation.check import check
 from simulation.drawn import without
 from simulation.keeping import PLAIN
@@ -33,7 +34,7 @@ def shrink(
     progress = True
     while progress and left > 0:
         progress = False
-        for smaller in _smaller(scenario):
+        for smaller in filter(_is_graph, _smaller(scenario)):
             for attempt in range(MACHINES):
                 if left <= 0:
                     break
@@ -47,6 +48,15 @@ def shrink(
             if progress:
                 break
     return scenario, said
+
+
+def _is_graph(scenario: Scenario) -> bool:
+    """Tells whether the streams that it records or leaves out are still there."""
+    try:
+        scenario.load()
+    except GraphError:
+        return False
+    return True
 
 
 def _on_machine(scenario: Scenario, attempt: int) -> Scenario:

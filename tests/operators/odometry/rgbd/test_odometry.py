@@ -29,7 +29,7 @@ from operators.odometry.rgbd.fitting import Fit, Fitter
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
-from operators.odometry.rgbd.surface import Surface
+from operators.odometry.rgbd.surface import Surface, scaled_intrinsics
 from operators.odometry.rgbd.tracker import RgbdOdometry, RgbdState
 from operators.odometry.rgbd.trial import Trial, with_trial
 from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
@@ -374,6 +374,52 @@ def test_old_map_is_found_again_after_a_gap() -> None:
     assert statuses[-1] is Status.LOST
     assert results[50].status is Status.RELOCALISED
     assert errors(results[50:], poses[45:])[0] < 0.03
+
+
+def after_a_second(
+    monkeypatch: pytest.MonkeyPatch, off: tuple[float, float, float], scale: int = 1
+) -> tuple[TrackResult, NDArray[np.float64]]:
+    """What comes of frame 22 a second after frame 20, where what is tracked across the gap errs by metres, and the
+    truth; images are `scale` times as large."""
+    frames, poses = sequence(60, 1.5)
+    larger = camera()
+    if scale > 1:
+        K = scaled_intrinsics(K_COLOR, scale)
+        larger = replace(larger, K_color=K)
+        frames = [(cv2.resize(g, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR), d) for g, d in frames]
+    odometry = RgbdOdometry(larger)
+    for i in range(20):
+        odometry.track(*frames[i], int(i * 1e9 / 30))
+    refine = odometry._refine
+
+    def erring(*given: Any) -> Fit:
+        return replace(refine(*given), T_world_camera=poses[22] @ se3.exp(np.array([*off, 0.0, 0.0, 0.0])))
+
+    monkeypatch.setattr(odometry, "_refine", erring)
+    return odometry.track(*frames[22], int(20e9 / 30) + 1_000_000_000), poses[22]
+
+
+def test_a_track_across_a_gap_gives_way_to_a_place_that_more_speaks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    result, truth = after_a_second(monkeypatch, (0.03, 0.0, 0.0))
+    assert result.status in MEASURED
+    assert np.linalg.norm((invert(truth) @ result.T_world_camera)[:3, 3]) < 0.02
+
+
+def test_a_track_across_a_gap_is_believed_whatever_the_size_of_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("operators.odometry.rgbd.tracker.recognised", lambda *_: iter(()))
+    result, truth = after_a_second(monkeypatch, (0.0, 0.0, 0.0), scale=2)
+    assert result.status in MEASURED
+    assert np.linalg.norm((invert(truth) @ result.T_world_camera)[:3, 3]) < 0.02
+
+
+def test_a_view_that_is_found_again_is_remembered_for_the_corners_of_the_next() -> None:
+    frames, _ = sequence(60, 1.5)
+    odometry = RgbdOdometry(camera())
+    for i in range(20):
+        odometry.track(*frames[i], int(i * 1e9 / 30))
+    result = odometry.track(*frames[12], int(20e9 / 30) + 2_000_000_000)
+    assert result.status is Status.RELOCALISED
+    assert result.keyframe
 
 
 def at_a_wrong_place(state: RgbdState, since: int, T_wrong: NDArray[np.float64]) -> RgbdState:

@@ -233,6 +233,7 @@ def test_the_stereo_pair_sees_from_its_own_mount() -> None:
     np.testing.assert_array_equal(step["left"].data, step["image"].data)
 
 
+@pytest.mark.long
 def test_a_moving_lidar_says_when_it_measured() -> None:
     (cloud,) = stream(robot(duration="200ms", lidar={"rate": 5, "columns": 60, "rings": 2, "motion": True}), "points")
     assert cloud.time_offsets.min() >= -0.2  # type: ignore[attr-defined]

@@ -177,7 +177,7 @@ def test_a_new_map_of_the_odometry_is_tied_to_the_old_one_when_two_scans_say_the
     mapped(poses, [invert(poses[0]) @ T for T in poses], slam)
     lost = slam.take(tracked(np.eye(4), None, np.eye(6), State.LOST), 40 * STEP)
     assert (lost.place, lost.T_map_odom) == (Place.ADRIFT, None)
-    there, wrong = elsewhere(8), at(9.0, -4.0, 1.0)
+    there, wrong = elsewhere(16), at(9.0, -4.0, 1.0)
     results = [
         slam.take(tracked(wrong @ invert(there[0]) @ T, seen(T.tobytes(), 50 + k), np.eye(6)), (41 + k) * STEP)
         for k, T in enumerate(there)
@@ -197,7 +197,7 @@ def test_a_new_map_of_the_odometry_is_tied_to_the_old_one_when_two_scans_say_the
 
 @pytest.mark.long
 def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
-    poses = elsewhere(10)
+    poses = elsewhere(16)
     played = run(clouds(poses, first=60), map_file=str(saved))
     assert "corrected: the map is found" in texts(played)
     assert len(played["pose"]) >= 5
@@ -206,7 +206,7 @@ def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
 
 @pytest.mark.long
 def test_a_saved_map_of_another_room_is_not_found(saved: Path) -> None:
-    played = run(clouds(elsewhere(5), "hall"), map_file=str(saved))
+    played = run(clouds(elsewhere(8), "hall"), map_file=str(saved))
     assert {text.split(":")[0] for text in texts(played)} == {"searching"}
     assert played["pose"] == []
     assert played["correction"] == []
@@ -215,7 +215,7 @@ def test_a_saved_map_of_another_room_is_not_found(saved: Path) -> None:
 @pytest.mark.long
 def test_a_room_that_looks_alike_in_four_headings_is_not_found(tmp_path: Path) -> None:
     run(clouds(on_round(ROUND), "square"), save=str(tmp_path / "square.npz"))
-    played = run(clouds(elsewhere(4), "square", first=60), map_file=str(tmp_path / "square.npz"))
+    played = run(clouds(elsewhere(8), "square", first=60), map_file=str(tmp_path / "square.npz"))
     assert played["pose"] == []
     assert any("ambiguous" in text for text in texts(played))
 
