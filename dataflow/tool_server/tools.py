@@ -207,7 +207,8 @@ def blame(
 ) -> Any:
     """Find what decided a value: the chain of calls back to the sensors' messages, each shown by re-execution.
 
-    `field`: STREAM.FIELD@SECONDS, such as "tracks.ids[3]@12.4"; `budget`: seconds to look for it.
+    `field`: STREAM.FIELD@SECONDS, such as "tracks.ids[3]@12.4"; `budget`: seconds to look for it. Where `whole` of the
+    answer is false, `sensed` may lack what decided: nothing that was tried shows it, or not all could be tried.
     """
     from dataflow.blame.chain import Blame
     from dataflow.blame.field import Field

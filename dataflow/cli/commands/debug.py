@@ -141,7 +141,10 @@ def capture(
     does not give what was recorded, that raises an error, or of which --predicate is true. Calls before it are kept as
     far as they are needed.
 
-    Exit code 0; 2: nothing is wrong, or it does not show apart from the recording.
+    The calls are made again some times, in new processes too: what does not repeat would be a test that passes by
+    chance, and is refused (verify --why finds the cause).
+
+    Exit code 0; 2: nothing is wrong, or it does not show apart from the recording, or does not repeat.
 
     Examples:
 
