@@ -14,6 +14,7 @@ pytest.importorskip("mcp", reason="needs the extra [mcp]")
 from mcp.client import Client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
+from dataflow.cli.commands.mcp import mcp
 from dataflow.tool_server.jobs import MOST_BYTES
 from dataflow.tool_server.tools import TOOLS
 
@@ -67,3 +68,8 @@ def test_tools_are_listed_and_answer_in_parts_whatever_operators_print(loud: tup
         assert "loud has calls 0 to 300, there is no 301" in text
 
     talk(talked)
+
+
+def test_the_help_of_the_command_names_all_tools() -> None:
+    words = (mcp.__doc__ or "").replace(",", " ").replace(";", " ").split()
+    assert {*TOOLS, "job"} - {*words} == set()
