@@ -53,6 +53,16 @@ def test_tools_are_listed_and_answer_in_parts_whatever_operators_print(loud: tup
         assert all(tool.description for tool in tools.values())
         assert tools["prove"].input_schema["required"] == ["recording", "operator", "call", "expect"]
         assert "say" not in tools["prove"].input_schema["properties"]
+        assert not any(tool.input_schema["additionalProperties"] for tool in tools.values())
+        text, wrong = await ask(client, "prove", **common, call=3, expect="True", may_changes="False")
+        assert (wrong, text) == (True, "prove takes no argument 'may_changes' (did you mean 'may_change'?)")
+        text, wrong = await ask(client, "what_if", **common, call=3, set={})
+        assert wrong
+        assert text.startswith("what_if takes no argument 'set' (it takes: recording, operator, call, params, show")
+        text, wrong = await ask(client, "goto", recording=recording, operator=["loud"], call=3)
+        assert (wrong, text) == (True, "goto: operator=['loud']: Input should be a valid string")
+        text, wrong = await ask(client, "goto", recording=recording, operator="loud")
+        assert (wrong, text) == (True, "goto: call is missing")
         text, wrong = await ask(client, "goto", **common, call="3")
         assert not wrong
         assert '"number": 3' in text
@@ -66,6 +76,9 @@ def test_tools_are_listed_and_answer_in_parts_whatever_operators_print(loud: tup
         text, wrong = await ask(client, "goto", **common, call="301")
         assert wrong
         assert "loud has calls 0 to 300, there is no 301" in text
+        text, wrong = await ask(client, "goto", **common, call=3)
+        assert not wrong
+        assert '"number": 3' in text
 
     talk(talked)
 
