@@ -106,7 +106,7 @@ class Debugger:
         self._reached = -1
         self.at: Fired | None = None
         self.unmade: Unmade | None = None
-        """What the last search (`until`, `first_difference`) has passed by; None where it made all calls on its way."""
+        """Calls that the last search (`until`, `first_difference`) has passed by; None where it made all on its way."""
         self.between: Callable[[], object] = lambda: None
         """Called behind each call that is made on the way to another; what it raises ends the way there."""
 

@@ -1,4 +1,4 @@
-"""What a fix of one operator may have changed of the others, judged by their verification.
+"""Judges, by their verification, the operators that a fix of another one must not have changed.
 
 A fix edits the operator's modules, which others may share, or its parameters. An operator whose code, parameters and
 files are the recorded ones is none that it has changed: where that does not repeat, it did not before the fix either.

@@ -52,7 +52,8 @@ class _Server(MCPServer):
         """Calls a tool. Raises `ToolError`, of wrong arguments with what would be right."""
         tool = _job if name == "job" else TOOLS.get(name)
         if tool is not None and (unknown := arguments.keys() - (taken := _taken(tool))):
-            told = (f"{each!r} ({did_you_mean(each, taken, 'it takes')})" for each in sorted(unknown))
+            others = [each for each in taken if each not in arguments]
+            told = (f"{each!r} ({did_you_mean(each, others, 'it also takes')})" for each in sorted(unknown))
             raise ToolError(f"{name} takes no argument {', '.join(told)}")
         try:
             return await super().call_tool(name, arguments, context)
@@ -72,7 +73,7 @@ def _taken(tool: Callable[..., Any]) -> list[str]:
     return [name for name in inspect.signature(tool).parameters if name != "say"]
 
 
-def _job(id: str, offset: int = 0, cancel: bool = False) -> Any:
+def _job(id: str | int, offset: int = 0, cancel: bool = False) -> Any:
     """Give the answer of a job from a byte on, or how far it is; `cancel` ends it."""
 
 
@@ -83,7 +84,7 @@ def _served(tool: Callable[..., Any], jobs: Jobs) -> Callable[..., Awaitable[str
     async def call(**arguments: Any) -> str:
         try:
             if tool is _job:
-                asked = functools.partial(jobs.job, arguments.pop("id"), **arguments)
+                asked = functools.partial(jobs.job, str(arguments.pop("id")), **arguments)
                 return await asyncio.to_thread(asked)
             return await asyncio.to_thread(jobs.call, tool.__name__, arguments)
         except Refused as error:

@@ -382,10 +382,14 @@ def _verdict(file: Path, operator: str, graph: Graph | None) -> str:
 
 
 def _by_verdict(report: VerifyReport, but: str = "") -> dict[str, list[str]]:
+    from dataflow.tool_server.proof import unmade
+
     found: dict[str, list[str]] = {}
     for v in report.operators:
         if v.operator != but:
-            found.setdefault(report.verdict(v), []).append(v.operator)
+            verdict = report.verdict(v)
+            words = "identical up to the cut" if verdict == "identical" and unmade(v) else verdict
+            found.setdefault(words, []).append(v.operator)
     return found
 
 

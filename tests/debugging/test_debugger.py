@@ -377,11 +377,9 @@ def test_a_capture_does_not_call_what_could_not_be_made_as_recorded(torn: Record
 
 def test_a_search_ends_at_its_last_call(added: Recording) -> None:
     debugger = Debugger(added, "adder")
-    seen = list[int]()
     for _ in range(2):  # the second time out of what is kept
-        assert debugger.until(lambda fired: bool(seen.append(fired.number)), first=4, last=9) is None
+        assert [fired.number for fired in all_made(debugger, 4, 9)] == [*range(4, 10)]
         assert debugger.unmade is None
-    assert seen == [*range(4, 10)] * 2
 
 
 def test_calls_on_the_way_that_cannot_be_made_are_counted(added: Recording, tmp_path: Path) -> None:
@@ -407,9 +405,14 @@ def test_calls_on_the_way_that_cannot_be_made_are_counted(added: Recording, tmp_
         assert "missing" in debugger.unmade.why
 
 
-def all_made(debugger: Debugger) -> list[Fired]:
+def all_made(debugger: Debugger, first: int = 0, last: int | None = None) -> list[Fired]:
     found = list[Fired]()
-    assert debugger.until(lambda fired: bool(found.append(fired)), first=0) is None
+
+    def visit(fired: Fired) -> bool:
+        found.append(fired)
+        return False
+
+    assert debugger.until(visit, first=first, last=last) is None
     return found
 
 

@@ -15,11 +15,13 @@ from tampering import Kept, as_it_is, tampered
 import dataflow
 from dataflow.graph import load_text
 from dataflow.recording import Recorded, Recording
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
 from dataflow.text import json_text
-from dataflow.tool_server.tools import ToolError, answer
+from dataflow.tool_server.tools import ToolError, _verified, answer
+from dataflow.verification.report import VerifyReport
 
 SKIPPED, DEGREES = 613, 640
 """The first calls of `sum` and `sine` that the bugs change."""
@@ -212,7 +214,20 @@ def test_calls_that_could_not_be_made_are_said_by_each_tool(torn: str) -> None:
     with pytest.raises(ToolError, match=r"sum, calls 650 to 660: 11 calls could not be made again"):
         ask("history", torn, operator="sum", field="same", first=650, last=660)
     told = ask("verify", torn, only=["sum"])
+    assert told["verdicts"] == {"unverifiable": ["sum"]}
     assert told["not_made"] == {"sum": "51 of 701 calls could not be made again (bugs/src/x #650 is not recorded)"}
+
+
+def test_what_follows_a_cut_is_not_called_identical() -> None:
+    whole = Verification("whole", firings=3, verified=3)
+    torn = Verification("torn", firings=5, verified=3, unverifiable=2, beyond=2, cut=True, missing="x #3")
+    report = VerifyReport((whole, torn), (), (), 0, 0, 0.0, 0.0)
+
+    told = _verified(report)
+
+    assert torn.verdict == "identical"
+    assert told["verdicts"] == {"identical": ["whole"], "identical up to the cut": ["torn"]}
+    assert told["not_made"] == {"torn": "2 of 5 calls could not be made again (x #3 is not recorded)"}
 
 
 def test_no_fix_is_proven_where_calls_could_not_be_made(torn: str, monkeypatch: pytest.MonkeyPatch) -> None:
