@@ -31,8 +31,8 @@ EQUAL = ("use", "params", "inputs", "env")
 
 @dataclass
 class Others:
-    """The operators besides the mended one. `reasons` are why the fix is not proven, by operator; `unrepeated` do not
-    repeat with the code that was recorded either, and why that is known."""
+    """The operators besides the mended one, and what that is given. `reasons`: why the fix is not proven, by operator;
+    `unrepeated`: those that do not repeat with the code that was recorded either, and why that is known."""
 
     reasons: dict[str, str] = field(default_factory=dict)
     unrepeated: dict[str, str] = field(default_factory=dict)
@@ -53,10 +53,13 @@ def judge(recording: Recording, report: VerifyReport, graph: Graph, mended: str)
     """Judges a verification of all operators with a fix, in the code or the graph, of the one that is `mended`."""
     recorded = graph_that_is_here(recording)[0]
     others = Others(dict.fromkeys(report.absent, "not re-executed"))
-    found = {v.operator: v for v in report.operators if v.operator != mended}
     downstream = list[str]()
-    for name, v in found.items():
-        if told := unmade(v):
+    for v in report.operators:
+        name = v.operator
+        if name == mended:
+            if v.tainted is not None and name not in _downstream(graph, {name}):
+                others.reasons[name] = "is given other messages than recorded, which are made again"
+        elif told := unmade(v):
             others.reasons[name] = told
         elif (verdict := report.verdict(v)) == "downstream":
             downstream.append(name)
