@@ -88,7 +88,7 @@ def debug(
       again                               make it once more, with the source as it was edited since
       step                                make it once more under pdb
 
-    Exit code 0; 1: a --do, or a line of standard input, could not be done; 2: it could not begin.
+    Exit code 0; 1: a --do, or a line of standard input, could not be done, or not of all calls; 2: it could not begin.
 
     Examples:
 
