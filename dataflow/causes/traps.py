@@ -203,7 +203,7 @@ class Traps:
 
     def _imports(self, frame: FrameType | None) -> bool:
         """Returns whether the innermost line of own code imports a module, or looks for packages: what is read then are
-        source, bytecode, and files of libraries. What own code reads while it is itself imported is not meant."""
+        source, bytecode, and files of libraries. Own code may read files while it is itself imported."""
         while frame is not None and self._places.of(frame.f_code) != "own":
             if frame.f_code.co_filename.startswith(("<frozen importlib", _IMPORTLIB)):
                 return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -195,7 +196,8 @@ class _Alone:
             incomplete = incomplete_streams(recording, played, books, told)
             held = recording.streams.keys() - incomplete
             chosen = with_makers(held, played, {name})
-        self.recorded = path.stat().st_mtime
+            last = max((record.wall_start for record in log.ordered(played.nodes[name])), default=0) * 1e-9
+        self.recorded = min(path.stat().st_mtime, last or math.inf)
         self._operators = tuple(each for each in played.nodes if each in chosen)
         self._env, self._threads = env_of(played, self._operators, held), played.threads
         at = 0 if found.first is None else found.first.index
@@ -234,7 +236,7 @@ class _Alone:
         return self.fire(Setting(lines=True))
 
     def is_newer(self, file: str, found: Verification) -> bool:
-        """Returns whether a file or folder was changed after the recording was written, or is not the recorded one."""
+        """Returns whether a file or folder was changed after the operator's last call, or is not the recorded one."""
         if file in found.files_changed:
             return True
         return os.path.exists(file) and os.stat(file).st_mtime > self.recorded

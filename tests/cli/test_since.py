@@ -31,18 +31,18 @@ def said(more: dict[str, Any], **of: Any) -> str:
 @pytest.mark.parametrize(
     ("of", "more", "sentence"),
     [
-        ({"code_known": True, "code_changed": ["rig"]}, {}, "changed since then: its code"),
+        ({"code_known": True, "code_changed": ["rig"]}, {}, "changed since the recording: its code"),
         (
             {"code_known": True},
             {"changes": {"x": ("parameter gain 1 → 2",)}},
-            "changed since then: parameter gain 1 → 2",
+            "changed since the recording: parameter gain 1 → 2",
         ),
         (
             {"code_known": True},
             {"facts": (("python", "3.11", "3.12"),)},
-            "changed since then: libraries or the machine",
+            "changed since the recording: libraries or the machine",
         ),
-        ({"files_changed": ["a.npy"]}, {}, "changed since then: a file that it read"),
+        ({"files_changed": ["a.npy"]}, {}, "changed since the recording: a file that it read"),
         ({"code_known": True}, {}, "its code, parameters, libraries and machine are as recorded"),
         ({}, {}, "its code, of which the recording has no digests"),
     ],

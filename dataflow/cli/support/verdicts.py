@@ -179,7 +179,7 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
             "(it may read the clock, draw numbers that are not self.rng's, or use threads; --why finds the cause)"
         )
     elif repeats and judged.verdict == "culprit":
-        yield f"{v.operator}: run a second time, it differed alike: it repeats here, and {_since(report, v)}"
+        yield f"{v.operator}: run a second time, it differed alike: {_since(report, v)}"
     if v.wrote:
         yield f"{v.operator}: it changed the memory of {v.wrote}; messages are immutable: copy before writing"
     elif judged.verdict == "culprit" and (mates := report.mates.get(v.operator)):
@@ -199,11 +199,11 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
 def _since(report: VerifyReport, v: Verification) -> str:
     """Returns what changed since an operator was recorded, as far as the recording holds it."""
     if not report.altered(v.operator):
-        return f"{as_recorded(code_known=v.code_known)} (--why looks for it)"
+        return f"it repeats here, and {as_recorded(code_known=v.code_known)} (--why looks for it)"
     found = list(report.changes.get(v.operator, ()))
     found += ["its code"] * bool(v.code_changed) + ["a file that it read"] * bool(v.files_changed)
     found += ["libraries or the machine"] * bool(report.facts or v.packages_changed)
-    return f"changed since then: {', '.join(found)}"
+    return f"changed since the recording: {', '.join(found)}"
 
 
 def _cut(report: VerifyReport) -> str:

@@ -83,7 +83,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
 
 
 def _differs(result: Verification, first: Sequence[Any] | None) -> bool:
-    """Returns whether an operator has differed, and not first as `first` tells."""
+    """Returns whether an operator has differed, and first otherwise than `first`."""
     found = result.first
     return found is not None and (first is None or tuple(first) != (found.incarnation, found.index, found.got))
 
