@@ -148,7 +148,7 @@ class VerifyReport:
         return self.repeated.get(operator)
 
     def altered(self, operator: str) -> tuple[str, ...]:
-        """Returns what the recording holds of an operator and its machine, and is not as it was then."""
+        """Returns the facts in the recording, of an operator and its machine, that are not as they were then."""
         v = next(v for v in self.operators if v.operator == operator)
         return (
             *self.changes.get(operator, ()),

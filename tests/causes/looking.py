@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 from glob import glob
 from pathlib import Path
+from typing import Any
 
 import helped
 
@@ -43,8 +44,8 @@ def read() -> dict[str, object]:
     }
 
 
-def _tried(function: object, path: Path) -> object:
+def _tried(function: Any, path: Path) -> Any:
     try:
-        return function(path)  # type: ignore[operator]
+        return function(path)
     except FileNotFoundError:
         return []

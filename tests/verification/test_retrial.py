@@ -115,7 +115,7 @@ def answer(differences: str, got: str = "b") -> dict[str, Any]:
     ("again", "repeats"), [(answer("1"), True), (answer("2"), False), (answer("1", got="c"), False)]
 )
 def test_an_operator_repeats_only_where_all_that_differs_is_the_same(again: dict[str, Any], repeats: bool) -> None:
-    asked = []
+    asked: list[Trial] = []
 
     def attempt(trials: Sequence[Trial]) -> list[dict[str, Any]]:
         asked.extend(trials)

@@ -13,7 +13,7 @@ from dataflow.causes.why import Why
 from dataflow.cli.support.output import count, plural, seconds, table
 
 OUTSIDE = "files that C libraries read, files that are gone, devices, services"
-"""What --why does not see."""
+"""Sources that --why does not see."""
 
 
 def as_recorded(*, code_known: bool) -> str:
