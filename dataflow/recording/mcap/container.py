@@ -79,7 +79,7 @@ class ContainerWriter:
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._declared: list[bytes] = []
-        """Schemas, channels and metadata that go to the disk with the next chunk, or when somebody flushes."""
+        """Schemas, channels and metadata that go to the disk with the next chunk, or at a flush."""
         self._lasting = 0, 0, 0
         """How many schemas, channels and metadata are in the file."""
         self._records: Gathered | None = None

@@ -74,7 +74,7 @@ def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
     outcome = simulate(plan, scenario.machine, scenario.happenings, limit=scenario.limit)
     report = outcome.report
     refused = outcome.disk_full and "not ready within" in str(outcome.failure)  # a disk that was full at the beginning
-    if outcome.failure is not None and not (scenario.may_fail or refused or _is_outrun(outcome)):
+    if outcome.failure is not None and not (scenario.may_fail or refused or is_outrun(outcome)):
         raise Violation(f"the run failed: {outcome.failure}\n{outcome.failure.details}")
     if scenario.only_paused:
         _check_pauses(outcome)
@@ -115,7 +115,7 @@ def _plan(scenario: Scenario, graph: Graph, folder: Path) -> RunPlan:
     )
 
 
-def _is_outrun(outcome: Outcome) -> bool:
+def is_outrun(outcome: Outcome) -> bool:
     """Tells whether a run that was stopped was given up because its disk was busy all the time: only the recorder owed
     anything, and it wrote without a rest."""
     said = str(outcome.failure)
