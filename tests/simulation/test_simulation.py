@@ -290,7 +290,7 @@ FOUND_BY = {
         graph="join",
         live=True,
         count=12,
-        machine=Machine(1, socket_room=2),
+        machine=Machine(2, socket_room=2),
         happenings=(
             Happening(0.01, "freeze", "right", {"span": 1e6}),
             Happening(0.1, "freeze", "smooth", {"span": 0.05}),
