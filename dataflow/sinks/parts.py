@@ -209,8 +209,11 @@ class PartsSink:
     def _open(self, start: int | None) -> Part:
         """Begins a file with what every part holds. Raises `RecordingError`."""
         path = self._free_name()
+        options = {**self._options, "mode": self._storage.mode}
+        if start is not None:
+            options["metadata"] = {**options["metadata"], CUT: Cut(self._path.name, start, None).metadata()}
         try:
-            sink = RecorderSink(path, self._graph, self._streams, {**self._options, "mode": self._storage.mode})
+            sink = RecorderSink(path, self._graph, self._streams, options)
         except RecordingError:
             if start is not None:
                 path.unlink(missing_ok=True)
@@ -219,8 +222,6 @@ class PartsSink:
         self._held.clear()
         part = Part(path, sink, start, Counter(self._statics.keys() if start is not None else ()))
         try:
-            if start is not None:
-                sink.writer.add_metadata(CUT, Cut(self._path.name, start, None).metadata())
             for stream, (message, seq, incarnation) in self._statics.items():
                 sink.message(stream, message, seq, incarnation)
             self._repeat_groups(part)
