@@ -160,8 +160,10 @@ def _aimed(debugger: Debugger, number: int | None, predicate: str) -> Fired:
     else:
         found = debugger.until(lambda fired: not fired.same or (fired.error is not None and not fired.injected))
     if found is None:
-        what = "all as recorded, without an error" if true is None else f"none for which {predicate}{_raised(true)}"
-        raise DebugError(f"{name} has {len(debugger.calls)} calls: {what}")
+        what = "as recorded, without an error" if true is None else f"none for which {predicate}{_raised(true)}"
+        if (unmade := debugger.unmade) is not None:
+            raise DebugError(f"{name}: {len(debugger.calls) - unmade.count} calls {what}; {unmade}")
+        raise DebugError(f"{name} has {len(debugger.calls)} calls: {'all ' * (true is None)}{what}")
     return found
 
 

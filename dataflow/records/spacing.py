@@ -1,4 +1,4 @@
-"""How far apart the recorded states of an operator are."""
+"""The distance between the recorded states of an operator, by event time or by what repeating its calls takes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ REPEATING = 2_000_000
 LARGE = 1 << 16
 """Bytes: smaller states are recorded more often, as many bytes of them."""
 MOST_OFTEN = 16
-"""How many small states are recorded in place of a large one at most."""
+"""Small states that are recorded in place of a large one, at most."""
 
 
 class StateSpacing:

@@ -49,6 +49,7 @@ class Part:
     ready: float = 0.0
     messages: int = 0
     bytes: int = 0
+    abandoned: bool = False
 
 
 class PartsSink:
@@ -208,8 +209,11 @@ class PartsSink:
     def _open(self, start: int | None) -> Part:
         """Begins a file with what every part holds. Raises `RecordingError`."""
         path = self._free_name()
+        options = {**self._options, "mode": self._storage.mode}
+        if start is not None:
+            options["metadata"] = {**options["metadata"], CUT: Cut(self._path.name, start, None).metadata()}
         try:
-            sink = RecorderSink(path, self._graph, self._streams, {**self._options, "mode": self._storage.mode})
+            sink = RecorderSink(path, self._graph, self._streams, options)
         except RecordingError:
             if start is not None:
                 path.unlink(missing_ok=True)
@@ -218,8 +222,6 @@ class PartsSink:
         self._held.clear()
         part = Part(path, sink, start, Counter(self._statics.keys() if start is not None else ()))
         try:
-            if start is not None:
-                sink.writer.add_metadata(CUT, Cut(self._path.name, start, None).metadata())
             for stream, (message, seq, incarnation) in self._statics.items():
                 sink.message(stream, message, seq, incarnation)
             self._repeat_groups(part)
@@ -297,7 +299,10 @@ class PartsSink:
             self._count(part)
 
     def _abandon(self, part: Part) -> None:
-        """Closes a file whose disk refuses."""
+        """Closes a file whose disk refuses, once: more than one thing may be refused before that is noticed."""
+        if part.abandoned:
+            return
+        part.abandoned = True
         with suppress(RecordingError):  # the refusal once more; the file is closed
             part.sink.writer.close()
         self.lost.firings += part.sink.unsaved_calls

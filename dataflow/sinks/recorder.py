@@ -54,6 +54,7 @@ class RecorderSink:
                 types = graph.message_types(stream)
                 if len(types) == 1 and types[0] is not Message:
                     self._add(stream, types[0])
+            self.writer.flush()  # a disk that refuses is noticed at the beginning
         except BaseException:
             self.writer.close()
             raise

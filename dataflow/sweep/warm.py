@@ -25,7 +25,7 @@ LEAVE_WITHIN = 10.0
 """Seconds that a warm process gets to end, with what it has forked."""
 KILLED = -int(signal.SIGKILL)
 STANDARD_ERROR = 2
-"""Where modules print that are imported for all runs: standard output is for results."""
+"""Takes the prints of modules that are imported for all runs: standard output is for results."""
 
 
 class Worker:

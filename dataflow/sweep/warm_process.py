@@ -49,7 +49,7 @@ COMMANDS = {
         "dataflow.verification.workers.job",
     ),
 }
-"""What each command imports."""
+"""The modules that each command imports."""
 
 
 def command(words: Sequence[str]) -> int:

@@ -102,6 +102,25 @@ def test_one_setting_gives_every_operator_the_label_space(name: str) -> None:
     assert set(spaces.values()) == {"own.yaml"}
 
 
+@pytest.mark.parametrize("name", ["perception", "perception_rgbd"])
+def test_rooms_reach_the_scene_graph_where_they_are_asked_for(name: str) -> None:
+    file = REPOSITORY / "graphs" / f"{name}.yaml"
+    nodes, plain = load_graph(file, settings=["rooms=true"]).nodes, load_graph(file).nodes
+    assert nodes["perception/scene"].inputs["rooms"] == ("robot1/perception/rooms/rooms",)
+    assert nodes["perception/floor"].params["lower"] > 1.0  # above desks
+    assert not {"perception/floor", "perception/rooms"} & plain.keys()
+
+
+@pytest.mark.parametrize("name", ["perception", "perception_rgbd"])
+def test_with_slam_the_map_gets_its_pose_and_its_keyframes(name: str) -> None:
+    nodes = load_graph(REPOSITORY / "graphs" / f"{name}.yaml", settings=["slam=true"]).nodes
+    assert nodes["perception/objects"].inputs["keyframes"] == ("robot1/perception/placed/keyframes",)
+    for each in ("objects", "lifter", "planes"):
+        assert nodes[f"perception/{each}"].inputs["pose"] == ("robot1/perception/placed/odometry",)
+    assert nodes["perception/scene"].inputs["robot"] == ("robot1/perception/placed/odometry",)
+    assert nodes["perception/placed"].inputs["path"] == ("robot1/perception/slam/path",)
+
+
 def test_postures_reach_the_activities_wherever_there_is_depth() -> None:
     nodes = load_graph(REPOSITORY / "graphs" / "perception.yaml").nodes
     assert nodes["perception/postures"].inputs["clusters"] == ("robot1/perception/lifter/clusters",)

@@ -37,6 +37,7 @@ from dataflow.messages import (
     Planes,
     PointCloud,
     Pose,
+    Rooms,
     SceneGraph,
     SegmentationMap,
     Tracks,
@@ -97,6 +98,10 @@ segments = SegmentationMap(stamp=0, frame="cam", class_names=("a", "b"), classes
 camera = CameraInfo.from_intrinsics(stamp=0, frame="cam", width=640, height=480, fx=500, fy=500, cx=320, cy=240)
 sightings = LandmarkSightings(stamp=0, frame="base", ids=[-1, 5], ranges=[1, 2], bearings=[0, 0.1])
 grid = OccupancyGrid(stamp=0, frame="map", resolution=0.05, cells=np.zeros((2, 3), np.int8), position=[0, 0, 0])
+rooms = Rooms(
+    stamp=0, frame="map", resolution=0.05, cells=np.zeros((2, 3), np.int32), position=[0, 0, 0], ids=[1], areas=[0.1],
+    centers=[[0, 0, 0]], doors=np.zeros((0, 2), np.int32), door_positions=np.zeros((0, 3)), door_widths=[],
+)  # fmt: skip
 planes = Planes(stamp=0, frame="map", coefficients=[[0, 0, 1, -0.7]])
 fix = NavSatFix(stamp=0, frame="gps", latitude=48.1, longitude=11.6, altitude=520.0)
 tf = Transforms(
@@ -201,6 +206,8 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (grid, {"resolution": 0.0}, r"OccupancyGrid\.resolution must be above zero, got 0\.0"),
     (grid, {"resolution": NAN}, r"OccupancyGrid\.resolution must be above zero, got nan"),
     (grid, {"orientation": [1, 1, 0, 0]}, r"OccupancyGrid\.orientation must be a unit quaternion.*\[1\.0, 1\.0, 0"),
+    (rooms, {"cells": np.full((2, 3), 1, np.int32)}, r"Rooms\.cells\[0, 0\] must be -1 or index the 1 rooms of ids"),
+    (rooms, {"areas": [-1.0]}, r"Rooms\.areas\[0\] must lie in"),
     (planes, {"coefficients": [[0, 0, 2, 1]]}, r"Planes\.coefficients\[0\] must have unit length, got \[0\.0, 0\.0, 2"),
     (planes, {"labels": [0, 1]}, r"Planes\.labels\[1\] must be -1 or index the 1 planes"),
     (planes, {"extents": [[1, 1]]}, r"Planes\.extents is given without centers, orientations"),

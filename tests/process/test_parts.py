@@ -131,6 +131,26 @@ def test_parts_are_verified_each_and_join_into_the_whole(
         assert set(verdicts(part).values()) <= {"identical", "unverifiable"}, part
 
 
+def test_a_part_begins_with_one_write_behind_its_header(
+    graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a disk that takes a tenth of a second for each, a recorder in parts is then not held up for seconds."""
+    real, writes = os.write, list[int]()
+
+    def write(fd: int, data: Any) -> int:
+        writes.append(len(data))
+        return real(fd, data)
+
+    monkeypatch.setattr(os, "write", write)
+    options = {"metadata": {"graph": {"text": GRAPH}}, "compression": "zstd", "overwrite": False, "storage": GO_ON}
+
+    sink = PartsSink(tmp_path / "run.mcap", graph, list(graph.record.streams), options)
+
+    assert len(writes) == 2
+    assert sink.size == sum(writes)
+    sink.close("complete")
+
+
 def test_the_newest_part_stays_however_large_it_is(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     facts = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(every=6 * SECOND), keep=1000)).all()
 
@@ -202,6 +222,30 @@ def test_a_full_disk_is_outlived_and_what_is_lost_is_counted(
     assert before - after == facts["lost"]["firings"] > 100
     for path in (first, second, whole):
         assert "culprit" not in verdicts(path).values()
+
+
+def test_what_a_part_holds_is_counted_once_however_often_it_refuses(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
+) -> None:
+    """As records of one operator after the other that are to stand in front of it."""
+    given = Given(recorded, graph, tmp_path / "run.mcap", GO_ON)
+
+    def at(seconds: float) -> None:
+        part, disk.full = given.sink._current, 3 <= seconds < 6
+        if disk.full and part is not None:
+            with pytest.raises(RecordingError) as refused:
+                part.sink.flush()
+            for _ in range(2):
+                given.sink._failed(part, refused.value)
+
+    facts = given.all(at)
+
+    assert facts["parts"] == [str(tmp_path / name) for name in ("run.mcap", "run_001.mcap")]
+    whole = joined([Path(part) for part in facts["parts"]], tmp_path / "whole.mcap")
+    with Recording(recorded) as was, Recording(whole) as again:
+        stored = {name: info.count for name, info in again.streams.items()}
+        lost = facts["lost"]["streams"]
+        assert {n: stored[n] + lost.get(n, 0) for n in stored} == {n: was.streams[n].count for n in stored}
 
 
 def test_a_static_message_of_which_only_a_copy_is_stored_is_not_lost(

@@ -156,6 +156,61 @@ def test_the_end_of_a_file_is_one_write(
         assert len(list(recording.messages())) == 40
 
 
+def test_what_a_file_declares_goes_to_the_disk_with_its_first_messages_in_one_write(
+    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a write for each schema, channel and metadata, a part of a recording began with forty."""
+    real, writes = os.write, list[int]()
+
+    def write(fd: int, data: Any) -> int:
+        writes.append(len(data))
+        return real(fd, data)
+
+    monkeypatch.setattr(os, "write", write)
+    writer = RecordingWriter(tmp_path / "many.mcap", metadata={"graph": {"text": "graph: g"}})
+    for k in range(12):
+        writer.add_stream(f"a{k}", Pose)
+        writer.write(f"a{k}", pose(1), seq=0)
+        writer.write_firings(f"operator{k}", 1, b"record")
+    writer.flush()
+
+    assert len(writes) == 2  # the header, and everything else
+    with Recording(tmp_path / "many.mcap") as recording:
+        assert recording.metadata["graph"] == {"text": "graph: g"}
+        assert len(list(recording.messages())) == 12
+    writer.close()
+
+
+def test_what_a_refused_write_would_have_declared_is_not_in_the_index(
+    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.write
+
+    def refuse(fd: int, data: Any) -> int:
+        monkeypatch.setattr(os, "write", real)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "full.mcap"
+    writer = RecordingWriter(path, metadata={"graph": {"text": "graph: g"}})
+    writer.add_stream("kept", Pose)
+    writer.write("kept", pose(1), seq=0)
+    writer.flush()
+    writer.add_stream("lost", Pose)
+    writer.add_metadata("later", {"a": "b"})
+    writer.write("lost", pose(1), seq=0)
+    monkeypatch.setattr(os, "write", refuse)
+    with pytest.raises(RecordingError, match="No space left"):
+        writer.flush()
+    with pytest.raises(RecordingError, match="No space left"):
+        writer.close()
+
+    with Recording(path) as recording:
+        assert not recording.torn
+        assert list(recording.streams) == ["kept"]
+        assert "later" not in recording.metadata
+        assert recording.metadata["graph"] == {"text": "graph: g"}
+
+
 def test_a_file_size_limit_of_the_system_leaves_a_finished_file(tmp_path: Path, noise: Callable[..., Any]) -> None:
     """A real refusal by the kernel; cutting the torn chunk off makes room for the index."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

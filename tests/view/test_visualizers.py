@@ -32,6 +32,7 @@ from dataflow.messages import (
     Odometry,
     PointCloud,
     RelativeDepth,
+    Rooms,
     SegmentationMap,
     Switch,
     Text,
@@ -380,6 +381,20 @@ def test_a_grid_lies_with_its_first_row_at_the_origin(tmp_path: Path) -> None:
     (data,) = at(found, "/m/g/space", "GridMap:data")
     assert data.values[0] == [255, 50, 0, 100]  # an image has its first row at the top
     assert at(found, "/m/g/space", "GridMap:translation")[0].values == [[1, 2, 0]]
+
+
+def test_rooms_are_floors_with_their_areas_and_doors_with_their_widths(tmp_path: Path) -> None:
+    cells = np.array([[0, 0, -1, 1], [-1, 0, -1, 1]], np.int32)
+    rooms = Rooms(
+        stamp=STAMP, frame="map", resolution=0.5, cells=cells, position=[1, 2, 0], ids=[1, 7], areas=[0.75, 0.5],
+        centers=[[1.5, 2.5, 0], [2.75, 2.5, 0]], doors=[[0, 1]], door_positions=[[2.25, 2.5, 0]], door_widths=[0.8],
+    )  # fmt: skip
+    found = draw(tmp_path, ("m/r", rooms))
+    corners = np.array(at(found, "/m/r/space", "Mesh3D:vertex_positions")[0].values).reshape(-1, 4, 3)
+    spans = [(*part.min(axis=0)[:2].tolist(), *part.max(axis=0)[:2].tolist()) for part in corners]
+    assert spans == [(1, 2, 2, 2.5), (2.5, 2, 3, 2.5), (1.5, 2.5, 2, 3), (2.5, 2.5, 3, 3)]
+    labels = at(found, "/m/r/space/places", "Points3D:labels")[0].values
+    assert labels == ["room 1: 0.8 m²", "room 7: 0.5 m²", "door 0.80 m"]
 
 
 def test_curves_carry_names_and_values(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,8 +15,8 @@ from dataflow.cli.support.arguments import (
     Json,
     ModuleFolders,
     OtherGraph,
+    OtherSettings,
     RecordingFile,
-    Settings,
     existing_recording,
     number,
     span,
@@ -59,7 +58,7 @@ def blame(
         ),
     ] = 1e-4,
     graph: OtherGraph = None,
-    settings: Settings = None,
+    settings: OtherSettings = None,
     path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
@@ -101,7 +100,7 @@ def drops(
     ],
     budget: Budget = 60.0,
     graph: OtherGraph = None,
-    settings: Settings = None,
+    settings: OtherSettings = None,
     path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
@@ -135,7 +134,7 @@ def drops(
                 raise fail(f"--worse {worse}: no Python expression: {error.msg}") from None
             begin, _ = span(opened, opened.streams) or (0, 0)
     if json:
-        print_json(asdict(cost))
+        print_json(cost.as_json())
     else:
         _print_cost(cost, worse, begin)
     if not cost.minimal:

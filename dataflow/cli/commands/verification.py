@@ -16,7 +16,7 @@ from dataflow.cli.support.arguments import (
     Json,
     ModuleFolders,
     OtherGraph,
-    Settings,
+    OtherSettings,
     check_offset,
     existing,
     find_modules_in,
@@ -78,7 +78,7 @@ def verify(
         list[Path], typer.Argument(metavar="RECORDING", help="Recordings (.mcap), or folders of them.")
     ],
     graph: OtherGraph = None,
-    settings: Settings = None,
+    settings: OtherSettings = None,
     path: ModuleFolders = None,
     first: Annotated[
         str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
@@ -286,7 +286,10 @@ def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None) -> l
 
     if checked.report is None:
         return []
-    say(f"[dim]looking for causes in {escape(', '.join(only or checked.report.culprits) or 'nothing')}[/]")
+    if not (names := only or checked.report.culprits):
+        say("[dim]no causes to look for: there is no culprit[/]")
+        return []
+    say(f"[dim]looking for causes in {escape(', '.join(names))}[/]")
     return reasons(checked.path, checked.report, only or (), graph)
 
 

@@ -26,7 +26,7 @@ def begin_again(
 ) -> Graph | None:
     """Makes operators importable, and this process one like those of the run; returns the graph that `--graph` names.
 
-    `operator`: the one whose calls are made, which may run in a separate environment (`env:`).
+    `operator`: the one whose calls are made, in its environment where it has one (`env:`).
 
     Raises `GraphError`, `EnvError`, `ReplayError`, and ends the command where `--set` has no graph file to change.
     """

@@ -1,9 +1,9 @@
 """The MCAP container, writing side: records, compressed chunks and their indexes, safe against a kill and a full disk.
 
-Schemas and channels are written at once, outside chunks, and messages are gathered into chunks: those of streams in
-one, the run's records (firing records, events) in another, so that records can be read without the streams. Both go to
-the operating system, with their message indexes, in one step, the records first. The file is
-therefore readable at any moment, and holds everything added up to some moment.
+Schemas, channels and metadata lie outside chunks, and messages are gathered into chunks: those of streams in
+one, the run's records (firing records, events) in another, so that records can be read without the streams. All go to
+the operating system, with the message indexes, in one step: first what lies outside chunks, then the records. The file
+is therefore readable at any moment, and holds everything added up to some moment.
 Layout: https://mcap.dev/spec.
 """
 
@@ -78,6 +78,10 @@ class ContainerWriter:
         self._chunks = KeptIndexes()
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
+        self._declared: list[bytes] = []
+        """Schemas, channels and metadata that go to the disk with the next chunk, or at a flush."""
+        self._lasting = 0, 0, 0
+        """How many schemas, channels and metadata are in the file."""
         self._records: Gathered | None = None
         self._messages: Gathered | None = None
         self.first_time: int | None = None
@@ -115,7 +119,7 @@ class ContainerWriter:
             if (known.name, known.encoding, known.data) == (name, encoding, data):
                 return known.id
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
-        self._append(self._checked("schema", name, schema))
+        self._declare(self._checked("schema", name, schema))
         self._schemas.append(schema)
         return schema.id
 
@@ -130,15 +134,14 @@ class ContainerWriter:
             schema_id=schema_id,
             metadata=dict(metadata),
         )
-        self._append(self._checked("channel", topic, channel))
+        self._declare(self._checked("channel", topic, channel))
         self._channels.append(channel)
         self._counts[channel.id] = 0
         return channel.id
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
         record = self._checked("metadata", name, Metadata(name=name, metadata=dict(metadata)))
-        offset = self._position
-        self._append(record)
+        offset = self._declare(record)
         self._metadata.append(MetadataIndex(offset=offset, length=len(record), name=name))
 
     def add_attachment(self, attachment: Attachment) -> None:
@@ -147,7 +150,7 @@ class ContainerWriter:
         record = record_bytes(attachment.record())
         if len(record) > MAX_CHUNK_BYTES:
             self._refuse(f"attachment {attachment.name!r}", len(record), MAX_CHUNK_BYTES)
-        place = Place(self._position, len(record))
+        place = Place(self._position + self._declared_bytes, len(record))
         self._append(record)
         self._attachments.append(attachment.index(place))
 
@@ -217,12 +220,12 @@ class ContainerWriter:
         return now
 
     def finish_chunks(self) -> None:
-        """Compresses what was gathered so far and hands it to the operating system with its indexes."""
+        """Compresses what was gathered so far and hands it to the operating system, with all that was declared."""
         self._check_usable()
         gathered = self._gathered()
         parts: list[bytes] = []
         indexes: list[ChunkIndex] = []
-        position = self._position
+        position = self._position + self._declared_bytes
         for chunk in gathered:
             packed, index = self._packer.pack(chunk, position)
             parts += packed
@@ -272,8 +275,23 @@ class ContainerWriter:
         if self.closed:
             raise RecordingError(f"the recording {self.path} is closed")
 
+    @property
+    def _declared_bytes(self) -> int:
+        return sum(map(len, self._declared))
+
+    def _declare(self, record: bytes) -> int:
+        """Adds a record outside chunks, which waits for the next write; returns its offset in the file."""
+        self._check_usable()
+        if self._declared_bytes >= WRITE_BYTES:
+            self._append()
+        offset = self._position + self._declared_bytes
+        self._declared.append(record)
+        return offset
+
     def _append(self, *parts: Buffer) -> None:
-        self._write(parts)
+        self._write([*self._declared, *parts])
+        self._declared.clear()
+        self._lasting = len(self._schemas), len(self._channels), len(self._metadata)
 
     def _write(self, parts: Iterable[Buffer]) -> None:
         """Writes all `parts` or, when the disk refuses, leaves the file as it was."""
@@ -298,6 +316,9 @@ class ContainerWriter:
         except OSError as second:
             cut = f"its torn end could not be cut off ({second.strerror}), readers skip it"
         until = f", stamps up to {self.last_time}" if self._chunks.count else ""
+        self._declared.clear()
+        for declared, lasting in zip((self._schemas, self._channels, self._metadata), self._lasting, strict=True):
+            del declared[lasting:]
         self._failure = (
             f"writing {self.path} failed: {error.strerror or error}. Saved: {self._position} bytes on disk, "
             f"{self._chunks.count} chunks ({self._chunks.content_bytes} bytes of messages{until}); "

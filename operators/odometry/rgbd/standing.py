@@ -78,7 +78,8 @@ def _drawn(sighting: Sighting, fitter: Fitter) -> Array:
     """Returns the poses (M, 4, 4) of triples of features, drawn alike at every call."""
     n, poses = len(sighting.pixels), list[Matrix]()
     rng = np.random.default_rng(n)
-    for chosen in rng.random((SAMPLES, n)).argsort(axis=1)[:, :3] if n >= FEWEST else ():
+    for _ in range(SAMPLES if n >= FEWEST else 0):
+        chosen = rng.choice(n, 3, replace=False)
         points, pixels = sighting.points_world[chosen], sighting.pixels[chosen]
         if np.square(pixels - pixels[[1, 2, 0]]).sum(axis=1).min() < APART**2:
             continue

@@ -183,8 +183,7 @@ class SemanticMap(Operator):
                 f"{cloud.count} points do not belong together"
             )
         known = self._opened(boxes, pose)
-        self._correct(known, keyframes)
-        self.state.trajectory.add(cloud.stamp, pose.matrix())
+        self._go_on(known, pose, cloud.stamp, keyframes)
         sensor = pose.child_frame or cloud.frame
         T = pose.matrix() @ transform_between(extrinsics, cloud.frame, sensor)
         usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
@@ -214,10 +213,7 @@ class SemanticMap(Operator):
             "surfaces": len(planes),
             "points": len(points),
         }
-        self.state.counts["views"] += 1
-        self.state.counts["views without points"] += not len(points)
-        self.state.counts["objects"], self.state.counts["moved"] = len(objects), known.moved
-        self.state.counts["doubted"], self.state.counts["surfaces"] = counts["doubted"], len(planes)
+        self._count(counts)
         made = {
             "objects": self._boxes(cloud.stamp, objects, scores),
             "nodes": nodes_of(cloud.stamp, self.state.frame, self.state.classes, objects, scores, planes),
@@ -254,10 +250,20 @@ class SemanticMap(Operator):
             self.state.map.widen(len(self.state.classes), Kinds.of(self._labels, self.state.classes))
         return self.state.map
 
-    def _correct(self, known: ObjectMap, keyframes: Path | None) -> None:
-        """Moves the map with keyframes that it has not moved with yet."""
-        if keyframes is None or keyframes.stamp == self.state.corrected:
-            return
+    def _count(self, counts: Mapping[str, int]) -> None:
+        """Counts a view, and notes what the map has now."""
+        self.state.counts["views"] += 1
+        self.state.counts["views without points"] += not counts["points"]
+        for name in ("objects", "moved", "doubted", "surfaces"):
+            self.state.counts[name] = counts[name]
+
+    def _go_on(self, known: ObjectMap, pose: Pose | Odometry, stamp: int, keyframes: Path | None) -> None:
+        """Moves the map with keyframes that it has not moved with yet, then notes from where it is seen."""
+        if keyframes is not None and keyframes.stamp != self.state.corrected:
+            self._correct(known, keyframes)
+        self.state.trajectory.add(stamp, pose.matrix())
+
+    def _correct(self, known: ObjectMap, keyframes: Path) -> None:
         if keyframes.frame != self.state.frame:
             raise ValueError(f"the keyframes are in {keyframes.frame!r}, the map in {self.state.frame!r}")
         self.state.corrected = keyframes.stamp

@@ -23,6 +23,7 @@ class Disk:
         self._written = 0
         self._opened: dict[int, Callable[[], None]] = {}
         self.full = False
+        self._busy: list[tuple[float, float]] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(os, name)
@@ -41,7 +42,9 @@ class Disk:
         world = self._world
         world.effect()
         if self._slow:
+            begun = world.now
             world.wait(world.random.random() * self._slow)
+            self._busy.append((begun, world.now))
         count = len(data)
         if world.random.random() < 0.1:
             count = world.random.randint(1, count)
@@ -52,6 +55,10 @@ class Disk:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._written += count
         return os.write(descriptor, data[:count])
+
+    def busy(self, since: float) -> float:
+        """Seconds that writes took since then."""
+        return sum(max(0.0, until - max(begun, since)) for begun, until in self._busy)
 
     def grow(self, more: int) -> None:
         """Makes room, as by deleting what others have written."""

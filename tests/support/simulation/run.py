@@ -91,6 +91,8 @@ class Outcome:
     killed: set[str] = field(default_factory=set)
     """Processes that died before their time, whoever killed them."""
     disk_full: bool = False
+    disk_busy: float = 0.0
+    """Share of the time since the run was stopped in which a write to the disk was on its way."""
     flown: Flown = field(default_factory=Flown)
 
 
@@ -119,6 +121,7 @@ class Simulation:
         self.outcome = Outcome()
         self._plan, self._happenings, self._mode, self._limit = plan, happenings, mode, limit
         self._supervisor: Supervisor | None = None
+        self._stopped: float | None = None
         self._lives: dict[str, int] = {}
         self._served: dict[str, tuple[Process, Callable[[Any], object]]] = {}
 
@@ -143,6 +146,8 @@ class Simulation:
         world = self.world
         self.outcome.seconds, self.outcome.turns, self.outcome.calls = world.now, world.turns, world.calls
         self.outcome.disk_full = self.disk.full
+        if self._stopped is not None and world.now > self._stopped:
+            self.outcome.disk_busy = self.disk.busy(self._stopped) / (world.now - self._stopped)
         return self.outcome
 
     def _play(self) -> None:
@@ -255,6 +260,7 @@ class Simulation:
         match happening.kind:
             case "stop":
                 assert self._supervisor is not None
+                self._stopped = world.now if self._stopped is None else self._stopped
                 self._supervisor.stop()
             case "play":
                 assert self._supervisor is not None

@@ -287,3 +287,26 @@ def test_a_restored_state_goes_on_alike() -> None:
         sent, again = one.process(cloud), other.process(cloud)
         assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
     assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+
+
+@pytest.mark.long
+def test_a_state_that_is_restored_while_a_saved_map_is_searched_goes_on_alike(saved: Path) -> None:
+    given = clouds(elsewhere(12), first=60)
+    one, other = (LidarSlam(map_file=str(saved), **NEAR) for _ in range(2))  # type: ignore[arg-type]
+    one.setup()
+    other.setup()
+    seen_again = 0
+    for k, cloud in enumerate(given):
+        search = one.state.mapper.graph.search
+        if search is not None and search.sights:
+            recorded = pack_state(one.snapshot())
+            other.restore(unpack_state(recorded))
+            assert pack_state(other.snapshot()) == recorded
+            seen_again = k
+            break
+        one.process(cloud)
+    assert seen_again
+    for cloud in given[seen_again:]:
+        sent, again = one.process(cloud), other.process(cloud)
+        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
+    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
