@@ -76,7 +76,7 @@ def _judge_culprit(
     others: Others, recording: Recording, report: VerifyReport, recorded: Graph, graph: Graph, v: Verification
 ) -> None:
     """Judges an operator that differs although it was given what was recorded."""
-    how = "differs each time" if report.repeats(v.operator) is False else "differs"
+    how = {False: "differs each time", True: "differs alike each time", None: "differs"}[report.repeats(v.operator)]
     touched = _touched(recording, recorded, graph, v)
     if not touched and (how == "differs each time" or report.facts):
         machine = ", ".join(f"{fact} {then} -> {now}" for fact, then, now in report.facts[:3])
@@ -85,7 +85,9 @@ def _judge_culprit(
         return
     before = _differs_as_recorded(recording, recorded, v) if v.code_changed else None
     baseline = {None: "", True: "; with the recorded code too", False: "; not with the recorded code"}[before]
-    others.reasons[v.operator] = f"culprit: {how} ({'; '.join(touched) or 'nothing of it was changed'}){baseline}"
+    others.reasons[v.operator] = (
+        f"culprit: {how} ({'; '.join(touched) or 'nothing that the recording holds of it has changed'}){baseline}"
+    )
 
 
 def _touched(recording: Recording, recorded: Graph, graph: Graph, v: Verification) -> list[str]:
