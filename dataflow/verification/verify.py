@@ -210,12 +210,16 @@ def _prepare(
             span=(last - begin) * 1e-9,
             unfed=unfed,
             torn=recording.torn or RECOVERED in recording.metadata,
-            placed={
-                n: f"{at} {played.nodes[n].env or ''}" for n, at in processes_of(recording).items() if n in played.nodes
-            },
+            placed=_placed(recording, played),
             absent=absent,
             changes={} if graph is None else changes_of(recording, graph),
         )
+
+
+def _placed(recording: Recording, graph: Graph) -> dict[str, str]:
+    """Returns, by operator, the process in which it ran, with its environment."""
+    nodes = graph.nodes
+    return {n: f"{at} {nodes[n].env or ''}" for n, at in processes_of(recording).items() if n in nodes}
 
 
 def _graph_here(recording: Recording) -> tuple[Graph, dict[str, str]]:

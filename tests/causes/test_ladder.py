@@ -16,6 +16,7 @@ from dataflow.causes.sources import (
     COMPILED,
     ENTROPY,
     FILE,
+    FOLDER,
     HASHES,
     HEAP,
     LOCALE,
@@ -27,6 +28,7 @@ from dataflow.causes.sources import (
     UUID,
     VARIABLE,
     WALL,
+    WORKING,
     named,
 )
 from dataflow.causes.traps import Site
@@ -34,6 +36,7 @@ from dataflow.supervision.core.report import RunFailed
 
 UNSEEN = (HEAP, ADDRESSES, COMPILED)
 GAIN, TABLE = named(VARIABLE, "GAIN"), named(FILE, "table.csv")
+MODELS = named(FOLDER, "models")
 SITE = Site("own.py", 1, "process", "call")
 
 
@@ -124,7 +127,7 @@ def test_sources_that_cannot_be_fixed_here_are_not_tried() -> None:
     assert not {COMPILED, ADDRESSES} & {*found.cleared, *found.causes}
 
 
-@pytest.mark.parametrize("cause", [HASHES, HEAP, MODULE, WALL, LOCALE, GAIN, TABLE])
+@pytest.mark.parametrize("cause", [HASHES, HEAP, MODULE, WALL, LOCALE, GAIN, TABLE, MODELS, WORKING])
 def test_what_a_repeating_operator_depends_on_is_named(cause: str) -> None:
     found = climbed(Repeating({cause}, reads={WALL, GAIN}), repeats=True)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,7 +12,9 @@ import zoo.faulty
 from typer.testing import CliRunner
 
 from dataflow.api.runs import run
-from dataflow.causes.why import refusal, why
+from dataflow.causes.ladder import Findings
+from dataflow.causes.rerun import Rerun
+from dataflow.causes.why import _answer, refusal, why
 from dataflow.cli.main import app
 from dataflow.graph import load_text
 from dataflow.records.comparison import Difference, Verification
@@ -83,6 +86,18 @@ def test_what_repeats_or_cannot_be_run_again_is_refused(found: Verification, mor
     made = report(found, **more)
 
     assert refusal(made, "x", next((v for v in made.operators if v.operator == "x"), None)) == reason
+
+
+@pytest.mark.parametrize(("newer", "causes", "older"), [(True, 2, 0), (False, 1, 1)])
+def test_a_folder_is_a_cause_only_where_it_was_changed_since_the_recording(
+    newer: bool, causes: int, older: int
+) -> None:
+    findings = Findings(Rerun(("",)), repeats=True, causes=["folder:models", "environment variable:GAIN"])
+    alone: Any = SimpleNamespace(is_newer=lambda file, found: newer)
+
+    found = _answer("x", findings, alone, None, Verification("x"))
+
+    assert (len(found.causes), len(found.older)) == (causes, older)
 
 
 def test_an_operator_that_is_refused_is_not_run(tmp_path: Path) -> None:

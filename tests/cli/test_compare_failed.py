@@ -36,15 +36,18 @@ def test_a_recording_that_failed_is_named_with_side_reason_and_output(tmp_path: 
         {"side": "b", "recording": "a.mcap", "settings": {"gain": "2"}}
         | {"outcome": "failed", "error": "no end", "log": log}
     ]
-    assert list(_failed_lines(found)) == [f"failed: a.mcap by B: failed: no end (its output: {log})"]
+    assert list(_failed_lines(found)) == [f"failed: a.mcap by B: no end (its output: {log})"]
 
 
 def test_what_failed_alike_by_both_is_one_line_and_what_was_not_done_is_said(tmp_path: Path) -> None:
-    both = result("a0", "no MCAP file"), result("a1", "no MCAP file")
+    both = result("a0", "error: no MCAP file", "1"), result("a1", "error: no MCAP file", "2")
 
     found = _failed(plan(tmp_path, {"a": both, "b": (result("b0"), None)}))
 
-    assert list(_failed_lines(found)) == ["failed: a by A and by B: failed: no MCAP file", "failed: b by B: not done"]
+    assert list(_failed_lines(found)) == [
+        f"failed: a by A and B: no MCAP file (its output: {tmp_path / 'logs' / 'a0.txt'})",
+        "failed: b by B: not done",
+    ]
 
 
 def test_of_many_that_failed_the_first_are_printed(tmp_path: Path) -> None:

@@ -257,19 +257,17 @@ def _failed(plan: Sweep) -> list[dict[str, Any]]:
 
 
 def _failed_lines(failed: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Returns a line for each recording that failed alike, the first of many."""
-    sides: dict[tuple[str, ...], list[str]] = {}
+    """Returns a line for each recording, with the sides by which it failed alike; of many the first."""
+    alike: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for one in failed:
-        sides.setdefault((one["recording"], one["outcome"], one["error"], one["log"] or ""), []).append(one["side"])
-    lines = [
-        f"failed: {recording} by {' and by '.join(side.upper() for side in by)}: {outcome}"
-        + (f": {error}" if error else "")
-        + (f" (its output: {log})" if log else "")
-        for (recording, outcome, error, log), by in sides.items()
-    ]
-    yield from lines[:MOST_NAMED]
-    if len(lines) > MOST_NAMED:
-        yield f"failed: {count(len(lines) - MOST_NAMED)} more: --json has all"
+        alike.setdefault((one["recording"], one["outcome"], one["error"].removeprefix("error: ")), []).append(one)
+    for (recording, outcome, error), of in list(alike.items())[:MOST_NAMED]:
+        sides = " and ".join(one["side"].upper() for one in of)
+        why = ": ".join(filter(None, ("" if outcome == "failed" else outcome, error)))
+        log = next((f" (its output: {one['log']})" for one in of if one["log"]), "")
+        yield f"failed: {recording} by {sides}: {why}{log}"
+    if len(alike) > MOST_NAMED:
+        yield f"failed: {count(len(alike) - MOST_NAMED)} more: --json has all"
 
 
 def _print(shown: Sequence[Paired], different: Sequence[Difference]) -> None:

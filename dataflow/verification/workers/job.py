@@ -28,8 +28,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     difference, as `retrial.First`, or None: once each has differed, and not first so, the rest is left), `guard` (watch
     over messages in every call), `live_effects` (make them again).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
-    stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: `operator` and `work` of
-    those that are not repeated as a whole.
+    stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: those of each operator.
     """
     graph = Graph.from_json(request["graph"])
     with Recording(request["path"], watch=board.goes_on) as recording:
