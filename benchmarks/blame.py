@@ -19,8 +19,9 @@ sys.path.append(str(REPOSITORY / "tests" / "support"))
 
 import blamed_graphs  # noqa: E402
 
-from dataflow.blame.chain import Blame, Chain  # noqa: E402
+from dataflow.blame.chain import Blame  # noqa: E402
 from dataflow.blame.field import Field  # noqa: E402
+from dataflow.blame.links import Chain  # noqa: E402
 from dataflow.recording import Recording  # noqa: E402
 
 

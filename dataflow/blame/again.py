@@ -19,6 +19,8 @@ Slot = tuple[str, int]
 Other = Mapping[str, InputValue] | None
 """Inputs that a call is given instead; None: it is not made."""
 AS_IT_WAS: Any = object()
+RAISED: Any = object()
+"""A call that did not raise in the run raised."""
 
 
 class Effects:
@@ -35,12 +37,24 @@ class Effects:
         self._others: dict[Place, Message | None] = {}
         self._left: list[tuple[tuple[int, ...], Call]] = []
         self._queued: set[Call] = set()
+        self.raised = ""
         self._under_way: set[str] = set()
         """Operators that were begun: those with a state make all calls from there on."""
 
-    def through(self, others: Mapping[Call, Other], anew: Call | None, target: Call, port: str) -> Any:
-        """Returns the target's message; `AS_IT_WAS` where nothing reached it, or the calls raise (which shows
-        nothing)."""
+    def through(
+        self,
+        others: Mapping[Call, Other],
+        anew: Call | None,
+        target: Call,
+        port: str,
+        messages: Mapping[Place, Message] | None = None,
+    ) -> Any:
+        """Returns the target's message; `AS_IT_WAS` where nothing reached it, `RAISED` where a call raises, which shows
+        nothing (`raised`: in words). `messages`: those of sensors that are others for all calls that take them."""
+        for place, message in (messages or {}).items():
+            self._others[place] = message
+            for taker in self._takers.get(place, ()):
+                self._queue(taker)
         for call in (*others, *([anew] if anew is not None else ())):
             self._queue(call)
         while self._left:
@@ -59,7 +73,8 @@ class Effects:
                 made = {}  # as in the run
             if made is None:
                 line.leave()
-                return AS_IT_WAS
+                self.raised = f"{call.operator} #{call.number} raises {line.error}"
+                return RAISED
             if call == target:
                 return made.get(port)
             self._hand_on(call, line, made)

@@ -2,22 +2,27 @@
 
 Nothing is guessed: a call is made again from its state with an input nudged, taken from the message before, or left
 out; the messages that come out go through all later calls on the chain, to the value. An input that changes it is on
-the chain, and the call that made it is looked into next, the latest first.
+the chain, and the call that made it is looked into next, the latest first. Where several change it together alone, the
+sensors' messages behind all of them are tried.
 """
 
 from __future__ import annotations
 
 import heapq
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from typing import Any
 
-from dataflow.blame.again import AS_IT_WAS, Effects, Other, Place, Slot, place_of, with_messages
-from dataflow.blame.field import Field, differ
+from dataflow.blame.again import AS_IT_WAS, RAISED, Effects, Other, Place, Slot, place_of, with_messages
+from dataflow.blame.field import Field, differ, is_measured
 from dataflow.blame.line import Call, Line
+from dataflow.blame.links import Chain, Effect, Link, Way
 from dataflow.blame.nudge import nudged
+from dataflow.blame.others import ANOTHER, Others, Taken, without
+from dataflow.blame.split import split
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
@@ -26,117 +31,20 @@ from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
 from dataflow.sync import Entry, Firing, InputValue
 from dataflow.sync.entries import entries_of
 
-Way = Literal["nudged", "the one before", "left out", "another"]
 TOLERANCE = 1e-4
 """Of floating-point values: a hundredth of the size of a nudge."""
 SECONDS = 60.0
-ANOTHER = 8
-"""Other messages of a stream, from its whole length, that are put in place of one of which nothing else shows an
-effect: a number on the same side of a threshold, nudged, shows none."""
 MOST_BYTES = 2**31
 """Of the inputs of all calls that are held: beyond it no others are read."""
 HISTORY = 0.5
 """Of the time that is left, what the earlier calls of one operator may take."""
+FURTHER = 3
+"""Blocks of earlier calls that are tried behind the first new operator that gives the same value, where that is no
+floating-point number: the same truth value, or the same class, may come of another state."""
 
 
 class BlameError(ReplayError):
     """Raised for a value whose origin cannot be found; the message has the reason."""
-
-
-@dataclass(frozen=True, slots=True)
-class Effect:
-    """The value (None: none) that came when an input was another; `way`: how, and the fields nudged.
-
-    `together`: how many inputs, or calls, were others at once, none of which changes the value alone (a tie).
-    """
-
-    way: Way | Literal["call left out", "a new operator"]
-    fields: tuple[str, ...]
-    value: Any
-    together: int = 1
-
-
-@dataclass(frozen=True, slots=True)
-class Link:
-    """An input of a call, or with `input` "" the state before it, that decided the value.
-
-    - `call`: the one that took it; `stamp`: its, in ns.
-    - `message`: of an input. `maker`: the call that made the message, or that left its mark in the state; None where it
-      comes from a source, or from an operator that is not made again, and for a state that the operator was given
-      before `call` (a reload, a beginning in the middle).
-    - `effects`: the changes of it that changed the value.
-    """
-
-    call: Call
-    stamp: int
-    input: str
-    message: Place | None
-    message_stamp: int
-    maker: Call | None
-    effects: tuple[Effect, ...]
-
-
-@dataclass(slots=True)
-class Chain:
-    """The calls that decided a value, the latest first.
-
-    - `value`, of the message `place` that `target` made. `links`: why each is on the chain.
-    - `sensed`: the links at the chain's ends.
-    - `left`: calls on the chain that were not looked into, as the time or the memory for inputs (`MOST_BYTES`) was up.
-      `unsplit`: operator, first and last of calls of which some left their mark in the state, which were not found for
-      the same reason, or as the operator was given its state behind them.
-    - `ended`: by operator, the call before which a new operator gives the same value, so that none before was tried.
-    """
-
-    target: Call
-    place: Place
-    stamp: int
-    value: Any
-    links: list[Link] = field(default_factory=list)
-    left: list[Call] = field(default_factory=list)
-    unsplit: list[tuple[str, int, int]] = field(default_factory=list)
-    ended: dict[str, int] = field(default_factory=dict)
-    made: int = 0
-    seconds: float = 0.0
-
-    @property
-    def whole(self) -> bool:
-        """Returns whether all of it was looked into."""
-        return not self.left and not self.unsplit
-
-    @property
-    def sensed(self) -> list[Link]:
-        """Returns the links to messages that no call made."""
-        return [link for link in self.links if link.input and link.maker is None]
-
-    def as_json(self) -> dict[str, Any]:
-        """Returns it as JSON values; a value that is no number is as the message holds it."""
-        return {
-            "value": self.value,
-            "call": [*self.target],
-            "stamp": self.stamp,
-            "links": [
-                {
-                    "call": [*link.call],
-                    "stamp": link.stamp,
-                    "input": link.input or None,
-                    "message": None if link.message is None else [*link.message],
-                    "from": None if link.maker is None else [*link.maker],
-                    "effects": [
-                        {"way": e.way, "fields": e.fields, "value": e.value, "together": e.together}
-                        for e in link.effects
-                    ],
-                }
-                for link in self.links
-            ],
-            "sensed": [[*place] for place in dict.fromkeys(link.message for link in self.sensed) if place is not None],
-            "whole": self.whole,
-            "not_looked_into": [[*call] for call in self.left],
-            "not_taken_apart": [[*each] for each in self.unsplit],
-            "not_tried_before": dict(self.ended),
-            "calls_made": self.made,
-            "seconds": self.seconds,
-        }
 
 
 class _OutOfTime(Exception):
@@ -175,6 +83,10 @@ class Blame:
         self._seen: set[Call] = set()
         self._searched: dict[str, int] = {}
         """By operator, from which call on it is known which ones left a mark."""
+        self._joint: list[list[Taken]] = []
+        """Messages of which none changes the value alone, though all of them together do."""
+        self._messages = Others(recording, self._taken)
+        self._raised = ""
         self.made = 0
         self._open: list[tuple[tuple[int, int, int], Call]] = []
 
@@ -191,7 +103,9 @@ class Blame:
             finally:
                 for line in self._lines.values():
                     line.close()
-        chain.links.sort(key=lambda link: (-link.stamp, self._age(link.call)))
+        looked_into = sorted(self._seen - set(chain.left), key=self._age)
+        chain.loose += [call for call in looked_into if chain.is_loose(call) and call not in chain.loose]
+        chain.links.sort(key=lambda link: (*(-each for each in chain.weight(link)), -link.stamp, self._age(link.call)))
         chain.seconds = time.monotonic() - began
         return chain
 
@@ -229,7 +143,8 @@ class Blame:
         if value is None:
             raise BlameError(f"{stream} at {emission.stamp} ns has no {self._field.path.lstrip('.')}: {message!r}")
         self._value = value
-        return Chain(target, (stream, record.incarnation, emission.seq), emission.stamp, value)
+        late = until > max((i.last for i in self._recording.streams.values() if i.last is not None), default=until)
+        return Chain(target, (stream, record.incarnation, emission.seq), emission.stamp, value, late)
 
     def _stream(self, name: str) -> str:
         known = [s for s in self.graph.streams if s == name or s.endswith(f"/{name}")]
@@ -296,6 +211,11 @@ class Blame:
                 self._look_into(call)
             except _OutOfTime:
                 self._chain.left.append(call)
+        for joint in self._joint:
+            try:
+                self._look_behind(joint)
+            except _OutOfTime:
+                self._chain.left.append(joint[0].call)
         self._chain.made = self.made
 
     def _look_into(self, call: Call) -> None:
@@ -310,18 +230,44 @@ class Blame:
         without: list[list[Slot]] = []
         for name, given in shot.firing.inputs.items():
             slots = [(name, k) for k in range(len(entries_of(given)))]
-            found = list(self._deciding(call, shot.firing, slots))
+            with self._noting(call, call.number, name):
+                found = list(self._deciding(call, shot.firing, slots))
             self._link_all(call, shot.firing, found)
             if slots and not found:
                 without.append(slots)
         if len(without) > 1:
-            self._link_all(call, shot.firing, self._tied(call, shot.firing, without))
+            self._link_all(call, shot.firing, list(self._tied(call, shot.firing, without)))
         if not line.stateless:
             self._look_back(call)
 
-    def _link_all(self, call: Call, firing: Firing, found: Iterable[tuple[Slot, tuple[Effect, ...]]]) -> None:
+    @contextmanager
+    def _noting(self, call: Call, last: int, name: str) -> Iterator[None]:
+        """Notes an input, or with `name` "" the calls up to `last`, where a call raised with all that was tried."""
+        tried, raised = self._chain.tried.total(), self._chain.raised.total()
+        yield
+        tried, raised = self._chain.tried.total() - tried, self._chain.raised.total() - raised
+        if tried and raised == tried:
+            self._chain.was_raised(call, last, name, self._raised)
+
+    def _link_all(self, call: Call, firing: Firing, found: Sequence[tuple[Slot, tuple[Effect, ...]]]) -> None:
+        """Makes links; one for messages of a stream that follow each other, and decide only together."""
+        stamp = self._lines[call.operator].records[call.number].stamp
+        joint: dict[int, list[Taken]] = defaultdict(list)
+        links = self._chain.links
         for (name, k), effects in found:
-            self._link(call, name, entries_of(firing.inputs[name])[k], effects)
+            entry = entries_of(firing.inputs[name])[k]
+            maker, place = self._maker(entry), place_of(entry)
+            alone = any(effect.together == 1 for effect in effects)
+            before = links[-1] if links else None
+            if before is not None and not alone and _goes_on(before, Taken(call, name, entry), effects):
+                links[-1] = replace(before, last=place[2])
+            else:
+                links.append(Link(call, stamp, name, place, entry.stamp, maker, effects))
+            if not alone:
+                joint[id(effects)].append(Taken(call, name, entry))
+            elif maker is not None:
+                self._queue(maker)
+        self._joint += joint.values()
 
     def _tied(
         self, call: Call, firing: Firing, inputs: Sequence[Sequence[Slot]]
@@ -334,13 +280,6 @@ class Blame:
             if len(rest) > 1 and (fewer := self._together(call, firing, [slot for each in rest for slot in each])):
                 left, effects = rest, fewer
         yield from ((slot, effects) for slots in left for slot in slots)
-
-    def _link(self, call: Call, name: str, entry: Entry, effects: tuple[Effect, ...]) -> None:
-        maker = self._maker(entry)
-        stamp = self._lines[call.operator].records[call.number].stamp
-        self._chain.links.append(Link(call, stamp, name, place_of(entry), entry.stamp, maker, effects))
-        if maker is not None and any(effect.together == 1 for effect in effects):
-            self._queue(maker)
 
     def _maker(self, entry: Entry) -> Call | None:
         stream = self.graph.streams[entry.stream]
@@ -369,18 +308,25 @@ class Blame:
             yield from ((slot, effects) for slot in slots)
 
     def _together(self, call: Call, firing: Firing, slots: Sequence[Slot]) -> tuple[Effect, ...]:
-        tried = ((way, self._changed({call: other})) for way, other in self._others(call, firing, slots))
-        return tuple(Effect(way, (), found[0], len(slots)) for way, found in tried if found is not None)
+        return self._shown(((way, {call: other}) for way, other in self._others(call, firing, slots)), len(slots))
+
+    def _shown(self, tries: Iterator[tuple[Way, Mapping[Call, Other]]], together: int) -> tuple[Effect, ...]:
+        """The effects of what is tried, one for each way."""
+        effects: dict[Way, Effect] = {}
+        for way, others in tries:
+            if way in effects or (way == "made finite" and "nudged" in effects):
+                continue
+            if (found := self._changed(way, others)) is not None:
+                effects[way] = Effect(way, (), found[0], together)
+        return tuple(effects.values())
 
     def _effects(self, call: Call, firing: Firing, slot: Slot) -> Iterator[Effect]:
-        shown = False
-        for way, other in self._others(call, firing, [slot]):
-            if (found := self._changed({call: other})) is not None:
-                shown = True
-                yield Effect(way, self._fields(call, firing, slot) if way == "nudged" else (), found[0])
+        effects = self._together(call, firing, [slot])
+        for effect in effects:
+            yield replace(effect, fields=self._fields(call, firing, slot)) if effect.way == "nudged" else effect
         entry = entries_of(firing.inputs[slot[0]])[slot[1]]
-        for message in () if shown else self._elsewhere(call, slot[0], entry):
-            if (found := self._changed({call: with_messages(firing, {slot: message})})) is not None:
+        for message in () if effects else self._messages.elsewhere(call, slot[0], entry):
+            if (found := self._changed("another", {call: with_messages(firing, {slot: message})})) is not None:
                 yield Effect("another", (), found[0])
                 return
 
@@ -393,8 +339,9 @@ class Blame:
             return names
         found = []
         for each in names:
-            other, fields = nudged(entry.value, (each,))
-            if fields and self._changed({call: with_messages(firing, {slot: other})}) is not None:
+            others = [nudged(entry.value, (each,), sign=sign) for sign in (1, -1)]
+            tries = ({call: with_messages(firing, {slot: other})} for other, fields in others if fields)
+            if any(self._changed("nudged", other) is not None for other in tries):
                 found.append(each)
         return tuple(found)
 
@@ -402,94 +349,49 @@ class Blame:
         self, call: Call, firing: Firing, slots: Sequence[Slot]
     ) -> Iterator[tuple[Way, Mapping[str, InputValue]]]:
         """Yields the inputs with these messages nudged, taken from the message before, left out."""
-        entries = {slot: entries_of(firing.inputs[slot[0]])[slot[1]] for slot in slots}
-        yield "nudged", with_messages(firing, {slot: nudged(entry.value)[0] for slot, entry in entries.items()})
-        before = {slot: self._before(call, slot[0], entry) for slot, entry in entries.items()}
-        if any(message is not None for message in before.values()):
-            yield "the one before", with_messages(firing, {slot: m for slot, m in before.items() if m is not None})
-        lacking = self._without(call.operator, firing, slots)
+        taken = [Taken(call, name, entries_of(firing.inputs[name])[k]) for name, k in slots]
+        for way, messages in self._messages.instead(taken):
+            yield way, with_messages(firing, dict(zip(slots, messages, strict=True)))
+        lacking = without(self.graph.nodes[call.operator], firing, slots)
         if lacking is not None:
             yield "left out", lacking
-
-    def _before(self, call: Call, name: str, entry: Entry) -> Message | None:
-        """The content of the message before one on its stream, as if it had come at the same time; of a stream that is
-        not recorded, of one that a call before took."""
-        info = self._recording.streams.get(entry.stream)
-        if info is not None and info.static:
-            return None
-        if info is None:
-            earlier = [each for each in self._taken(call, name, entry.stream) if each.stamp < entry.stamp]
-            return max(earlier, key=lambda each: each.stamp).replace(stamp=entry.stamp) if earlier else None
-        index = self._recording.index(entry.stream, end=entry.stamp - 1)
-        return index.read(len(index) - 1).message.replace(stamp=entry.stamp) if len(index) else None
-
-    def _elsewhere(self, call: Call, name: str, entry: Entry) -> Iterator[Message]:
-        """The contents of other messages of a stream, spread over its length; of one that is not recorded, of those
-        that calls before took."""
-        info = self._recording.streams.get(entry.stream)
-        if info is None:
-            yield from (m.replace(stamp=entry.stamp) for m in self._taken(call, name, entry.stream)[-ANOTHER:])
-        elif not info.static:
-            index = self._recording.index(entry.stream)
-            for row in sorted({round(k * (len(index) - 1) / (ANOTHER - 1)) for k in range(ANOTHER)}):
-                yield index.read(row).message.replace(stamp=entry.stamp)
 
     def _taken(self, call: Call, name: str, stream: str) -> list[Message]:
         """What calls before took of a stream in an input."""
         first = max(0, call.number - ANOTHER)
-        self._reach(Call(call.operator, first), call.number)
+        self._reach(Call(call.operator, first), max(call.number, self._last.get(call.operator, -1)))
         shots = self._lines[call.operator].shots
         given = [shots[n].firing.inputs.get(name) for n in range(first, call.number) if n in shots]
         return [entry.value for each in given for entry in entries_of(each) if entry.stream == stream]
-
-    def _without(self, operator: str, firing: Firing, slots: Sequence[Slot]) -> Mapping[str, InputValue] | None:
-        """The inputs without these messages, where a firing may lack them."""
-        spec = self.graph.nodes[operator].operator.spec
-        inputs = dict(firing.inputs)
-        for name in {name for name, _ in slots}:
-            port, given = spec.inputs[name], inputs[name]
-            out = {k for each, k in slots if each == name}
-            if isinstance(given, tuple):
-                inputs[name] = tuple(entry for k, entry in enumerate(given) if k not in out)
-            elif port.kind == "in" and not spec.merge:
-                return None
-            elif isinstance(given, Mapping) and len(out) < len(given):
-                inputs[name] = {s: entry for k, (s, entry) in enumerate(given.items()) if k not in out}
-            elif port.kind == "in" or not port.required:
-                inputs[name] = None
-            else:
-                return None
-        triggered = firing.tick or any(inputs[p.name] for p in spec.triggers if p.name in inputs)
-        return inputs if triggered or not spec.triggers else None
 
     # ------------------------------------------------------------------------------------------------- the state
 
     def _look_back(self, call: Call) -> None:
         """Finds the earlier calls of an operator that left their mark in its state: the latest ones first, in blocks of
-        1, 1, 2, 4, 8... calls, back to where an operator that is new gives the same value, and no call before has
-        brought the state back to that of a new one."""
+        1, 1, 2, 4, 8... calls, back to where the calls before are forgotten (`_is_forgotten`)."""
         operator, line = call.operator, self._line(call.operator)
         first = line.begin_of(call.number)
         end = min(call.number, self._searched.get(operator, call.number))
         size = 1 if end == call.number else end - self._goes_back_to(operator, first, end)
         if end > first and not size:
             return
-        deadline = self._deadline
+        deadline, agreed, found = self._deadline, 0, False
         self._deadline = min(deadline, time.monotonic() + HISTORY * (deadline - time.monotonic()))
         try:
             while end > first:
                 begin = max(first, end - size)
                 self._reach(Call(operator, begin), self._last[operator])
-                for number, effects in self._marks(call, begin, end):
-                    earlier = Call(operator, number)
-                    self._chain.links.append(Link(call, line.records[call.number].stamp, "", None, 0, earlier, effects))
-                    if any(effect.together == 1 for effect in effects):
-                        self._queue(earlier)
+                found |= self._link_marks(call, begin, end)
+                if not found and end < call.number:  # these calls do again what the ones before have done
+                    found = self._link_marks(call, begin, call.number)
                 self._searched[operator] = begin
                 back = self._goes_back_to(operator, first, begin)
                 if begin > first and back == begin:
-                    self._chain.ended[operator] = min(begin, self._chain.ended.get(operator, begin))
-                    break
+                    agreed += 1
+                    if self._is_forgotten(call, begin, agreed, found=found):
+                        self._chain.ended[operator] = min(begin, self._chain.ended.get(operator, begin))
+                        break
+                    back = begin - 1
                 size, end = max(size, call.number - begin, begin - back), begin
             else:
                 self._look_at_beginning(Call(operator, first))
@@ -498,13 +400,57 @@ class Blame:
         finally:
             self._deadline = deadline
 
+    def _link_marks(self, call: Call, begin: int, end: int) -> bool:
+        """Makes links to those calls from `begin` to before `end` that decide by what they leave in the state; returns
+        whether there are any."""
+        line, operator = self._line(call.operator), call.operator
+        stamp, links = line.records[call.number].stamp, len(self._chain.links)
+        with self._noting(Call(operator, begin), end - 1, ""):
+            marks = list(split([n for n in range(begin, end) if n in line.shots], lambda n: self._mark(operator, n)))
+        for numbers, effects in marks:
+            maker, last = Call(operator, numbers[0]), numbers[-1] if len(numbers) > 1 else None
+            self._chain.links.append(Link(call, stamp, "", None, 0, maker, effects, last))
+            if last is None:
+                self._queue(maker)
+            else:
+                self._joint.append([taken for number in numbers for taken in self._given(Call(operator, number))])
+        return len(self._chain.links) > links
+
+    def _mark(self, operator: str, numbers: Sequence[int]) -> tuple[Effect, ...]:
+        """The effects of some calls that are others together; of several, one effect."""
+        line = self._line(operator)
+
+        def tries() -> Iterator[tuple[Way, Mapping[Call, Other]]]:
+            yield "call left out", {Call(operator, n): None for n in numbers}
+            taken = {n: self._given(Call(operator, n)) for n in numbers}
+            for way, messages in self._messages.instead([each for n in numbers for each in taken[n]]):
+                left, others = iter(messages), dict[Call, Other]()
+                for n in numbers:
+                    firing = line.shots[n].firing
+                    sizes = {name: len(entries_of(given)) for name, given in firing.inputs.items()}
+                    slots = [(name, k) for name, size in sizes.items() for k in range(size)]
+                    others[Call(operator, n)] = with_messages(firing, {slot: next(left) for slot in slots})
+                yield way, others
+
+        if len(numbers) == 1:
+            return self._shown(tries(), 1)
+        for each in tries():
+            if effects := self._shown(iter([each]), len(numbers)):
+                return effects
+        return ()
+
+    def _given(self, call: Call) -> list[Taken]:
+        """The messages of a call whose inputs are held, in the order of its inputs."""
+        inputs = self._lines[call.operator].shots[call.number].firing.inputs
+        return [Taken(call, name, entry) for name, given in inputs.items() for entry in entries_of(given)]
+
     def _goes_back_to(self, operator: str, first: int, begin: int) -> int:
-        """The call down to which at least the search for marks goes on before `begin`: that itself where it ends.
+        """The call down to which at least the search for marks goes on before `begin`: that itself where it may end.
 
         A new operator gives the same value where the calls before are forgotten, and where one of them has brought the
         state back to that of a new one: then the search goes back to that call.
         """
-        if begin <= first or self._changed({}, anew=Call(operator, begin)) is not None:
+        if begin <= first or self._value_with("a new operator", {}, anew=Call(operator, begin)) is not _SAME:
             return begin - 1
         line = self._line(operator)
         if not line.is_as_new(begin):
@@ -513,6 +459,22 @@ class Blame:
         returned = line.returned_by(begin)
         return begin if returned is None else returned
 
+    def _is_forgotten(self, call: Call, begin: int, agreed: int, *, found: bool) -> bool:
+        """Returns whether the calls before `begin` do not count, where a new operator gives the same value for the
+        `agreed`th time.
+
+        They may count where the calls from there on do again what they have done: then one of these without the other
+        does not change the value. A truth value may be the same by chance, if the state is another.
+        """
+        operator = call.operator
+        if not found:
+            again: dict[Call, Other] = {Call(operator, n): None for n in range(begin, call.number)}
+            if self._changed("call left out", again, anew=Call(operator, begin)) is not None:
+                return False
+        if isinstance(self._value, Message) or is_measured(self._value) or agreed > FURTHER:
+            return True
+        return self._line(operator).has_forgotten(begin, call.number)
+
     def _look_at_beginning(self, first: Call) -> None:
         """Names the state that an operator was given before its first call, where that decides."""
         line = self._lines[first.operator]
@@ -520,55 +482,130 @@ class Blame:
             link.call == first and not link.input and link.maker is None for link in self._chain.links
         ):
             return
-        if (found := self._changed({}, anew=first)) is None:
+        if (found := self._changed("a new operator", {}, anew=first)) is None:
             return
         effects = (Effect("a new operator", (), found[0]),)
         self._chain.links.append(Link(first, line.records[first.number].stamp, "", None, 0, None, effects))
         if first.number:
             self._chain.unsplit.append((first.operator, 0, first.number - 1))
 
-    def _marks(self, call: Call, begin: int, end: int) -> Iterator[tuple[int, tuple[Effect, ...]]]:
-        """Yields those calls from `begin` to before `end` that decide by what they leave in the state."""
-        line = self._line(call.operator)
-        numbers = [n for n in range(begin, end) if n in line.shots]
-        if not numbers:
-            return
-        effects = []
-        if (left_out := self._changed({Call(call.operator, n): None for n in numbers})) is not None:
-            effects.append(Effect("call left out", (), left_out[0]))
-        if not effects or len(numbers) == 1:
-            others = {n: self._nudged_all(line.shots[n].firing) for n in numbers}
-            other = self._changed({Call(call.operator, n): inputs for n, inputs in others.items()})
-            effects += [] if other is None else [Effect("nudged", (), other[0])]
-        if not effects:
-            return
-        if len(numbers) == 1:
-            yield numbers[0], tuple(effects)
-            return
-        half, alone = (begin + end) // 2, False
-        for part in ((half, end), (begin, half)):
-            for found in self._marks(call, *part):
-                alone = True
-                yield found
-        if not alone:
-            joint = tuple(replace(effect, together=len(numbers)) for effect in effects)
-            yield from ((number, joint) for number in numbers)
+    # ------------------------------------------------------------------------------------------ what is in common
 
-    def _nudged_all(self, firing: Firing) -> Mapping[str, InputValue]:
-        slots = {(n, k): e.value for n, given in firing.inputs.items() for k, e in enumerate(entries_of(given))}
-        return with_messages(firing, {slot: nudged(message)[0] for slot, message in slots.items()})
+    def _look_behind(self, joint: Sequence[Taken]) -> None:
+        """Finds the sensors' messages behind some that decide only together: those that decide alone, through all of
+        them; else the smallest run of one stream; else of several streams."""
+        by_stream: dict[tuple[str, int], list[Taken]] = defaultdict(list)
+        for each in sorted(self._sensed_behind(joint), key=lambda each: place_of(each.entry)):
+            by_stream[place_of(each.entry)[:2]].append(each)
+        runs = [run for taken in by_stream.values() for run in split(taken, self._sensed)]
+        if not runs and len(by_stream) > 1 and (effects := self._sensed([t for ts in by_stream.values() for t in ts])):
+            left = dict(by_stream)
+            for stream in by_stream:
+                rest = [each for other in left if other != stream for each in left[other]]
+                if rest and (fewer := self._sensed(rest)):
+                    effects = fewer
+                    del left[stream]
+            runs = [(taken, effects) for taken in left.values()]
+        for taken, effects in runs:
+            call, name, entry = taken[0]
+            place, last = place_of(entry), taken[-1].entry.seq if len(taken) > 1 else None
+            if any(link.message == place and link.maker is None for link in self._chain.links):
+                continue
+            stamp = self._lines[call.operator].records[call.number].stamp
+            self._chain.links.append(Link(call, stamp, name, place, entry.stamp, None, effects, last))
+        if not runs:
+            makers = (self._maker(each.entry) for each in joint)
+            self._chain.loose += [maker for maker in makers if maker is not None][:1]
+
+    def _sensed_behind(self, joint: Sequence[Taken]) -> list[Taken]:
+        """Returns the messages at the beginning of all that some come from, with the calls that took them; the inputs
+        of the calls between are held then."""
+        sensed: dict[Place, Taken] = {}
+        makers: dict[str, set[int]] = defaultdict(set)
+        done: set[str] = set()
+        left = list(joint)
+        while left:
+            for each in left:
+                if (maker := self._maker(each.entry)) is None:
+                    sensed.setdefault(place_of(each.entry), each)
+                else:
+                    makers[maker.operator].add(maker.number)
+            ready = [operator for operator in makers if operator not in done]
+            if not ready:
+                break
+            operator = max(ready, key=self._rank.__getitem__)
+            done.add(operator)
+            calls = [Call(operator, number) for number in self._behind(operator, makers[operator])]
+            left = [taken for call in calls for taken in self._given(call)]
+        return [*sensed.values()]
+
+    def _behind(self, operator: str, numbers: set[int]) -> Sequence[int]:
+        """The calls that some calls of an operator come from: with a state, those before that are not forgotten."""
+        line, first, last = self._line(operator), min(numbers), max(numbers)
+        self._last[operator] = last = max(last, self._last.get(operator, -1))
+        self._reach(Call(operator, first), last)
+        if line.stateless:
+            return sorted(number for number in numbers if number in line.shots)
+        begin, size = line.begin_of(last), last + 1 - first
+        while first > begin and self._changed("a new operator", {}, anew=Call(operator, first)) is not None:
+            first, size = max(begin, first - size), 2 * size
+            self._reach(Call(operator, first), last)
+        return [number for number in range(first, last + 1) if number in line.shots]
+
+    def _sensed(self, taken: Sequence[Taken]) -> tuple[Effect, ...]:
+        """The effects of sensors' messages that are others for all calls that take them; of several, one."""
+        effects: dict[Way, Effect] = {}
+        for way, messages in self._messages.instead(taken):
+            others = {place_of(each.entry): message for each, message in zip(taken, messages, strict=True)}
+            if way not in effects and (found := self._changed(way, {}, messages=others)) is not None:
+                effects[way] = Effect(way, (), found[0], len(taken))
+                if len(taken) > 1:
+                    break
+        return tuple(effects.values())
 
     # ------------------------------------------------------------------------------------------------- the effect
 
-    def _changed(self, others: Mapping[Call, Other], anew: Call | None = None) -> tuple[Any] | None:
-        """Makes the calls again with other inputs, or `anew` by an operator that is new, and all later ones on the
-        chain that these reach; returns the value if it changed."""
+    def _changed(
+        self,
+        way: Way,
+        others: Mapping[Call, Other],
+        anew: Call | None = None,
+        messages: Mapping[Place, Message] | None = None,
+    ) -> tuple[Any] | None:
+        """Makes the calls again with other inputs, or `anew` by an operator that is new, or with other messages of
+        sensors, and all later ones on the chain that these reach; returns the value if it changed."""
+        value = self._value_with(way, others, anew, messages)
+        return None if value is _SAME or value is RAISED else (value,)
+
+    def _value_with(
+        self,
+        way: Way,
+        others: Mapping[Call, Other],
+        anew: Call | None = None,
+        messages: Mapping[Place, Message] | None = None,
+    ) -> Any:
+        """As `_changed`; `_SAME` where it does not, `RAISED` where a call raises."""
         run = Effects(self._lines, self._takers, self._last, self._age)
-        message = run.through(others, anew, self._chain.target, self._port)
+        message = run.through(others, anew, self._chain.target, self._port, messages)
+        self._chain.tried[way] += 1
+        if message is RAISED:
+            self._raised = run.raised
+            self._chain.raised[run.raised] += 1
+            return RAISED
         if message is AS_IT_WAS:
-            return None
+            return _SAME
         value = self._field.value(message)
-        return (value,) if differ(self._value, value, self._tolerance) else None
+        return value if differ(self._value, value, self._tolerance) else _SAME
+
+
+_SAME: Any = object()
+
+
+def _goes_on(link: Link, taken: Taken, effects: tuple[Effect, ...]) -> bool:
+    """Returns whether a message follows that of a link, with which it decides together."""
+    same = link.effects is effects and (link.call, link.input) == (taken.call, taken.input)
+    stream, incarnation, number = place_of(taken.entry)
+    return same and (stream, incarnation, number - 1) == link.messages[-1]
 
 
 def _above(graph: Graph, operator: str) -> set[str]:

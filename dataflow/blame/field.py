@@ -76,6 +76,22 @@ def differ(before: Any, after: Any, tolerance: float) -> bool:
     return bool(np.abs(a[finite] - b[finite]).max(initial=0.0) > tolerance * size)
 
 
+def is_measured(value: Any) -> bool:
+    """Returns whether a value consists of floating-point numbers."""
+    return not isinstance(value, Message) and np.asarray(value).dtype.kind in "fc"
+
+
+def change(before: Any, after: Any) -> float:
+    """Returns by how much a value is another: of numbers the largest difference, of anything else infinity."""
+    a, b = np.asarray(before), np.asarray(after)
+    if a.shape != b.shape or not a.size or a.dtype.kind not in "biufc" or b.dtype.kind not in "biufc":
+        return float("inf")
+    kind = np.complex128 if "c" in (a.dtype.kind, b.dtype.kind) else np.float64
+    with np.errstate(invalid="ignore"):
+        most = float(np.abs(a.astype(kind) - b.astype(kind)).max())
+    return float("inf") if np.isnan(most) else most
+
+
 def _packed(value: Any) -> bytes:
     try:
         return pack_state({"": plain(value)})

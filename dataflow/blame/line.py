@@ -12,7 +12,7 @@ from dataflow.debugging.debugger import Debugger
 from dataflow.debugging.fired import Fired
 from dataflow.execution.calls import Calls
 from dataflow.execution.effects.journal import RecordedJournal
-from dataflow.execution.failure import RAISED
+from dataflow.execution.failure import RAISED, readable
 from dataflow.execution.restarts import close_quietly
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
@@ -80,6 +80,8 @@ class Line:
         """By call, whether the state before it is that of a new operator."""
         self._graph, self._seeding, self._made, self._was_read = graph, seeding_of(recording), made, read
         self._journal = RecordedJournal()
+        self.error = ""
+        """The error of the last call that raised."""
         self._calls: Calls | None = None
         self._at = -1
         """The number of the call that `_calls` is just before, as it was then; -1: it was given other inputs."""
@@ -190,6 +192,17 @@ class Line:
             self._as_new[number] = new is not None and self._state(number) == new
         return self._as_new[number]
 
+    def has_forgotten(self, begin: int, number: int) -> bool:
+        """Returns whether an operator that is new before the call `begin` has the recorded state before `number`; False
+        where the operator gives none."""
+        self.begin(begin, anew=True)
+        for passed in range(begin, number):
+            if passed in self.shots:
+                self.fire(passed, self.shots[passed].firing)
+        new = self._state(number)
+        self.begin(number)
+        return new is not None and self._state(number) == new
+
     def returned_by(self, number: int) -> int | None:
         """The last of the calls before one, all held, that has brought another state back to that of a new operator."""
         return next((n for n in range(number - 1, self.begin_of(number) - 1, -1) if not self._was_new(n)), None)
@@ -236,7 +249,8 @@ class Line:
             return self._calls.process(firing)
         except KeyboardInterrupt:
             raise
-        except RAISED:
+        except RAISED as error:
+            self.error = readable(error)
             return None
         finally:
             self._go_on(number + 1)

@@ -17,16 +17,17 @@ SIZE = 0.01
 M = TypeVar("M", bound=Message)
 
 
-def nudged(message: M, only: Collection[str] = ()) -> tuple[M, tuple[str, ...]]:
+def nudged(message: M, only: Collection[str] = (), *, sign: int = 1) -> tuple[M, tuple[str, ...]]:
     """Returns the message with its numbers nudged, each by a different part of `SIZE`, and the names of the fields.
 
-    Texts stay, and so do fields that the type does not take otherwise. `only`: no others. The same message is nudged
-    in the same way. Directions (rows whose norm the type checks) keep their norm.
+    Texts stay, and so do fields that the type does not take otherwise, and numbers that are not finite. `only`: no
+    others. The same message is nudged in the same way; with `sign` -1 each number moves the other way. Directions (rows
+    whose norm the type checks) keep their norm.
     """
     random = np.random.default_rng(int.from_bytes(message.digest()[:8], "little"))
     names: list[str] = []
     for name, value in [(field.name, getattr(message, field.name)) for field in type(message).FIELDS]:
-        for other in _others(value, random):
+        for other in _others(value, random, sign):
             if only and name not in only:
                 continue
             try:
@@ -38,13 +39,52 @@ def nudged(message: M, only: Collection[str] = ()) -> tuple[M, tuple[str, ...]]:
     return message, tuple(names)
 
 
-def _others(value: Any, random: np.random.Generator) -> list[Any]:
+def is_finite(message: Message) -> bool:
+    """Returns whether all numbers of a message are finite."""
+    arrays = [np.asarray(getattr(message, field.name)) for field in type(message).FIELDS]
+    return all(array.dtype.kind != "f" or bool(np.isfinite(array).all()) for array in arrays)
+
+
+def made_finite(message: M, beside: Message | None) -> M:
+    """Returns the message with a finite neighbour in place of each number that is not finite: from the same array, or,
+    where that has none, from the same place of the message `beside`. Returns the same message where there is none."""
+    for name, value in [(field.name, getattr(message, field.name)) for field in type(message).FIELDS]:
+        if value is None or isinstance(value, str | bytes):
+            continue
+        array = np.asarray(value)
+        if array.dtype.kind != "f" or np.isfinite(array).all():
+            continue
+        near = np.asarray(getattr(beside, name, None)) if type(beside) is type(message) else array
+        filled = _filled(array, near)
+        if not (np.isfinite(filled) > np.isfinite(array)).any():
+            continue
+        try:
+            message = message.replace(**{name: filled if isinstance(value, np.ndarray) else filled.item()})
+        except MessageError:
+            continue
+    return message
+
+
+def _filled(array: npt.NDArray[Any], near: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    flat = array.reshape(-1)
+    places = np.flatnonzero(np.isfinite(flat))
+    if len(places):
+        after = np.searchsorted(places, np.arange(len(flat)), side="right")
+        filled = flat[places[np.maximum(after - 1, 0)]].reshape(array.shape)
+    elif near.shape == array.shape and near.dtype.kind == "f":
+        filled = np.where(np.isfinite(near), near, array).astype(array.dtype)
+    else:
+        return array
+    return np.where(np.isfinite(array), array, filled)
+
+
+def _others(value: Any, random: np.random.Generator, sign: int) -> list[Any]:
     if value is None or isinstance(value, str | bytes):
         return []
     array = np.asarray(value)
     if not array.size or array.dtype.kind not in "biuf":
         return []
-    moved = _moved(array, random)
+    moved = _moved(array, random, sign)
     if not isinstance(value, np.ndarray):
         return [type(value)(moved.item())]
     tries = [moved]
@@ -56,10 +96,10 @@ def _others(value: Any, random: np.random.Generator) -> list[Any]:
     return tries
 
 
-def _moved(array: npt.NDArray[Any], random: np.random.Generator) -> npt.NDArray[Any]:
+def _moved(array: npt.NDArray[Any], random: np.random.Generator, sign: int) -> npt.NDArray[Any]:
     if array.dtype.kind == "b":
         return ~array
-    part = random.uniform(0.5, 1.0, array.shape) * random.choice([-1.0, 1.0], array.shape)
+    part = sign * random.uniform(0.5, 1.0, array.shape) * random.choice([-1.0, 1.0], array.shape)
     wide = array.astype(np.float64)
     largest = np.abs(wide[np.isfinite(wide)]).max(initial=0.0) or 1.0
     if array.dtype.kind == "f":

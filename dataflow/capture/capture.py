@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from dataflow.capture.captured import BEFORE, Captured, Change, Outcome, Predicate, Setting, Shot
 from dataflow.capture.reduce import shortest_end, smallest
+from dataflow.capture.repeats import NotRepeated, check_repeats
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Fired
 from dataflow.execution.failure import place_of, readable
@@ -96,8 +97,8 @@ def capture(
     """Captures the call of that number, by default the first that does not give what was recorded, or for which
     `predicate` is true.
 
-    Raises `DebugError` where there is nothing wrong with it, or where it cannot be shown apart from the recording;
-    SyntaxError for a predicate that is no expression.
+    Raises `DebugError` where there is nothing wrong with it, where it cannot be shown apart from the recording, or does
+    not give the same each time; SyntaxError for a predicate that is no expression.
     """
     fired = _aimed(debugger, number, predicate)
     wrong = Wrong(fired, predicate)
@@ -131,9 +132,16 @@ def capture(
     if best is None:
         raise DebugError(
             f"call {fired.number} of {debugger.node.name} is not wrong when it is made apart from its recording: what "
-            "it depends on is neither among its inputs nor in its state (dataflow verify --why)"
+            f"it depends on is neither among its inputs nor in its state (dataflow verify {recording.path} --why)"
         )
     captured, begins = best
+    try:
+        check_repeats(captured)
+    except NotRepeated as error:
+        raise DebugError(
+            f"call {fired.number} of {debugger.node.name} does not repeat: {error}. A test of it would pass and fail "
+            f"by chance: dataflow verify {recording.path} --why finds the cause"
+        ) from None
     return Found(captured, fired.number, len(debugger.calls), len(captured.shots), begins, wrong.text)
 
 
@@ -152,8 +160,10 @@ def _aimed(debugger: Debugger, number: int | None, predicate: str) -> Fired:
     else:
         found = debugger.until(lambda fired: not fired.same or (fired.error is not None and not fired.injected))
     if found is None:
-        what = "all as recorded, without an error" if true is None else f"none for which {predicate}{_raised(true)}"
-        raise DebugError(f"{name} has {len(debugger.calls)} calls: {what}")
+        what = "as recorded, without an error" if true is None else f"none for which {predicate}{_raised(true)}"
+        if (unmade := debugger.unmade) is not None:
+            raise DebugError(f"{name}: {len(debugger.calls) - unmade.count} calls {what}; {unmade}")
+        raise DebugError(f"{name} has {len(debugger.calls)} calls: {'all ' * (true is None)}{what}")
     return found
 
 

@@ -22,6 +22,7 @@ from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date, datetime, tzinfo
 from multiprocessing.pool import ThreadPool
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from dataflow.causes.sources import (
     ADDRESSES,
     ENTROPY,
     FILE,
+    FOLDER,
     HEAP,
     IDENTITY,
     MONOTONIC,
@@ -42,10 +44,11 @@ from dataflow.causes.sources import (
     UUID,
     VARIABLE,
     WALL,
+    WORKING,
     kind_of,
     name_of,
 )
-from dataflow.causes.traps import BIT_GENERATOR, ForNumpy
+from dataflow.causes.traps import BIT_GENERATOR, ForNumpy, absolute, look_through, looking_at
 from dataflow.execution.generators import lazy_numpy
 
 TICK_NS = 1_000_000
@@ -53,6 +56,8 @@ TURN = 0.2
 """Seconds for which a thread is waited for where it starts."""
 LATER_NS = 400 * 86_400 * 10**9 + 3_723 * 10**9
 """By how much the time of day is changed: more than a year, and neither whole days nor whole hours."""
+HERE = "/proc/self/cwd"
+"""Another name of the working folder, by which the same files are found."""
 _ADDRESS_OF = id
 FILL, OTHER_FILL = 0x5A, 0xA7
 
@@ -83,12 +88,15 @@ class Interventions:
 
     def vary(self, sources: Collection[str]) -> None:
         """Makes sources give something else than they do here."""
-        hidden = {name_of(source) for source in sources if kind_of(source) == FILE}
+        hidden = {name_of(source) for source in sources if kind_of(source) in (FILE, FOLDER)}
         if hidden:
             _hide(hidden)
         for source in sources:
             if kind_of(source) == VARIABLE:
                 os.environ[name_of(source)] = changed(os.environ.get(name_of(source)))
+        if WORKING in sources:
+            for name, value in (("getcwd", HERE), ("getcwdb", HERE.encode())):
+                setattr(os, name, self._for_own(getattr(os, name), value))
         if WALL in sources:
             real = time.time_ns
             self._set_clock(lambda: real() + LATER_NS, lambda: True)
@@ -104,6 +112,17 @@ class Interventions:
             return (value if on() and not self._places.passes(sys._getframe(1)) else real)(*args, **kwargs)
 
         setattr(module, name, replaced)
+
+    def _for_own(self, real: Callable[[], Any], value: Any) -> Callable[[], Any]:
+        """Gives `value` where own code asks, itself or by the standard library."""
+
+        def asked() -> Any:
+            frame: FrameType | None = sys._getframe(1)
+            while frame is not None and self._places.of(frame.f_code) == "standard":
+                frame = frame.f_back
+            return value if frame is not None and self._places.of(frame.f_code) == "own" else real()
+
+        return asked
 
     def _ticking(self, start: int) -> Callable[[], int]:
         count = itertools.count(start, TICK_NS)
@@ -272,13 +291,19 @@ def _filled(make: Callable[..., Any], pattern: int) -> Callable[..., Any]:
 
 
 def _hide(paths: Collection[str]) -> None:
+    """Has nothing find files and folders: neither open them, nor list them, nor ask about them."""
+
     def refuse(event: str, args: tuple[Any, ...]) -> None:
-        if event == "open" and isinstance(args[0], str | bytes):
-            path = os.path.abspath(os.fsdecode(args[0]))
-            if path in paths:
-                raise FileNotFoundError(2, "hidden by --why", path)
+        if event in ("open", "os.listdir", "os.scandir") and (path := absolute(args[0] or ".")) in paths:
+            raise FileNotFoundError(2, "hidden by --why", path)
+
+    def look(name: str, path: Any, args: Any, kwargs: Any) -> Any:
+        if (asked := absolute(path)) in paths:
+            raise FileNotFoundError(2, "hidden by --why", asked)
+        return looking_at(name, path, args, kwargs)
 
     sys.addaudithook(refuse)
+    look_through(look)
 
 
 def changed(value: str | None) -> str:

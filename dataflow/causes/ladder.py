@@ -17,6 +17,7 @@ from dataflow.causes.sources import (
     CHANCE,
     COMPILED,
     FILE,
+    FOLDER,
     HASHES,
     HEAP,
     LOCALE,
@@ -24,6 +25,7 @@ from dataflow.causes.sources import (
     THREADS,
     VARIABLE,
     WALL,
+    WORKING,
     kind_of,
 )
 from dataflow.supervision.core.report import RunFailed
@@ -118,7 +120,7 @@ class Ladder:
 
     def _find_varied(self, found: Findings, base: Rerun) -> None:
         seen = dict.fromkeys(source for source, _, _ in found.first.sites)
-        trapped = [s for s in seen if kind_of(s) in (WALL, VARIABLE, FILE, LOCALE)]
+        trapped = [s for s in seen if kind_of(s) in (WALL, VARIABLE, FILE, FOLDER, WORKING, LOCALE)]
 
         def effect(group: Sequence[str]) -> Rerun | None:
             made = self._tried(Setting(varied=frozenset(group)))

@@ -18,6 +18,8 @@ PROCESS = "number of the process"
 THREADS = "threads"
 HEAP = "uninitialised memory"
 FILE = "file"
+FOLDER = "folder"
+WORKING = "working folder"
 VARIABLE = "environment variable"
 LOCALE = "locale or time zone"
 MODULE = "state of a module or class"
@@ -47,6 +49,8 @@ SOURCES = {
     THREADS: Source("the order in which threads finish", "one thread, or results taken in the order of the tasks"),
     HEAP: Source("memory that it has not written", "np.zeros, or every element written before it is read"),
     FILE: Source("a file that is not the one of then", "self.use_file(path): its digest is recorded"),
+    FOLDER: Source("the files that a folder holds", "a list of files as a parameter; sorted()"),
+    WORKING: Source("the folder that it was started in", "a parameter: it is recorded"),
     VARIABLE: Source("a variable of the environment", "a parameter: it is recorded"),
     LOCALE: Source("the locale or the time zone", "an explicit encoding, format or time zone"),
     MODULE: Source("what an operator before it left in a module or class", "self, or the state"),

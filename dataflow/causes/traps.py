@@ -6,12 +6,14 @@ Reads of compiled code, past the interpreter, are not seen.
 
 from __future__ import annotations
 
+import importlib
 import os
 import random
 import sys
 import threading
 import uuid
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import CodeType, FrameType
 from typing import Any
@@ -22,6 +24,7 @@ from dataflow.causes.places import Places
 from dataflow.causes.sources import (
     ENTROPY,
     FILE,
+    FOLDER,
     HEAP,
     IDENTITY,
     LOCALE,
@@ -33,6 +36,7 @@ from dataflow.causes.sources import (
     UUID,
     VARIABLE,
     WALL,
+    WORKING,
     kind_of,
     named,
 )
@@ -56,9 +60,13 @@ _BUILT_IN: dict[str, tuple[str | None, str]] = {
     **dict.fromkeys(("setlocale", "localeconv", "nl_langinfo"), ("_locale", LOCALE)),
     "id": ("builtins", IDENTITY),
     "getpid": ("posix", PROCESS),
+    **dict.fromkeys(("getcwd", "getcwdb"), ("posix", WORKING)),
     "empty": ("numpy", HEAP),
 }
 """By qualified name of a built-in function: its module (None for methods), and the source that it reads."""
+_IMPORTLIB = os.path.dirname(importlib.__file__)
+_SOURCE = (".py", ".pyc", ".so")
+_LOOKS = {name: getattr(os, name) for name in ("stat", "lstat")}
 _ZONED = ("localtime", "strftime", "ctime", "mktime", "datetime.now", "datetime.today", "date.today")
 
 
@@ -98,13 +106,15 @@ class Traps:
             random.SystemRandom.getrandbits.__code__: ENTROPY,
             uuid.uuid1.__code__: UUID,
             uuid.uuid4.__code__: UUID,
+            looking_at.__code__: FILE,
         }
 
     def set(self) -> None:
         """Begins to log, in this thread and in those to come."""
         ForNumpy.install()
         lazy_numpy.seed_lazily(random.SystemRandom().getrandbits(32))  # its lock shows who draws
-        sys.addaudithook(self._opened)
+        look_through(looking_at)
+        sys.addaudithook(self._audited)
         threading.setprofile(self._called)
         sys.setprofile(self._called)
 
@@ -132,6 +142,9 @@ class Traps:
         local = frame.f_locals
         if source is VARIABLE:
             self._note(named(VARIABLE, os.fsdecode(local["key"])), f"os.environ[{local['key']!r}]", frame.f_back)
+        elif source is FILE:
+            asked = frame.f_back  # that of `look_through`
+            self._note_path(local["path"], f"os.{local['name']}", asked and asked.f_back)
         elif source is ENTROPY:
             if isinstance(local["self"], ForNumpy):
                 self._note(NUMPY, "a generator without a seed", frame.f_back)
@@ -164,15 +177,38 @@ class Traps:
         thread, whose draws mix with those of others."""
         return AT_WORK.begun == AT_WORK.ended or threading.get_ident() != self._main
 
-    def _opened(self, event: str, args: tuple[Any, ...]) -> None:
-        if event != "open" or not isinstance(args[0], str | bytes) or sys.getprofile() is None:
+    def _audited(self, event: str, args: tuple[Any, ...]) -> None:
+        if sys.getprofile() is None:
             return
-        path, flags = os.path.abspath(os.fsdecode(args[0])), args[2] or 0
-        frame = sys._getframe(1)
-        if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
-            self._written.add(path)
-        elif path not in self._written and os.path.isfile(path) and not _imports(frame):
-            self._note(named(FILE, path), "open", frame)
+        if event == "os.mkdir":
+            self._written.add(absolute(args[0]) or "")
+        elif event in ("os.listdir", "os.scandir"):
+            self._note_path(args[0] or ".", event, sys._getframe(1))
+        elif event == "open" and (args[2] or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+            self._written.add(absolute(args[0]) or "")
+        elif event == "open":
+            self._note_path(args[0], "open", sys._getframe(1))
+
+    def _note_path(self, given: object, call: str, frame: FrameType | None) -> None:
+        """Notes a file that is read or looked at, a folder that is listed: neither what this process has written, nor
+        what the import of a module reads."""
+        path = absolute(given)
+        lists = call in ("os.listdir", "os.scandir")
+        if path is None or path in self._written or not (os.path.isdir(path) if lists else os.path.isfile(path)):
+            return
+        if call != "open" and path.endswith(_SOURCE):
+            return  # for tracebacks and warnings
+        if not self._imports(frame):
+            self._note(named(FOLDER if lists else FILE, path), call, frame)
+
+    def _imports(self, frame: FrameType | None) -> bool:
+        """Returns whether the innermost line of own code imports a module, or looks for packages: what is read then are
+        source, bytecode, and files of libraries. Own code may read files while it is itself imported."""
+        while frame is not None and self._places.of(frame.f_code) != "own":
+            if frame.f_code.co_filename.startswith(("<frozen importlib", _IMPORTLIB)):
+                return True
+            frame = frame.f_back
+        return False
 
     def _note(self, source: str, call: str, frame: FrameType | None) -> None:
         led = self._places.led(frame)
@@ -187,9 +223,24 @@ class Traps:
         self.counts[source, Site(own.f_code.co_filename, own.f_lineno, own.f_code.co_name, call)] += 1
 
 
-def _imports(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
-        frame = frame.f_back
-    return False
+def looking_at(name: str, path: Any, args: Any, kwargs: Any) -> Any:
+    """Calls `os.stat` or `os.lstat`, which raise no audit event."""
+    return _LOOKS[name](path, *args, **kwargs)
+
+
+def look_through(look: Callable[[str, Any, Any, Any], Any]) -> None:
+    """Has code that asks for facts of a file ask `look`: name of the call, path, and what else it was given. Imports
+    of modules ask past it."""
+
+    def through(name: str) -> Callable[..., Any]:
+        return lambda path, *args, **kwargs: look(name, path, args, kwargs)
+
+    for name, real in _LOOKS.items():
+        setattr(os, name, through(name))
+        for able in (os.supports_dir_fd, os.supports_fd, os.supports_follow_symlinks):
+            able.update({getattr(os, name)} if real in able else ())
+
+
+def absolute(given: object) -> str | None:
+    """Returns the absolute path of what a call was given; None for a descriptor."""
+    return os.path.abspath(os.fsdecode(given)) if isinstance(given, str | bytes | os.PathLike) else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -10,13 +12,13 @@ from typing import Any
 
 from dataflow.causes.ladder import MOST, Findings, Ladder
 from dataflow.causes.rerun import Rerun, Setting, fake_time, run_again
-from dataflow.causes.sources import COMPILED, FILE, INPUT, MODULE, SOURCES, kind_of, name_of
+from dataflow.causes.sources import COMPILED, FILE, FOLDER, INPUT, MODULE, SOURCES, kind_of, name_of
 from dataflow.causes.traps import Site
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.reading import FiringLog
-from dataflow.reexecution.recorded_run import graph_as_recorded, graph_that_is_here
+from dataflow.reexecution.recorded_run import graph_that_is_here
 from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.books import Books
 from dataflow.verification.choice import accountable, env_of, with_makers
@@ -71,7 +73,9 @@ class Why:
     """The answer about one operator. `refused`: the reason for which nothing was tried; `repeats`: whether its re-runs
     agree; `settled`: whether they do with all sources of chance fixed (None where that was not tried or needed).
     `cleared` sources were tried without effect, of each group in `open` one has an effect, `left_out` could not be
-    tried, with the reason. `changed` are facts that the recording holds and that differ now. `seconds` in all."""
+    tried, with the reason. `older`: files and folders that have an effect, and were not changed since the recording.
+    `changed` are facts that the recording holds and that differ now; `code_known`: it holds digests of the operator's
+    code. `seconds` in all."""
 
     operator: str
     refused: str = ""
@@ -81,7 +85,9 @@ class Why:
     cleared: tuple[str, ...] = ()
     open: tuple[tuple[str, ...], ...] = ()
     left_out: Mapping[str, str] | None = None
+    older: tuple[str, ...] = ()
     changed: tuple[str, ...] = ()
+    code_known: bool = False
     reruns: int = 0
     seconds: float = 0.0
 
@@ -112,8 +118,7 @@ def why(
         return Why(operator, refused=refused)
     assert verification is not None
     alone = _Alone(path, graph, verification, seconds=seconds, stall_timeout=stall_timeout, workers=workers)
-    changed = (*alone.changed, *(f"file {file}" for file in verification.files_changed), *verification.packages_changed)
-    changed += tuple(f"{fact}: {then or 'none'} → {now or 'none'}" for fact, then, now in report.facts)
+    changed, known = report.altered(operator), verification.code_known
     try:
         wrote = alone.lines() if verification.wrote else None
         if verification.first is None:
@@ -125,7 +130,7 @@ def why(
         if failure.interrupted:
             raise
         return Why(operator, refused=f"it cannot be run again: {failure}")
-    return replace(made, left_out=alone.left_out, changed=changed, seconds=time.monotonic() - began)
+    return replace(made, left_out=alone.left_out, changed=changed, code_known=known, seconds=time.monotonic() - began)
 
 
 def refusal(report: VerifyReport, operator: str, found: Verification | None) -> str:
@@ -146,7 +151,9 @@ def refusal(report: VerifyReport, operator: str, found: Verification | None) -> 
 
 def _answer(operator: str, findings: Findings, alone: _Alone, wrote: Rerun | None, verification: Verification) -> Why:
     causes = [_cause(source, findings.first, findings.left) for source in findings.causes]
-    causes = [cause for cause in causes if cause.kind != FILE or alone.is_newer(name_of(cause.source), verification)]
+    outside = [cause for cause in causes if cause.kind in (FILE, FOLDER)]
+    older = [cause for cause in outside if not alone.is_newer(name_of(cause.source), verification)]
+    causes = [cause for cause in causes if cause not in older]
     first = [] if wrote is None else [_cause(INPUT, wrote)]
     return Why(
         operator,
@@ -155,6 +162,7 @@ def _answer(operator: str, findings: Findings, alone: _Alone, wrote: Rerun | Non
         causes=(*first, *causes),
         cleared=tuple(findings.cleared),
         open=tuple(findings.open),
+        older=tuple(cause.what for cause in older),
         reruns=findings.reruns + len(first),
     )
 
@@ -188,8 +196,8 @@ class _Alone:
             incomplete = incomplete_streams(recording, played, books, told)
             held = recording.streams.keys() - incomplete
             chosen = with_makers(held, played, {name})
-            self.changed = () if graph is None else _changes(graph_as_recorded(recording), graph, name)
-        self.recorded = path.stat().st_mtime
+            last = max((record.wall_start for record in log.ordered(played.nodes[name])), default=0) * 1e-9
+        self.recorded = min(path.stat().st_mtime, last or math.inf)
         self._operators = tuple(each for each in played.nodes if each in chosen)
         self._env, self._threads = env_of(played, self._operators, held), played.threads
         at = 0 if found.first is None else found.first.index
@@ -228,20 +236,10 @@ class _Alone:
         return self.fire(Setting(lines=True))
 
     def is_newer(self, file: str, found: Verification) -> bool:
-        """Returns whether a file was changed after the recording was written, or is not the recorded one."""
-        return file in found.files_changed or Path(file).stat().st_mtime > self.recorded
-
-
-def _changes(recorded: Graph, graph: Graph, name: str) -> tuple[str, ...]:
-    """Returns what the graph that was named has otherwise than the recorded one, of one operator."""
-    if name not in recorded.nodes:
-        return (f"operator {name} is not in the recorded graph",)
-    then, now = recorded.nodes[name], graph.nodes[name]
-    found = [] if then.use == now.use else [f"class: {then.use} → {now.use}"]
-    for key in sorted(then.params.keys() | now.params.keys()):
-        if then.params.get(key) != now.params.get(key):
-            found.append(f"parameter {key}: {then.params.get(key)} → {now.params.get(key)}")
-    return tuple(found)
+        """Returns whether a file or folder was changed after the operator's last call, or is not the recorded one."""
+        if file in found.files_changed:
+            return True
+        return os.path.exists(file) and os.stat(file).st_mtime > self.recorded
 
 
 def reasons(path: Path, report: VerifyReport, operators: Sequence[str], graph: Graph | None = None) -> list[Why]:

@@ -10,6 +10,7 @@ import pdb
 import traceback
 from bdb import BdbQuit
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate
 from types import CodeType
@@ -49,6 +50,19 @@ MOST_BYTES = 2**28
 
 class DebugError(ReplayError):
     """Raised for a call that cannot be gone to; the message has the reason, and what there is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unmade:
+    """Calls that a search has passed by, as they cannot be made again: how many, the number of the first, and why."""
+
+    count: int
+    first: int
+    why: str
+
+    def __str__(self) -> str:
+        calls = f"{self.count:,} call{'' if self.count == 1 else 's'}"
+        return f"{calls} could not be made again (the first is call {self.first}: {self.why})"
 
 
 class Debugger:
@@ -91,6 +105,8 @@ class Debugger:
         self._probe: Probe | None = None
         self._reached = -1
         self.at: Fired | None = None
+        self.unmade: Unmade | None = None
+        """Calls that the last search (`until`, `first_difference`) has passed by; None where it made all on its way."""
         self.between: Callable[[], object] = lambda: None
         """Called behind each call that is made on the way to another; what it raises ends the way there."""
 
@@ -194,6 +210,15 @@ class Debugger:
             self.between()
         return self._reached
 
+    def no_state(self) -> str:
+        """Returns why an operator whose states are None has none to be shown."""
+        if self.node.operator.stateless:
+            return f"{self.node.name} has no state: it is declared stateless"
+        return (
+            f"{self.node.name} declares no state, so what it keeps in attributes is not seen: declare it "
+            "(`state: State`, a dataclass), or give it by snapshot() and restore()"
+        )
+
     @property
     def reached(self) -> int:
         """Returns the number of the call that was made last on a way; -1 where none was."""
@@ -218,22 +243,44 @@ class Debugger:
                 return number
         return 0
 
-    def until(self, condition: Callable[[Fired], bool]) -> Fired | None:
-        """Goes on to the next call for which `condition` is true; None where none is: then `at` stays."""
-        after = -1 if self.at is None else self.at.number
-        while (held := self._ring.get(after + 1)) is not None and not held.stale:
-            after += 1
+    def until(
+        self, condition: Callable[[Fired], bool], *, first: int | None = None, last: int | None = None
+    ) -> Fired | None:
+        """Goes on to the next call for which `condition` is true, of those from the number `first` (by default the one
+        behind the call where we are) to `last`; None where none is: then `at` stays. `unmade` has those that it has
+        passed by, of which nothing is known.
+        """
+        self.unmade = None
+        number = first if first is not None else 0 if self.at is None else self.at.number + 1
+        end = len(self.calls) - 1 if last is None else last
+        while number <= end and (held := self._ring.get(number)) is not None and not held.stale:
+            number += 1
             if self._goes_to(held, condition):
                 return self.at
-        if after + 1 == len(self.calls):
+        if number > end:
             return None
-        if self._work is None or self._end is not None or self._reached > after:
-            self._begin(after + 1)
+        if self._work is None or self._end is not None or self._reached >= number:
+            self._begin(number)
         for held in self._onwards():
-            if held.number > after and self._goes_to(held, condition):
+            if held.number < number:
+                continue
+            self._pass_by(number, min(held.number, end + 1))
+            number = held.number + 1
+            if held.number > end:
+                return None
+            if self._goes_to(held, condition):
                 return self.at
+            if held.number == end:
+                return None
+        self._pass_by(number, end + 1)
         self._leave()
         return None
+
+    def _pass_by(self, number: int, behind: int) -> None:
+        """Notes that a search has made none of the calls from `number` to before `behind`."""
+        if number < behind:
+            was = self.unmade or Unmade(0, number, self._why_not())
+            self.unmade = replace(was, count=was.count + behind - number)
 
     def _goes_to(self, held: Held, condition: Callable[[Fired], bool]) -> bool:
         fired = self._fired(held)
@@ -445,10 +492,15 @@ class Debugger:
             yield Made(port, stream, same=False, here=here, recorded=then, fields=fields)
 
     def _unreached(self, number: int) -> str:
+        return f"call {number} of {self.node.name} cannot be made again: {self._why_not()}"
+
+    def _why_not(self) -> str:
+        """Returns why the calls behind the last one that was made cannot be."""
         assert self._work is not None
         result = self._work.runners[self.node.name].result
-        why = f"{result.missing} is not recorded" if result.missing else "records before it are missing"
-        return f"call {number} of {self.node.name} cannot be made again: {why}"
+        if result.missing:
+            return f"{result.missing} is not recorded"
+        return "the state before it is not known" if result.unknown else "records before it are missing"
 
     def _leave(self) -> None:
         if self._work is not None:
@@ -490,5 +542,10 @@ def _named(operator: str, graph: Graph, log: FiringLog) -> str:
         return found[0]
     if operator in graph.nodes and graph.nodes[operator].source:
         raise DebugError(f"{operator!r} is a source: what its device gave is recorded, not made again")
+    if not there:
+        raise DebugError(
+            f"no calls of {operator!r} are recorded, nor of any other operator: the recording holds what sources gave. "
+            "Replay it through a graph with operators (dataflow replay --graph GRAPH --record RUN.mcap), and debug that"
+        )
     what = f"{operator!r} is several operators" if found else f"no calls of {operator!r} are recorded"
     raise DebugError(f"{what}; there are: {', '.join(found or there)}")

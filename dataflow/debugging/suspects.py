@@ -116,7 +116,7 @@ def _changes(
     recording: Recording, debugger: Debugger, call: Call, ran: frozenset[Place]
 ) -> tuple[dict[str, str | None], dict[str, list[str]], list[Change]]:
     """Returns where the recorded text of each module that differs was found, the lines here, and what differs."""
-    then = _recorded_code(recording, debugger.node.name, call)
+    then = recorded_code(recording, debugger.node.name, call)
     modules: dict[str, str | None] = {}
     texts: dict[str, list[str]] = {}
     changes: list[Change] = []
@@ -124,7 +124,7 @@ def _changes(
         file = getattr(sys.modules.get(name), "__file__", None)
         if file is None or name not in then or then[name] == digest_of(text):
             continue
-        found = _recorded_text(then[name], Path(file))
+        found = recorded_text(then[name], Path(file))
         modules[name] = None if found is None else found[1]
         if found is not None:
             texts[name] = text.decode().splitlines(keepends=True)
@@ -132,11 +132,11 @@ def _changes(
     return modules, texts, changes
 
 
-def _recorded_code(recording: Recording, operator: str, call: Call) -> Mapping[str, str]:
-    """Returns the digests of the code that made a call, by module."""
+def recorded_code(recording: Recording, operator: str, call: Call | None = None) -> Mapping[str, str]:
+    """Returns the digests of the code that made a call, or the last one, by module; empty where none is recorded."""
     found: Mapping[str, str] = {}
     for record in FiringLog.read(recording).records(operator):
-        if (record.incarnation, record.index) > (call.incarnation, call.record):
+        if call is not None and (record.incarnation, record.index) > (call.incarnation, call.record):
             break
         found = code_in(record) or found
     return found
@@ -178,7 +178,7 @@ def _raised(fired: Fired, homes: tuple[Path, ...]) -> Place | None:
     return own[-1] if own else None
 
 
-def _recorded_text(digest: str, file: Path) -> tuple[bytes, str] | None:
+def recorded_text(digest: str, file: Path) -> tuple[bytes, str] | None:
     """Returns the text with a digest, and where it was: the store of reloads, or a commit of the file; None where it
     is in neither. Of the file's commits the newest `REVISIONS` are looked at."""
     if (text := stored(digest)) is not None:

@@ -6,7 +6,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
@@ -24,7 +24,7 @@ from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Feeding, plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, seeding_of
-from dataflow.sync import NEVER
+from dataflow.sync import FOREVER, NEVER
 
 SECONDS = 60.0
 
@@ -68,7 +68,7 @@ class Worse:
             is_worse = bool(eval(self._code, names))
         except Exception as error:
             raise DropsError(
-                f"--worse {self.text}: {type(error).__name__}: {error}; figures: {dict(figures)}"
+                f"--worse {self.text}: {type(error).__name__}: {error}; figures: {_said(self.values(figures))}"
             ) from error
         seen = self.values(figures)
         if not is_worse and (unknown := [n for n, v in seen.items() if isinstance(v, float) and math.isnan(v)]):
@@ -128,6 +128,11 @@ class Cost:
     calls: int
     seconds: float
 
+    def as_json(self) -> dict[str, Any]:
+        """Returns it as plain values; `until` of a message that never came is null."""
+        named = [asdict(loss) | {"until": None if loss.until == FOREVER else loss.until} for loss in self.named]
+        return asdict(self) | {"named": named}
+
 
 class Drops:
     """Looks for the losses of a recorded run that made `worse` true of its figures.
@@ -159,7 +164,9 @@ class Drops:
         """Finds them."""
         began = time.monotonic()
         if not self.worse.is_true(self._recorded):
-            raise DropsError(f"the recorded figures are not {self.worse.text}: {self.worse.values(self._recorded)}")
+            raise DropsError(
+                f"the recorded figures are not {self.worse.text}: {_said(self.worse.values(self._recorded))}"
+            )
         feeding, losses, sent = self._plan()
         if not losses:
             raise DropsError("nothing was lost, or came late, between the sources and these figures")
@@ -218,7 +225,7 @@ class Drops:
         self._check(branch, before)
         best = self._replay(branch, losses)
         if self.worse.is_true(best):
-            found = self.worse.values(best)
+            found = _said(self.worse.values(best))
             raise DropsError(f"with all {len(losses)} losses undone it is {self.worse.text} still: {found}")
         in_time = True
 
@@ -283,7 +290,8 @@ class Drops:
                 )
         recorded, found = self.worse.values(self._recorded), self.worse.values(figures)
         if recorded != found:
-            raise DropsError(f"the figures change by themselves: recorded {recorded}, replayed {found}")
+            both = f"recorded {_said(recorded, 17)}, replayed {_said(found, 17)}"
+            raise DropsError(f"the figures change by themselves: {both}")
 
     def _not_sent(self) -> int:
         sources = [records for name, records in self._records.items() if self.graph.nodes[name].source]
@@ -341,3 +349,9 @@ def _word(name: str) -> str:
 
 def _begins(figure: str, name: str) -> bool:
     return figure.startswith(f"{name}_")
+
+
+def _said(values: Mapping[str, Any], digits: int = 6) -> str:
+    """Figures in words."""
+    told = {name: f"{value:.{digits}g}" if isinstance(value, float) else value for name, value in values.items()}
+    return ", ".join(f"{name} {value}" for name, value in told.items())

@@ -29,6 +29,9 @@ class Judge:
     def __init__(self, operator: str, ports: tuple[str, ...], inputs: Digests) -> None:
         self.result = Verification(operator)
         self._ports, self._inputs = ports, inputs
+        self._differences = xxhash.xxh3_128()
+        self._erred: FiringRecord | None = None
+        """The call whose error, or want of one, is counted as a difference: its first output that differs is not."""
         self._altered: set[tuple[str, int, int]] = set()
         """Messages that arrived, and are not known to be the recorded ones, as long as none was given."""
 
@@ -56,7 +59,7 @@ class Judge:
                 continue
             self.result.outputs += 1
             if expected is None or got is None:
-                self.differ(record, name, _word(expected), _word(got))
+                self.differ(record, name, _word(expected), _word(got), "" if got is None else got.digest().hex())
             elif got.digest() != expected.digest:
                 self.differ(record, name, expected.digest.hex(), got.digest().hex())
             if expected is not None and got is not None and expected.seq != WITHHELD:
@@ -65,22 +68,26 @@ class Judge:
     def statics(self, record: FiringRecord, messages: Mapping[str, Message]) -> None:
         """Compares the static messages of an operator that was restarted, which are not sent again."""
         for name, expected in zip(self._ports, record.outputs, strict=True):
-            if expected is not None and (name not in messages or messages[name].digest() != expected.digest):
-                self.differ(record, name, expected.digest.hex(), "another static message")
+            got = messages.get(name)
+            if expected is not None and (got is None or got.digest() != expected.digest):
+                made = "" if got is None else got.digest().hex()
+                self.differ(record, name, expected.digest.hex(), "another static message", made)
 
     def error(self, record: FiringRecord, error: BaseException | None) -> None:
         """Compares what a call raised, if anything; addresses in memory, which texts may hold, are left out."""
         expected = f"error: {record.detail.get('error', '')}" if record.outcome == "error" else "no error"
         got = "no error" if error is None else f"error: {readable(error)}"
         if _ADDRESS.sub("", expected) != _ADDRESS.sub("", got):
-            self.differ(record, "", expected, got)
+            self.differ(record, "", expected, got, _ADDRESS.sub("", got))
+            self._erred = record
 
     def summary(self, record: FiringRecord, got: Mapping[str, float | int | str]) -> None:
         """Compares what the operator sums up at its end: all that a sink makes."""
         expected = record.detail["summary"]
         name = next((n for n in (*expected, *got) if repr(expected.get(n)) != repr(got.get(n))), None)
         if name is not None:
-            self.differ(record, "", *(f"summary {name}: {values.get(name, 'nothing')}" for values in (expected, got)))
+            then, now = (f"summary {name}: {values.get(name, 'nothing')}" for values in (expected, got))
+            self.differ(record, "", then, now, repr(sorted(got.items())))
 
     def state(self, record: FiringRecord, packed: bytes | None) -> None:
         """Compares a snapshot, if its state was not too large to be recorded."""
@@ -98,6 +105,7 @@ class Judge:
 
     def code(self, then: Mapping[str, str], now: Mapping[str, str]) -> None:
         """Notes modules whose code is not as recorded; a recording from before these were noted has none."""
+        self.result.code_known = bool(then)
         changed = {name for name, digest in then.items() if now.get(name) != digest}
         self.result.code_changed = sorted(changed.union(self.result.code_changed))
 
@@ -106,9 +114,14 @@ class Judge:
         changed = [name for name, version in now.items() if then.get(name) != version]
         self.result.packages_changed = [f"{name} {then.get(name, '–')} -> {now[name]}" for name in changed]
 
-    def differ(self, record: FiringRecord, port: str, expected: str, got: str) -> None:
-        """Notes one difference."""
-        self.result.differing += 1
+    def differ(self, record: FiringRecord, port: str, expected: str, got: str, made: str = "") -> None:
+        """Notes one difference. `made`: what was made, where `got` does not tell all of it."""
+        self._differences.update(f"{record.incarnation} {record.index} {port} {made or got}\n".encode())
+        self.result.differences = self._differences.hexdigest()
+        if self._erred is record:
+            self._erred = None
+        else:
+            self.result.differing += 1
         if self.result.first is None:
             self.result.own_fault = self.result.tainted is None
             self.result.first = Difference(

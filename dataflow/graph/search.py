@@ -11,13 +11,14 @@ import sys
 from pathlib import Path
 
 FOLDERS: list[str] = []
-"""The folders that were added to `sys.path`, in order."""
+"""The folders that were added to `sys.path`, or were there already, in order."""
 
 
 def add_folder(folder: str | Path) -> None:
     """Lets modules be found in `folder`: before the current folder, after everything else."""
     path = os.path.abspath(folder)
-    if path in sys.path:
+    if path in sys.path:  # of PYTHONPATH, by which this process was started
+        FOLDERS.extend([] if path in FOLDERS else [path])
         return
     last = bool(FOLDERS) and sys.path[-1] == FOLDERS[-1] == _current_folder()
     sys.path.insert(len(sys.path) - last, path)

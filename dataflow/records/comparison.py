@@ -39,8 +39,10 @@ class Verification:
     lost. `cut`: the recording itself ends before the run did, and before this operator; `after_cut` are then the
     messages without a record. `not_stored` messages were made again, but are not in the recording.
     `tainted` is the index of the first firing that was given anything other than recorded; `own_fault`: the
-    first difference came before that; `states` of the differences are in snapshots, not in messages.
-    `code_changed`: its modules whose code is no longer, in any incarnation, what it was. `packages_changed`: packages
+    first difference came before that; `states` of the differences are in snapshots, not in messages; `differences`
+    is the digest of all that was made in place of what was recorded.
+    `code_changed`: its modules whose code is no longer, in any incarnation, what it was; `code_known`: the recording
+    has digests of that code. `packages_changed`: packages
     of its environment (`env:`) of which it ran other versions, such as "numpy 1.26.4 -> 2.4.6".
     `wrote` names the first message that the operator has written into, which others may be given too.
     `effects`: by name of a call how often its recorded answer was `given`, `missed`, and, where calls were made live,
@@ -54,6 +56,7 @@ class Verification:
     outputs: int = 0
     differing: int = 0
     states: int = 0
+    differences: str = ""
     unverifiable: int = 0
     beyond: int = 0
     lost_records: int = 0
@@ -71,6 +74,7 @@ class Verification:
     wrote: str = ""
     files_changed: list[str] = field(default_factory=list)
     code_changed: list[str] = field(default_factory=list)
+    code_known: bool = False
     packages_changed: list[str] = field(default_factory=list)
     effects: dict[str, dict[str, int]] = field(default_factory=dict)
 

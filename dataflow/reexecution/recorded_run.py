@@ -48,7 +48,7 @@ def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
     classes are gone, or lack a parameter or a port of then. These are external in it, so that what they made is taken
     from the recording.
 
-    Raises as `recorded_graph`.
+    Raises as `recorded_graph`; `ReplayError` where none of its operators is here.
     """
     from dataflow.graph import GraphError
     from dataflow.graph.lookup import NotFound, find_operator
@@ -61,8 +61,10 @@ def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
         if graph is None:
             raise
         absent = {name: why for name, node in graph.nodes.items() if (why := _missing(node, found[name]))}
-        if not absent or absent.keys() >= {name for name, node in graph.nodes.items() if not node.external}:
+        if not absent:
             raise
+        if absent.keys() >= {name for name, node in graph.nodes.items() if not node.external}:
+            raise ReplayError(_none_here(recording, absent, found)) from None
     nodes = {
         name: replace(node, external=True)
         if name in absent
@@ -71,6 +73,16 @@ def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
         for cls in (found[name],)
     }
     return isolated(replace(graph, nodes=nodes)), absent
+
+
+def _none_here(recording: Recording, absent: Mapping[str, str], found: Mapping[str, type[Operator] | NotFound]) -> str:
+    """Returns in words that no operator of a recording is here: each reason once, with its operators."""
+    names: dict[str, list[str]] = {}
+    for name, reason in absent.items():
+        names.setdefault(reason, []).append(name)
+    reasons = "; ".join(f"{reason} ({', '.join(of)})" for reason, of in names.items())
+    hints = [each.hint for name in absent if not isinstance(each := found[name], type) and each.hint]
+    return "\n".join([f"{recording.path}: the code of its operators is not here: {reasons}", *dict.fromkeys(hints)])
 
 
 def _missing(node: Node, found: type[Operator] | NotFound) -> str:

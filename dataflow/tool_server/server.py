@@ -10,7 +10,9 @@ from typing import Any
 
 from mcp.server.mcpserver import MCPServer
 from mcp.server.mcpserver.exceptions import ToolError
+from pydantic import ValidationError
 
+from dataflow.graph.problems import did_you_mean
 from dataflow.tool_server.jobs import MOST_BYTES, Jobs, Refused
 from dataflow.tool_server.tools import TOOLS
 
@@ -26,7 +28,7 @@ answered by a job: ask for it with job(id)."""
 def serve() -> None:
     """Serves one agent, until it closes standard input."""
     jobs = Jobs()
-    server = MCPServer("dataflow", instructions=INSTRUCTIONS)
+    server = _Server("dataflow", instructions=INSTRUCTIONS)
     for tool in (*TOOLS.values(), _job):
         server.add_tool(_served(tool, jobs), structured_output=False)
     try:
@@ -35,7 +37,43 @@ def serve() -> None:
         jobs.close()
 
 
-def _job(id: str, offset: int = 0, cancel: bool = False) -> Any:
+class _Server(MCPServer):
+    """Refuses arguments that a tool does not take, which the library would drop: a proof would pass without its
+    conditions."""
+
+    async def list_tools(self) -> Any:
+        """Returns the tools; their schemas allow no other arguments."""
+        tools = await super().list_tools()
+        for tool in tools:
+            tool.input_schema |= {"additionalProperties": False}
+        return tools
+
+    async def call_tool(self, name: str, arguments: dict[str, Any], context: Any = None) -> Any:
+        """Calls a tool. Raises `ToolError`, of wrong arguments with what would be right."""
+        tool = _job if name == "job" else TOOLS.get(name)
+        if tool is not None and (unknown := arguments.keys() - (taken := _taken(tool))):
+            others = [each for each in taken if each not in arguments]
+            told = (f"{each!r} ({did_you_mean(each, others, 'it also takes')})" for each in sorted(unknown))
+            raise ToolError(f"{name} takes no argument {', '.join(told)}")
+        try:
+            return await super().call_tool(name, arguments, context)
+        except ToolError as error:
+            if not isinstance(error.__cause__, ValidationError):
+                raise
+            wrong = {str(each["loc"][0]): each for each in error.__cause__.errors()}
+            told = (
+                f"{each} is missing" if of["type"] == "missing" else f"{each}={arguments[each]!r}: {of['msg']}"
+                for each, of in wrong.items()
+            )
+            raise ToolError(f"{name}: {'; '.join(told)}") from None
+
+
+def _taken(tool: Callable[..., Any]) -> list[str]:
+    """Returns the arguments that agents give to a tool."""
+    return [name for name in inspect.signature(tool).parameters if name != "say"]
+
+
+def _job(id: str | int, offset: int = 0, cancel: bool = False) -> Any:
     """Give the answer of a job from a byte on, or how far it is; `cancel` ends it."""
 
 
@@ -46,7 +84,7 @@ def _served(tool: Callable[..., Any], jobs: Jobs) -> Callable[..., Awaitable[str
     async def call(**arguments: Any) -> str:
         try:
             if tool is _job:
-                asked = functools.partial(jobs.job, arguments.pop("id"), **arguments)
+                asked = functools.partial(jobs.job, str(arguments.pop("id")), **arguments)
                 return await asyncio.to_thread(asked)
             return await asyncio.to_thread(jobs.call, tool.__name__, arguments)
         except Refused as error:

@@ -21,6 +21,8 @@ MOST_CALLS = 200
 MOST_CHANGED = 50
 """Changed calls that `prove` names."""
 
+CallName = str | int
+"""The number of a call, or in text also "@SECONDS" and "diff"."""
 Say = Callable[[str], None]
 """Takes a line about how far the work is."""
 
@@ -38,7 +40,7 @@ def verify(
     field; its `call` is the number for the other tools. `only`: these operators; `graph`: a graph file in place of
     the recorded graph; `path`: folders of modules.
     """
-    return _verified(_verify(_file(recording), only, _loaded(graph))[1])
+    return _verified(_verify(_file(recording), only, _loaded(graph)))
 
 
 def why(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None) -> Any:
@@ -47,14 +49,14 @@ def why(recording: str, operator: str, graph: str | None = None, path: list[str]
     from dataflow.causes.why import why as find
 
     file, loaded = _file(recording), _loaded(graph)
-    return find(file, _verify(file, [operator], loaded)[1], operator, graph=loaded).as_json()
+    return find(file, _verify(file, [operator], loaded), operator, graph=loaded).as_json()
 
 
-def goto(recording: str, operator: str, call: str, graph: str | None = None, path: list[str] | None = None) -> Any:
+def goto(recording: str, operator: str, call: CallName, graph: str | None = None, path: list[str] | None = None) -> Any:
     """Make one recorded call of an operator again: what it was given, made, and changed, against the recording.
 
-    `call`: its number ("0" is the first, "-1" the last), "@12.3" (the last one by 12.3 s), or "diff" (the first that
-    does not give what was recorded).
+    `call`: its number (0 is the first, -1 the last), "@12.3" (the last one by 12.3 s), or "diff" (the first that does
+    not give what was recorded).
     """
     with _debugger(recording, operator, graph) as (debugger, origin, _):
         return _shown(_at(debugger, origin, call), debugger, origin)
@@ -66,7 +68,12 @@ def diff(recording: str, operator: str, graph: str | None = None, path: list[str
 
 
 def state(
-    recording: str, operator: str, call: str, part: str = "", graph: str | None = None, path: list[str] | None = None
+    recording: str,
+    operator: str,
+    call: CallName,
+    part: str = "",
+    graph: str | None = None,
+    path: list[str] | None = None,
 ) -> Any:
     """Show the state of an operator before and after a call (as in `goto`): the parts it changed, or the one named."""
     from dataflow.execution.snapshots import changes
@@ -75,7 +82,7 @@ def state(
         fired = _at(debugger, origin, call)
         before, after = fired.states()
         if before is None or after is None:
-            raise ToolError(f"{debugger.node.name} has no state")
+            raise ToolError(debugger.no_state())
         if part and part not in {*before, *after}:
             raise ToolError(f"no part {part!r} in the state; there are: {', '.join(sorted({*before, *after}))}")
         pairs = [(part, before.get(part), after.get(part))] if part else list(changes(before, after))
@@ -136,15 +143,18 @@ def history(
                 values.append({"call": fired.number, "stamp": fired.call.stamp, "value": value})
             return len(values) == MOST_CALLS
 
-        reached = _each(debugger, begin, end, visit)
+        found = debugger.until(visit, first=begin, last=end)
+        reached, not_made = end if found is None else found.number, _not_made(debugger)
+        if not values and debugger.unmade is not None:
+            raise ToolError(f"{debugger.node.name}, calls {begin} to {end}: {debugger.unmade}")
     rest = {} if reached == end else {"next": f"history with first={reached + 1} goes on"}
-    return {"field": field, "calls": [begin, reached], "changes": values} | rest
+    return {"field": field, "calls": [begin, reached], "changes": values} | not_made | rest
 
 
 def what_if(
     recording: str,
     operator: str,
-    call: str,
+    call: CallName,
     params: dict[str, Any] | None = None,
     show: str = "",
     graph: str | None = None,
@@ -168,15 +178,15 @@ def capture(
     recording: str,
     operator: str,
     to: str,
-    call: int | None = None,
+    call: CallName | None = None,
     predicate: str = "",
     graph: str | None = None,
     path: list[str] | None = None,
 ) -> Any:
     """Write a wrong call of an operator as a pytest file with the smallest inputs that still show it.
 
-    `to`: the file, which must not exist (test_NAME.py; its data lie beside it). `call`: its number, by default the
-    first wrong one. `predicate`: a Python expression, true of a wrong call; by default: not as recorded, or an error.
+    `to`: the file, which must not exist (test_NAME.py; its data lie beside it). `call`: as in `goto`, by default
+    the first wrong one. `predicate`: a Python expression, true of a wrong call; by default: not as recorded, or error.
     """
     from dataflow.capture.capture import capture as find
     from dataflow.capture.capture import write_test
@@ -186,8 +196,8 @@ def capture(
         raise ToolError(f"to={to!r}: expected a new file that ends in .py, in a folder that exists")
     if predicate:
         _compiled("predicate", predicate)
-    with _debugger(recording, operator, graph) as (debugger, _, opened):
-        found = find(opened, debugger, call, predicate)
+    with _debugger(recording, operator, graph) as (debugger, origin, opened):
+        found = find(opened, debugger, None if call is None else _at(debugger, origin, call).number, predicate)
     words = ["dataflow", "capture", Path(recording).name, "--op", operator, "--firing", str(found.number)]
     words += ["--predicate", predicate] * bool(predicate) + ["--graph", graph or ""] * bool(graph)
     words += [word for folder in path or () for word in ("--path", folder)]
@@ -207,7 +217,8 @@ def blame(
 ) -> Any:
     """Find what decided a value: the chain of calls back to the sensors' messages, each shown by re-execution.
 
-    `field`: STREAM.FIELD@SECONDS, such as "tracks.ids[3]@12.4"; `budget`: seconds to look for it.
+    `field`: STREAM.FIELD@SECONDS, such as "tracks.ids[3]@12.4"; `budget`: seconds to look for it. Where `whole` of the
+    answer is false, `sensed` may lack what decided: nothing that was tried shows it, or not all could be tried.
     """
     from dataflow.blame.chain import Blame
     from dataflow.blame.field import Field
@@ -248,7 +259,7 @@ def drops(
 def prove(
     recording: str,
     operator: str,
-    call: str,
+    call: CallName,
     expect: str,
     may_change: str = "True",
     right: str | None = None,
@@ -264,46 +275,57 @@ def prove(
     calls of the operator that change are such that `may_change` is true, and every other operator that is given the
     recorded inputs makes what was recorded. Both are Python expressions over a call: inp, out, stamp, number, same,
     error; `expect` also sees before and after, the states. `call`: as in `goto`. `right`: a recording that right code
-    made: the operator makes all that is recorded there, too.
+    made: the operator makes all that is recorded there, too. Operators that do not repeat with the recorded code either
+    are named, and not judged. Nothing is proven where calls could not be made again.
     """
+    from dataflow.tool_server.proof import judge
+
     expected, allowed = _compiled("expect", expect), _compiled("may_change", may_change)
-    with _debugger(recording, operator, graph, params) as (debugger, origin, _):
+    with _debugger(recording, operator, graph, params) as (debugger, origin, opened):
         fired = _at(debugger, origin, call)
         number, name, changed_graph = fired.number, debugger.node.name, debugger.graph
         meets, differs = bool(_evaluated(expected, expect, _names(fired))), not fired.same
-        shown, changed, refused = _shown(fired, debugger, origin), list[int](), list[int]()
+        shown = _shown(fired, debugger, origin)
         say(f"call {number} of {name} made again; all its calls follow")
-
-        def visit(each: Fired) -> bool:
-            if not each.same:
-                changed.append(each.number)
-                if each.number != number and not _evaluated(allowed, may_change, each.names()):
-                    refused.append(each.number)
-            return False
-
-        _each(debugger, 0, len(debugger.calls) - 1, visit)
-    say("all operators are verified")
-    with_graph = changed_graph if graph or params else None
-    others, report = _verify(_file(recording), None, with_graph)
-    verdicts = {v.operator: report.verdict(v) for v in report.operators if v.operator != name}
-    after = _downstream(changed_graph, name)
-    wrong = {n: v for n, v in verdicts.items() if v != "identical" and not (v == "downstream" and n in after)}
-    bad: dict[str, str] = {**wrong, **dict.fromkeys(others, "not re-executed")}
+        changed, refused = _changed(debugger, lambda each: _evaluated(allowed, may_change, each.names()), but=number)
+        say("all operators are verified")
+        with_graph = changed_graph if graph or params else None
+        report = _verify(_file(recording), None, with_graph)
+        others = judge(opened, report, changed_graph, name)
     of_right = "identical" if right is None else _verdict(_file(right), name, with_graph)
     reasons = [
         *(() if differs else [f"call {number} still gives what was recorded"]),
         *(() if meets else [f"call {number}: expect is false: {expect}"]),
         *([f"calls that may not change do: {refused[:MOST_CHANGED]}"] if refused else ()),
-        *([f"other operators: {bad}"] if bad else ()),
+        *([] if debugger.unmade is None else [f"{name}: {debugger.unmade}"]),
+        *([f"{name} does not repeat: it differs each time"] if report.repeats(name) is False else ()),
+        *([f"other operators: {others.reasons}"] if others.reasons else ()),
         *([f"{name} in {right}: {of_right}"] if of_right != "identical" else ()),
     ]
+    changes = {"count": len(changed), "of": len(debugger.calls), "first": changed[:MOST_CHANGED]}
     return {
         "proven": not reasons,
         "reasons": reasons,
-        "changed_calls": {"count": len(changed), "of": len(debugger.calls), "first": changed[:MOST_CHANGED]},
-        "other_operators": {v: sorted(n for n, of in verdicts.items() if of == v) for v in set(verdicts.values())},
+        "do_not_repeat": others.unrepeated,
+        "changed_calls": changes | _not_made(debugger),
+        "other_operators": _by_verdict(report, name),
         "call": shown,
     }
+
+
+def _changed(debugger: Debugger, may: Callable[[Fired], Any], *, but: int) -> tuple[list[int], list[int]]:
+    """Returns the calls that do not give what was recorded, and those of them that may not; call `but` may."""
+    changed, refused = list[int](), list[int]()
+
+    def visit(each: Fired) -> bool:
+        if not each.same:
+            changed.append(each.number)
+            if each.number != but and not may(each):
+                refused.append(each.number)
+        return False
+
+    debugger.until(visit, first=0)
+    return changed, refused
 
 
 TOOLS: Mapping[str, Callable[..., Any]] = {
@@ -345,27 +367,40 @@ def _loaded(graph: str | None) -> Graph | None:
     return None if graph is None else load_graph(graph)
 
 
-def _verify(file: Path, only: Sequence[str] | None, graph: Graph | None) -> tuple[list[str], VerifyReport]:
-    """Returns the recorded operators that were left out, and the report."""
+def _verify(file: Path, only: Sequence[str] | None, graph: Graph | None) -> VerifyReport:
     from dataflow.verification.verify import verify as verify_recording
 
-    report = verify_recording(file, graph=graph, only=only or None)
-    return sorted(report.absent), report
+    return verify_recording(file, graph=graph, only=only or None)
 
 
 def _verdict(file: Path, operator: str, graph: Graph | None) -> str:
-    """Returns the verdict of verification on one operator."""
-    report = _verify(file, [operator], graph)[1]
-    return next((report.verdict(v) for v in report.operators if v.operator == operator), "not re-executed")
+    """Returns the verdict of verification on one operator, or which of its calls could not be made."""
+    from dataflow.tool_server.proof import unmade
+
+    report = _verify(file, [operator], graph)
+    found = next((v for v in report.operators if v.operator == operator), None)
+    return "not re-executed" if found is None else unmade(found) or report.verdict(found)
+
+
+def _by_verdict(report: VerifyReport, but: str = "") -> dict[str, list[str]]:
+    from dataflow.tool_server.proof import unmade
+
+    found: dict[str, list[str]] = {}
+    for v in report.operators:
+        if v.operator != but:
+            verdict = report.verdict(v)
+            words = "identical up to the cut" if verdict == "identical" and unmade(v) else verdict
+            found.setdefault(words, []).append(v.operator)
+    return found
 
 
 def _verified(report: VerifyReport) -> dict[str, Any]:
-    """Returns the report, of identical operators the names alone."""
+    """Returns the report; of operators that are identical, and of which all calls were made, the names alone."""
+    from dataflow.tool_server.proof import unmade
+
     values = report.as_json()
-    by: dict[str, list[str]] = {}
-    for each in values["operators"]:
-        by.setdefault(each["verdict"], []).append(each["operator"])
-    values["verdicts"] = by
+    values["verdicts"] = _by_verdict(report)
+    values["not_made"] = {v.operator: told for v in report.operators if (told := unmade(v))}
     values["operators"] = [each for each in values["operators"] if each["verdict"] != "identical"]
     return {name: value for name, value in values.items() if value not in ([], {}, None)}
 
@@ -404,17 +439,20 @@ def _with(graph: Graph | None, recording: Recording, operator: str, params: Mapp
     return replace(graph, nodes={**graph.nodes, operator: replace(node, params=changed)})
 
 
-def _at(debugger: Debugger, origin: int, call: str) -> Fired:
+def _at(debugger: Debugger, origin: int, call: CallName) -> Fired:
     if call == "diff":
-        if (found := debugger.first_difference()) is None:
-            raise ToolError(f"{debugger.node.name}: all {len(debugger.calls)} calls give what was recorded")
-        return found
+        if (found := debugger.first_difference()) is not None:
+            return found
+        if (unmade := debugger.unmade) is not None:
+            made = len(debugger.calls) - unmade.count
+            raise ToolError(f"{debugger.node.name}: {made} calls give what was recorded; {unmade}")
+        raise ToolError(f"{debugger.node.name}: all {len(debugger.calls)} calls give what was recorded")
+    text = str(call)
     try:
-        if call.startswith("@"):
-            return debugger.goto(debugger.number_at(origin + round(float(call[1:]) * 1e9)))
-        number = int(call)
-    except ValueError:
-        raise ToolError(f'call={call!r}: expected a number such as "7" or "-1", "@SECONDS" or "diff"') from None
+        at_time = text.startswith("@")
+        number = debugger.number_at(origin + round(float(text[1:]) * 1e9)) if at_time else int(text)
+    except (ValueError, OverflowError):
+        raise ToolError(f'call={call!r}: expected a number such as 7 or -1, "@SECONDS" or "diff"') from None
     return debugger.goto(number)
 
 
@@ -425,16 +463,15 @@ def _number(debugger: Debugger, number: int) -> int:
     return range(count)[number]
 
 
-def _each(debugger: Debugger, begin: int, end: int, visit: Callable[[Fired], bool]) -> int:
-    """Visits the calls from one number to another, until a visit returns true; returns the number of the last one."""
-    debugger.at = debugger.goto(begin - 1) if begin else None
-    found = debugger.until(lambda fired: visit(fired) or fired.number == end)
-    return end if found is None else found.number
-
-
 def _shown(fired: Fired, debugger: Debugger, origin: int) -> dict[str, Any]:
     given = {m.port: _fields(m.here) for m in fired.made}
-    return fired.as_json(debugger.node.name, origin) | {"of": len(debugger.calls), "made": given}
+    more = {"of": len(debugger.calls), "made": given} | _not_made(debugger)
+    return fired.as_json(debugger.node.name, origin) | more
+
+
+def _not_made(debugger: Debugger) -> dict[str, Any]:
+    """Returns what the last search has passed by, since it cannot be made again; nothing where there is nothing."""
+    return {} if debugger.unmade is None else {"not_made": asdict(debugger.unmade)}
 
 
 def _fields(message: Any) -> Any:
@@ -468,14 +505,3 @@ def _evaluated(code: Any, text: str, names: dict[str, Any]) -> Any:
         raise ToolError(
             f"{text} at call {names['number']}: {type(error).__name__}: {error}; there are: {there}"
         ) from None
-
-
-def _downstream(graph: Graph, operator: str) -> set[str]:
-    """Returns the operators that take, directly or not, what one makes."""
-    found, waiting = set[str](), [operator]
-    while waiting:
-        name = waiting.pop()
-        more = {node.name for stream in graph.nodes[name].outputs.values() for node, _ in graph.consumers(stream)}
-        waiting += more - found
-        found |= more
-    return found

@@ -55,12 +55,13 @@ class VerifyReport:
     could not be. `facts` are what differs between the machine that recorded and this one: (fact, then, now). `wall`:
     seconds of re-execution, operators' set-up not included; `total`: of everything; `span`: seconds of event time.
     `comparisons` hold, for the operators that differ, how their messages compare with the recorded ones; `repeated`,
-    for culprits that were run twice, whether they differed alike. `digests` are (messages, stream digest) of what was
+    for culprits that were run twice, whether they made the same. `digests` are (messages, stream digest) of what was
     made here, by stream; `outputs` the streams of each operator, `producers` the nodes that it takes from.
     `start`: seconds into the recording, where it began there. `torn`: the recording has no proper end, so only
     its stored part is verified. `part`: the recording is a part of another, cut out of it. `work` is how long each
     operator worked, `reading` the CPU seconds for which that worker read the recording that read most of it.
     `absent` are operators whose code is not here, and why: their messages are taken from the recording.
+    `changes` are, by operator, what the graph has otherwise than the recorded one.
     `shared` are operators that make what was recorded, but not always in one process with those named; `mates` are, by
     operator, those that ran in its process.
     """
@@ -88,6 +89,7 @@ class VerifyReport:
     work: Mapping[str, OperatorCounts] = field(default_factory=dict)
     reading: float = 0.0
     absent: Mapping[str, str] = field(default_factory=dict)
+    changes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     shared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     mates: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -145,6 +147,17 @@ class VerifyReport:
         """Returns whether a culprit differed twice alike; None where it was not run twice."""
         return self.repeated.get(operator)
 
+    def altered(self, operator: str) -> tuple[str, ...]:
+        """Returns the facts in the recording, of an operator and its machine, that are not as they were then."""
+        v = next(v for v in self.operators if v.operator == operator)
+        return (
+            *self.changes.get(operator, ()),
+            *(f"code of {module}" for module in v.code_changed),
+            *(f"file {file}" for file in v.files_changed),
+            *v.packages_changed,
+            *(f"{fact}: {then or 'none'} → {now or 'none'}" for fact, then, now in self.facts),
+        )
+
     def as_json(self) -> dict[str, Any]:
         operators = []
         for v in self.operators:
@@ -175,6 +188,7 @@ class VerifyReport:
             "stored": [s.to_wire() for s in self.stored if not s.as_recorded or s.missing],
             "unchecked": list(self.unchecked),
             "absent": dict(self.absent),
+            "changes": {name: list(changes) for name, changes in self.changes.items()},
             "shared": {name: list(beside) for name, beside in self.shared.items()},
             "differing_facts": [{"fact": f, "recorded": a, "here": b} for f, a, b in self.facts],
         }

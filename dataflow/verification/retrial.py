@@ -15,17 +15,20 @@ from dataflow.supervision.core.report import RunFailed
 
 Answer = Mapping[str, Any]
 """The answer of `part.verify_part`."""
+First = tuple[int, int, str]
+"""A first difference: incarnation, index of the record, what was made."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Operators to be re-executed in one process, until each of those `asked` has differed, or to their end.
+    """Operators to be re-executed in one process to their end, or until each of those `asked` has differed otherwise
+    than first at the place, and by the result, that is given for it (None: than not at all).
 
     `wired`: they are given what they make themselves, as in the run, not what was recorded of it.
     """
 
     operators: frozenset[str]
-    asked: tuple[str, ...] = ()
+    asked: Mapping[str, First | None] = field(default_factory=dict)
     wired: bool = False
 
 
@@ -36,9 +39,9 @@ Try = Callable[[Sequence[Trial]], Sequence[Answer]]
 class Retrial:
     """The outcome for culprits that were tried again.
 
-    `repeated`: whether they differed alike both times, in the process that they had. `instead` are the answers
-    that count for operators rather than those of the first trial. `shared` names, by operator that makes what was
-    recorded, those that share its process where it does not, or where alone it does. `wrote`: the messages that
+    `repeated`: whether both times they made the same, to the end, in the process that they had. `instead` are the
+    answers that count for operators rather than those of the first trial. `shared` names, by operator that makes what
+    was recorded, those that share its process where it does not, or where alone it does. `wrote`: the messages that
     operators wrote into, by operator.
     """
 
@@ -55,7 +58,7 @@ def retry(
     outcome = Retrial()
     first = {name: _first(of[name], name) for name in culprits}
     told = _try(outcome, _grouped(first, mates), attempt)
-    alike = [name for name in told if _first(told[name], name) == first[name]]
+    alike = [name for name in told if _alike(told[name], of[name], name)]
     outcome.repeated.update(dict.fromkeys(alike, True))
     _acquit_in_company(outcome, [name for name in alike if len(mates[name]) > 1], of, mates, attempt)
     apart = {name: answer for name, answer in told.items() if name not in alike}
@@ -69,9 +72,10 @@ def retry(
 def _acquit_apart(outcome: Retrial, suspects: Mapping[str, Answer], of: Mapping[str, Answer], attempt: Try) -> None:
     """Acquits operators that make what was recorded in the process that they had, if beside those of the first trial
     they differ again, and alike."""
-    beside = _grouped(suspects, {name: frozenset(of[name]["operators"]) for name in suspects})
+    first = {name: _first(of[name], name) for name in suspects}
+    beside = _grouped(first, {name: frozenset(of[name]["operators"]) for name in suspects})
     for name, answer in _try(outcome, beside, attempt).items():
-        if _first(answer, name) == _first(of[name], name):
+        if _alike(answer, of[name], name):
             del outcome.repeated[name]
             outcome.instead[name] = suspects[name]
             outcome.shared[name] = _others(of[name], suspects[name])
@@ -86,7 +90,7 @@ def _acquit_in_company(
 ) -> None:
     """Acquits operators that had company if they make what was recorded alone, or given what that company makes."""
     for name in suspects:
-        for trial in Trial(frozenset({name}), (name,)), Trial(mates[name], (name,), wired=True):
+        for trial in Trial(frozenset({name}), {name: None}), Trial(mates[name], {name: None}, wired=True):
             try:
                 answer = _try(outcome, [trial], attempt)[name]
             except RunFailed as failure:
@@ -108,17 +112,17 @@ def _confirm(
     trials = [Trial(operators) for operators in dict.fromkeys(mates[name] for name in suspects)]
     for trial, answer in zip(trials, attempt(trials) if trials else (), strict=True):
         for name in trial.operators & suspects.keys():
-            if _first(answer, name) == _first(suspects[name], name):
+            if _alike(answer, suspects[name], name):
                 outcome.repeated[name] = True
                 outcome.instead[name] = answer
 
 
-def _grouped(names: Iterable[str], mates: Mapping[str, frozenset[str]]) -> list[Trial]:
-    """One trial for all that share a process."""
-    groups: dict[frozenset[str], list[str]] = {}
-    for name in names:
-        groups.setdefault(mates[name], []).append(name)
-    return [Trial(operators, tuple(asked)) for operators, asked in groups.items()]
+def _grouped(first: Mapping[str, First | None], mates: Mapping[str, frozenset[str]]) -> list[Trial]:
+    """One trial for all that share a process. `first`: how each differed first."""
+    groups: dict[frozenset[str], dict[str, First | None]] = {}
+    for name, found in first.items():
+        groups.setdefault(mates[name], {})[name] = found
+    return [Trial(operators, asked) for operators, asked in groups.items()]
 
 
 def _try(outcome: Retrial, trials: Sequence[Trial], attempt: Try) -> dict[str, Answer]:
@@ -139,10 +143,21 @@ def _wrote(answer: Answer) -> dict[str, str]:
     return {name: values["wrote"] for name, values in answer["operators"].items() if values["wrote"]}
 
 
-def _first(answer: Answer, name: str) -> Any:
-    """The first difference of an operator in an answer: where and what; None where there is none."""
+def _alike(answer: Answer, other: Answer, name: str) -> bool:
+    """Returns whether an operator made the same twice: the same first difference, and the same to the end."""
+    return _first(answer, name) == _first(other, name) and _made(answer, name) == _made(other, name)
+
+
+def _first(answer: Answer, name: str) -> First | None:
+    """The first difference of an operator in an answer; None where there is none."""
     first = answer["operators"][name]["first"]
     return None if first is None else (first["incarnation"], first["index"], first["got"])
+
+
+def _made(answer: Answer, name: str) -> Any:
+    """All that an operator made otherwise than recorded, in an answer: how much, its digest, and the calls of them."""
+    values = answer["operators"][name]
+    return [values[key] for key in ("verified", "differing", "states", "differences")]
 
 
 def mates_of(placed: Mapping[str, str], operators: Collection[str]) -> dict[str, frozenset[str]]:

@@ -37,7 +37,7 @@ from dataflow.verification.choice import (
     without_environments,
 )
 from dataflow.verification.compare import OutputComparison
-from dataflow.verification.facts import differing_facts
+from dataflow.verification.facts import changes_of, differing_facts
 from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
 from dataflow.verification.report import StandIn, VerifyReport
 from dataflow.verification.retrial import Retrial, Trial, mates_of, retry
@@ -78,6 +78,7 @@ class _Task:
     torn: bool
     placed: Mapping[str, str]
     absent: Mapping[str, str]
+    changes: Mapping[str, tuple[str, ...]]
 
 
 def verify(
@@ -131,7 +132,7 @@ def verify(
         "tolerance": tolerance,
         "checks": [],
         "slices": {},
-        "until": [],
+        "until": {},
         "guard": paranoid,
         "live_effects": live_effects,
     }
@@ -213,6 +214,7 @@ def _prepare(
                 n: f"{at} {played.nodes[n].env or ''}" for n, at in processes_of(recording).items() if n in played.nodes
             },
             absent=absent,
+            changes={} if graph is None else changes_of(recording, graph),
         )
 
 
@@ -339,6 +341,7 @@ def _report(
         part=task.ledger.part,
         work={name: OperatorCounts(*answer["work"][name]) for name, answer in of.items()},
         absent=task.absent,
+        changes=task.changes,
         repeated=retrial.repeated,
         shared=retrial.shared,
         mates={name: tuple(sorted(mates - {name})) for name, mates in mates_of(task.placed, task.operators).items()},
@@ -395,7 +398,7 @@ def _retry(task: _Task, culprits: Iterable[str], answers: Sequence[Mapping[str, 
             chosen = with_makers(task.held - made, task.graph, set(trial.operators))
             operators = tuple(name for name in task.operators if name in chosen)
             incomplete = sorted(task.incomplete.union(made))
-            calls.append(({"until": list(trial.asked), "incomplete": incomplete, "guard": True}, operators))
+            calls.append(({"until": dict(trial.asked), "incomplete": incomplete, "guard": True}, operators))
         at_once = len(task.parts)
         return [answer for k in range(0, len(calls), at_once) for answer in attempt(calls[k : k + at_once])]
 

@@ -13,9 +13,10 @@ import pytest
 
 import dataflow
 from dataflow.blame import chain as chain_module
-from dataflow.blame.chain import Blame, BlameError, Chain
+from dataflow.blame.chain import Blame, BlameError
 from dataflow.blame.field import Field, differ
 from dataflow.blame.line import Line
+from dataflow.blame.links import Chain
 from dataflow.blame.nudge import nudged
 from dataflow.graph import load_text
 from dataflow.graph.model import Node
@@ -162,7 +163,7 @@ def test_where_the_search_among_earlier_calls_ended_is_named(tmp_path: Path) -> 
     assert sensed(chain) == {("a", 38), ("a", 39), ("a", 40)}
 
 
-def test_two_inputs_that_each_suffice_are_named_together_and_not_followed(tmp_path: Path) -> None:
+def test_two_inputs_that_each_suffice_are_named_together_and_the_readings_behind_them(tmp_path: Path) -> None:
     a, b, c = ([blamed_graphs.reading(0, s, k) for k in range(blamed_graphs.STEPS)] for s in "abc")
     large = [(x >= blamed_graphs.HALF, y / 2 + z / 2 >= blamed_graphs.HALF) for x, y, z in zip(a, b, c, strict=True)]
     k = next(k for k in range(2, len(large)) if all(large[k]) and not any(large[k - 1]))
@@ -173,8 +174,11 @@ def test_two_inputs_that_each_suffice_are_named_together_and_not_followed(tmp_pa
     with Recording(path) as recording:
         chain = Blame(recording, Field.parse(blamed_graphs.at(k, "either/out"))).find()
 
-    assert [(link.call, link.input) for link in chain.links] == [(("either", k), "x"), (("either", k), "y")]
-    assert {effect.together for link in chain.links for effect in link.effects} == {2}
+    inputs = {link.input: link for link in chain.links if link.call == ("either", k)}
+    assert set(inputs) == {"x", "y"}
+    assert {effect.together for link in inputs.values() for effect in link.effects} == {2}
+    assert {stream for stream, _ in sensed(chain)} in ({"a", "b"}, {"a", "c"}, {"a", "b", "c"})
+    assert {number for _, number in sensed(chain)} == {k}
 
 
 @pytest.mark.parametrize("offset", [-HOUR, HOUR])

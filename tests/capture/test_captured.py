@@ -34,6 +34,12 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tuned.recorded(tmp_path_factory.mktemp("changed") / "run.mcap")
 
 
+@pytest.fixture(autouse=True)
+def _made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """New processes are for `test_repeats`."""
+    monkeypatch.setattr("dataflow.capture.capture.check_repeats", lambda made: None)
+
+
 def captured(path: Path, operator: str = "bug", number: int | None = None, predicate: str = "") -> Captured:
     with Recording(path) as recording:
         return capture(recording, Debugger(recording, operator), number, predicate).captured

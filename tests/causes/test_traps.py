@@ -21,28 +21,28 @@ LOG = """
 import json
 from dataflow.causes.places import Places
 from dataflow.causes.traps import Traps
-traps = Traps(Places(["chancy"]))
+traps = Traps(Places([{module!r}]))
 traps.set()
-import chancy
-chancy.read()
+import {module}
+{module}.read()
 traps.lift()
 print(json.dumps([[source, site.file, site.line, site.call, count] for (source, site), count in traps.counts.items()]))
 """
 FIX = """
 from dataflow.causes.interventions import Interventions
 from dataflow.causes.places import Places
-interventions = Interventions(Places(["chancy"]), 1_700_000_000_000_000_000)
+interventions = Interventions(Places([{module!r}]), 1_700_000_000_000_000_000)
 interventions.fix({fixed!r})
 interventions.vary({varied!r})
-import chancy
-print(chancy.read())
+import {module}
+print({module}.read())
 """
 
 NAMES = {"datetime": datetime, "UUID": str}
 
 
-def ran(program: str) -> str:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path]), "CHANCY": "7"}
+def ran(program: str, **more: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path]), "CHANCY": "7", **more}
     done = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=100, check=False
     )
@@ -53,7 +53,7 @@ def ran(program: str) -> str:
 @pytest.fixture(scope="module")
 def logged() -> set[tuple[str, str]]:
     """The sources that were logged, each with the text of its line."""
-    found = json.loads(ran(LOG))
+    found = json.loads(ran(LOG.format(module="chancy")))
     assert {file for _, file, *_ in found} == {str(HERE / "chancy.py")}
     return {(source, SOURCE[line - 1].strip()) for source, _, line, _, _ in found}
 
@@ -92,8 +92,8 @@ def test_waits_of_the_standard_library_are_no_clock_of_the_operator(logged: set[
 
 
 def test_what_is_fixed_is_the_same_in_every_process_and_nothing_else_is() -> None:
-    fixed = FIX.format(fixed=set(CHANCE), varied=set())
-    free = FIX.format(fixed=set(), varied=set())
+    fixed = FIX.format(module="chancy", fixed=set(CHANCE), varied=set())
+    free = FIX.format(module="chancy", fixed=set(), varied=set())
 
     one, other, third, fourth = (eval(ran(p), NAMES) for p in (fixed, fixed, free, free))
 
@@ -113,7 +113,10 @@ def test_what_is_fixed_is_the_same_in_every_process_and_nothing_else_is() -> Non
     ],
 )
 def test_a_source_that_is_left_free_is_free_alone(free: str, changes: set[str]) -> None:
-    programs = FIX.format(fixed=set(CHANCE), varied=set()), FIX.format(fixed=set(CHANCE) - {free}, varied=set())
+    programs = (
+        FIX.format(module="chancy", fixed=set(CHANCE), varied=set()),
+        FIX.format(module="chancy", fixed=set(CHANCE) - {free}, varied=set()),
+    )
 
     one, other = (eval(ran(p), NAMES) for p in programs)
 
@@ -123,7 +126,7 @@ def test_a_source_that_is_left_free_is_free_alone(free: str, changes: set[str]) 
 def test_what_is_varied_differs() -> None:
     varied = {sources.WALL, sources.named(sources.VARIABLE, "CHANCY")}
 
-    found = eval(ran(FIX.format(fixed=set(), varied=varied)), NAMES)
+    found = eval(ran(FIX.format(module="chancy", fixed=set(), varied=varied)), NAMES)
 
     assert found["variable"] == "8"
     assert (found["date"] - datetime.date.today()).days in (400, 401)
@@ -132,3 +135,58 @@ def test_what_is_varied_differs() -> None:
 @pytest.mark.parametrize(("value", "other"), [(None, "7"), ("3", "4"), ("0.5", "1.5"), ("fast", "fast_"), ("/", "/")])
 def test_a_variable_is_changed_to_another_value_of_its_kind(value: str | None, other: str) -> None:
     assert changed(value) == other
+
+
+FILES, FOLDERS = ("at_import", "dated", "sized", "asked"), ("listed", "scanned", "found")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files and folders at which `looking` looks."""
+    made = tmp_path_factory.mktemp("looking")
+    for name in FILES:
+        (made / name).write_text(name)
+    for name in FOLDERS:
+        (made / name).mkdir()
+        (made / name / "one").write_text("")
+    return made
+
+
+def test_files_that_are_read_at_import_or_looked_at_and_folders_that_are_listed_are_logged_and_no_others(
+    folder: Path,
+) -> None:
+    found = json.loads(ran(LOG.format(module="looking"), LOOKING=str(folder)))
+
+    assert {file for _, file, *_ in found} == {str(HERE / "looking.py")}
+    read = {source for source, *_ in found if not source.startswith(sources.VARIABLE)}
+    assert read == {
+        sources.WORKING,
+        *(sources.named(sources.FILE, str(folder / name)) for name in FILES),
+        *(sources.named(sources.FOLDER, str(folder / name)) for name in FOLDERS),
+    }
+
+
+def test_a_file_that_is_hidden_is_neither_found_nor_listed_and_the_working_folder_has_another_name(
+    folder: Path,
+) -> None:
+    hidden = {sources.named(sources.FILE, str(folder / name)) for name in FILES[1:]}
+    hidden |= {sources.named(sources.FOLDER, str(folder / name)) for name in FOLDERS} | {sources.WORKING}
+
+    found = eval(ran(FIX.format(module="looking", fixed=set(), varied=hidden), LOOKING=str(folder)))
+
+    assert {name: found[name] for name in ("listed", "scanned", "found", "time", "size", "there")} == {
+        "listed": [],
+        "scanned": [],
+        "found": 0,
+        "time": [],
+        "size": [],
+        "there": False,
+    }
+    assert found["here"] == found["here too"] == "/proc/self/cwd"
+
+
+def test_a_file_that_is_read_at_import_is_hidden_there(folder: Path) -> None:
+    hidden = {sources.named(sources.FILE, str(folder / "at_import"))}
+
+    with pytest.raises(AssertionError, match="FileNotFoundError"):
+        ran(FIX.format(module="looking", fixed=set(), varied=hidden), LOOKING=str(folder))

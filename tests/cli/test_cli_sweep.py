@@ -335,7 +335,11 @@ def test_two_settings_are_compared_pair_by_pair(dataflow, folder: Path, tmp_path
 
     words = ("--set", "b:scaled.by=3", "--set", "a:scaled.fail_at=5")
     failed = json.loads(dataflow("compare", folder / "graph.yaml", *given, *words, code=1).stdout)
-    assert failed["failed"] == [{"settings": {"scaled.fail_at": "5"}, "outcomes": {"failed": 2}}]
+    assert [(one["side"], one["recording"], one["outcome"]) for one in failed["failed"]] == [
+        ("a", "deep/second.mcap", "failed"),
+        ("a", "first.mcap", "failed"),
+    ]
+    assert all("operator 'scaled'" in one["error"] for one in failed["failed"])
 
 
 @pytest.mark.long

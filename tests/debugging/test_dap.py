@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tampering import Kept, as_it_is, tampered
 
 import dataflow
 from dataflow.debugging.dap.session import Session, listen
-from dataflow.debugging.debugger import Debugger
+from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Abandoned, Probe
-from dataflow.debugging.lines import homes_of, is_own
+from dataflow.debugging.lines import homes_of, is_own, lines_of
 from dataflow.messages.base import Message
-from dataflow.recording import Recording
+from dataflow.recording import Recorded, Recording
 from dataflow.sync import Firing
 
 SOURCE = '''
@@ -577,3 +578,83 @@ def test_a_client_that_sends_nothing_ends_the_session(
         session = Session(ours, Debugger(recorded[0], "adder"), 0)
         session.serve()
         assert session._over
+
+
+def test_a_line_behind_the_end_of_the_file_names_the_last_one(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded) as client:
+        (told,) = client.breakpoints(100_000)
+        client.ask("configurationDone")
+        client.stopped()
+    assert not told["verified"]
+    last = max(lines_of(str(recorded[1])))
+    assert told["message"] == f"no code from line 100000 on: the last line with code is {last}"
+
+
+def test_what_is_no_message_ends_the_session_and_no_call_is_blamed(recorded: tuple[Recording, Path]) -> None:
+    ours, theirs = socket.socketpair()
+    debugger = Debugger(recorded[0], "adder")
+    with ours, theirs:
+        client = Client(theirs, recorded[1])
+        server = threading.Thread(target=Session(ours, debugger, 3).serve, daemon=True)
+        server.start()
+        for command in ("initialize", "launch", "configurationDone"):
+            client.ask(command)
+        client.stopped()
+        theirs.sendall(b"Content-Length: 5\r\n\r\nhello")
+        while (message := client._read())["event"] != "terminated":
+            client._note(message)
+        server.join(60)
+    debugger.close()
+    assert not server.is_alive()
+    assert [text for text in client.told if "not as recorded" in text] == []
+    assert "the session ends: no message of the Debug Adapter Protocol" in client.told[-1]
+
+
+@pytest.fixture(scope="module")
+def torn(recorded: tuple[Recording, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
+    """The recording without what the calls from 9 on were given."""
+
+    def before_the_end(found: Recorded) -> Kept:
+        return [] if found.stream.endswith("numbers/x") and found.seq >= 9 else as_it_is(found)
+
+    file = tmp_path_factory.mktemp("torn") / "torn.mcap"
+    with Recording(tampered(Path(recorded[0].path), file, messages=before_the_end)) as recording:
+        yield recording
+
+
+def test_running_on_to_a_call_that_cannot_be_made_stops_at_the_last_line_before(
+    recorded: tuple[Recording, Path], torn: Recording
+) -> None:
+    with editing((torn, recorded[1]), 7, stopOnEntry=False) as client:
+        client.ask("configurationDone")
+        assert client.stopped()[0] == "end of the recording"
+        assert client.call() == 8
+        assert any("call 9 of adder cannot be made again: graph/numbers/x #9 is not recorded" in t for t in client.told)
+        assert client.go("stepBack")[0] == "step"
+        assert client.call() == 8
+
+
+def test_a_first_call_that_cannot_be_made_is_said_and_ends_the_session(
+    recorded: tuple[Recording, Path], torn: Recording
+) -> None:
+    ours, theirs = socket.socketpair()
+    debugger, failures = Debugger(torn, "adder"), list[BaseException]()
+
+    def serve() -> None:
+        try:
+            Session(ours, debugger, 10).serve()
+        except DebugError as error:
+            failures.append(error)
+
+    with ours, theirs:
+        client = Client(theirs, recorded[1])
+        server = threading.Thread(target=serve, daemon=True)
+        server.start()
+        for command in ("initialize", "launch", "configurationDone"):
+            client.ask(command)
+        while (message := client._read())["event"] != "terminated":
+            client._note(message)
+        server.join(60)
+    debugger.close()
+    assert "call 10 of adder cannot be made again" in client.told[-1]
+    assert len(failures) == 1

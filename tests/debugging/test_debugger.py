@@ -6,23 +6,26 @@ import importlib
 import json
 import random
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from tampering import Kept, as_it_is, tampered
 
 import dataflow
 from dataflow.api.local import LocalRun
-from dataflow.debugging.debugger import DebugError, Debugger
-from dataflow.debugging.fired import SPACING, Probe, Process
+from dataflow.capture.capture import capture
+from dataflow.cli.support.debug_shell import Shell, WrongCommand
+from dataflow.debugging.debugger import DebugError, Debugger, Unmade
+from dataflow.debugging.fired import SPACING, Fired, Probe, Process
 from dataflow.execution.failure import OperatorFailure
 from dataflow.graph import Graph, load_graph
 from dataflow.graph.sections import Record
 from dataflow.messages.base import Message
-from dataflow.recording import Recording
+from dataflow.recording import Recorded, Recording
 from dataflow.records import reading
-from dataflow.records.firing import FiringRecord, Rows
+from dataflow.records.firing import CALLS, FiringRecord, Rows
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import graph_that_is_here
 from dataflow.supervision.run import run
@@ -337,6 +340,138 @@ def test_a_condition_is_gone_to(added: Recording) -> None:
     assert debugger.until(lambda fired: False) is None
     assert debugger.at is later
     assert debugger.goto(21).number == 21
+
+
+@pytest.fixture
+def torn(added: Recording, tmp_path: Path) -> Iterator[Recording]:
+    """A recording of 31 calls whose last 11 lack what they were given."""
+
+    def before_the_end(found: Recorded) -> Kept:
+        return [] if found.stream.endswith("numbers/x") and found.seq >= 20 else as_it_is(found)
+
+    with Recording(tampered(Path(added.path), tmp_path / "torn.mcap", messages=before_the_end)) as recording:
+        yield recording
+
+
+def test_calls_that_cannot_be_made_are_counted_and_not_taken_for_as_recorded(torn: Recording) -> None:
+    debugger = Debugger(torn, "adder")
+    assert debugger.first_difference() is None
+    lost = Unmade(len(debugger.calls) - 20, 20, "graph/numbers/x #20 is not recorded")
+    assert debugger.unmade == lost
+    assert str(lost) == "11 calls could not be made again (the first is call 20: graph/numbers/x #20 is not recorded)"
+
+    assert debugger.until(lambda fired: False, first=3, last=25) is None
+    assert debugger.unmade == replace(lost, count=6)
+    assert debugger.until(lambda fired: fired.number == 7) is not None
+    assert debugger.unmade is None
+    assert debugger.until(lambda fired: True, first=20) is None
+    assert debugger.unmade == lost
+    with pytest.raises(DebugError, match="call 25 of adder cannot be made again: graph/numbers/x #20 is not recorded"):
+        debugger.goto(25)
+
+
+def test_a_capture_does_not_call_what_could_not_be_made_as_recorded(torn: Recording) -> None:
+    with pytest.raises(DebugError, match="adder: 20 calls as recorded, without an error; 11 calls could not be made"):
+        capture(torn, Debugger(torn, "adder"))
+
+
+def test_a_search_ends_at_its_last_call(added: Recording) -> None:
+    debugger = Debugger(added, "adder")
+    for _ in range(2):  # the second time out of what is kept
+        assert [fired.number for fired in all_made(debugger, 4, 9)] == [*range(4, 10)]
+        assert debugger.unmade is None
+
+
+def test_calls_on_the_way_that_cannot_be_made_are_counted(added: Recording, tmp_path: Path) -> None:
+    """Five records are missing, behind which a state is recorded."""
+    graph = replace(graph_that_is_here(added)[0], record=Record(tuple(added.streams), snapshots="cpu"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dataflow.records.spacing.CPU_SPACING", 0)
+        LocalRun(graph).execute(record=tmp_path / "states.mcap")
+    with Recording(tmp_path / "states.mcap") as recording:
+        calls = [r.index for r in FiringLog.read(recording).records("adder") if r.kind in CALLS]
+    gone = range(calls[10], calls[12])
+    path = tampered(
+        tmp_path / "states.mcap",
+        tmp_path / "gap.mcap",
+        records=lambda record: record.operator != "adder" or record.index not in gone,
+    )
+    with Recording(path) as recording:
+        debugger = Debugger(recording, "adder", graph)
+        made = {fired.number for fired in all_made(debugger)}
+        assert debugger.unmade is not None
+        assert made | {*range(debugger.unmade.first, len(debugger.calls))} == {*range(len(debugger.calls))}
+        assert len(made) + debugger.unmade.count == len(debugger.calls)
+        assert "missing" in debugger.unmade.why
+
+
+def all_made(debugger: Debugger, first: int = 0, last: int | None = None) -> list[Fired]:
+    found = list[Fired]()
+
+    def visit(fired: Fired) -> bool:
+        found.append(fired)
+        return False
+
+    assert debugger.until(visit, first=first, last=last) is None
+    return found
+
+
+def test_the_prompt_says_what_could_not_be_made_and_fails(torn: Recording, capsys: pytest.CaptureFixture[str]) -> None:
+    shell = Shell(Debugger(torn, "adder"), 0)
+    for line, told in (
+        (
+            "diff",
+            "error: 20 calls as recorded; 11 calls could not be made again (the first is call 20: graph/numbers/x #20",
+        ),
+        ("until False", "error: no call after this one that can be made is so: False; 11 calls could not be made"),
+    ):
+        shell.onecmd(line)
+        assert shell.failed
+        assert told in capsys.readouterr().out
+
+
+def test_what_a_search_passes_by_is_said_with_what_it_finds(
+    torn: Recording, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    debugger = Debugger(torn, "adder")
+    made = debugger.goto(3)
+
+    def found(condition: Callable[[Fired], bool]) -> Fired:
+        debugger.unmade = Unmade(2, 1, "records before it are missing")
+        return made
+
+    monkeypatch.setattr(debugger, "until", found)
+    Shell(debugger, 0).onecmd("until True")
+    assert "on the way to it 2 calls could not be made again (the first is call 1" in capsys.readouterr().out
+    Shell(debugger, 0, json=True).onecmd("diff")
+    assert json.loads(capsys.readouterr().out)["not_made"]["count"] == 2
+
+
+def test_the_prompt_goes_to_a_call_as_the_command_line_names_it(added: Recording) -> None:
+    debugger = Debugger(added, "adder")
+    shell = Shell(debugger, debugger.calls[0].stamp)
+    assert shell.number("adder@1.25") == shell.number("@1.25") == 12
+    for word, why in (("numbers@1", "the operator here is adder"), ("@inf", "expected the number"), ("7x", "number")):
+        with pytest.raises(WrongCommand, match=why):
+            shell.number(word)
+
+
+def test_an_operator_that_declares_no_state_may_have_one(added: Recording, tmp_path: Path) -> None:
+    debugger = Debugger(added, "adder")
+    assert "adder declares no state, so what it keeps in attributes is not seen" in debugger.no_state()
+    debugger.node.operator.stateless = True
+    try:
+        assert debugger.no_state() == "adder has no state: it is declared stateless"
+    finally:
+        debugger.node.operator.stateless = False
+
+
+def test_a_recording_without_calls_names_what_would_have_some(repository: Path) -> None:
+    with (
+        Recording(repository / "recordings" / "demo.mcap") as recording,
+        pytest.raises(DebugError, match="nor of any other operator: the recording holds what sources gave"),
+    ):
+        Debugger(recording, "odometry")
 
 
 def test_an_error_is_shown_with_its_line(added: Recording, tmp_path: Path) -> None:

@@ -51,6 +51,7 @@ def test_the_drop_and_the_late_message_that_cost_the_estimate_are_named(run: Pat
     assert found.figures["score: end_error_m"] == pytest.approx(30.0, abs=0.5)
     assert found.undone["score: end_error_m"] < 0.5
     assert found.best["score: end_error_m"] == 0.0
+    assert [one["until"] for one in found.as_json()["named"]] == [None, STAMP + 3040 * MS]
 
 
 def test_losses_without_a_message_between_them_are_one_burst_and_tried_together(run: Path) -> None:
@@ -106,8 +107,8 @@ def test_a_figure_is_called_by_its_name_its_beginning_or_its_operator() -> None:
 @pytest.mark.parametrize(
     ("worse", "problem"),
     [
-        ("end_error_m > 50", "the recorded figures are not end_error_m > 50: {'score: end_error_m': 30"),
-        ("turns > 0", "losses undone it is turns > 0 still: {'score: turns': "),
+        ("end_error_m > 50", "the recorded figures are not end_error_m > 50: score: end_error_m 30"),
+        ("turns > 0", "losses undone it is turns > 0 still: score: turns "),
         ("error > 50", "no figure error; there are: beats, end_error_m, turns, worst_error_m"),
         ("end_error_m > 'a'", "TypeError"),
         ("1 > 0", "no figure ; there are"),

@@ -14,6 +14,7 @@ pytest.importorskip("mcp", reason="needs the extra [mcp]")
 from mcp.client import Client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
+from dataflow.cli.commands.mcp import mcp
 from dataflow.tool_server.jobs import MOST_BYTES
 from dataflow.tool_server.tools import TOOLS
 
@@ -52,6 +53,16 @@ def test_tools_are_listed_and_answer_in_parts_whatever_operators_print(loud: tup
         assert all(tool.description for tool in tools.values())
         assert tools["prove"].input_schema["required"] == ["recording", "operator", "call", "expect"]
         assert "say" not in tools["prove"].input_schema["properties"]
+        assert not any(tool.input_schema["additionalProperties"] for tool in tools.values())
+        text, wrong = await ask(client, "prove", **common, call=3, expect="True", may_changes="False")
+        assert (wrong, text) == (True, "prove takes no argument 'may_changes' (did you mean 'may_change'?)")
+        text, wrong = await ask(client, "what_if", **common, call=3, set={})
+        assert wrong
+        assert text == "what_if takes no argument 'set' (it also takes: params, show, graph)"
+        text, wrong = await ask(client, "goto", recording=recording, operator=["loud"], call=3)
+        assert (wrong, text) == (True, "goto: operator=['loud']: Input should be a valid string")
+        text, wrong = await ask(client, "goto", recording=recording, operator="loud")
+        assert (wrong, text) == (True, "goto: call is missing")
         text, wrong = await ask(client, "goto", **common, call="3")
         assert not wrong
         assert '"number": 3' in text
@@ -60,10 +71,18 @@ def test_tools_are_listed_and_answer_in_parts_whatever_operators_print(loud: tup
         assert not wrong
         assert "gives the rest)" in first
         offset = int(first.rpartition("offset=")[2].partition(")")[0])
-        rest, _ = await ask(client, "job", id="2", offset=offset)
+        rest, _ = await ask(client, "job", id=2, offset=offset)
         assert '"next": "history with first=200 goes on"' in rest
         text, wrong = await ask(client, "goto", **common, call="301")
         assert wrong
         assert "loud has calls 0 to 300, there is no 301" in text
+        text, wrong = await ask(client, "goto", **common, call=3)
+        assert not wrong
+        assert '"number": 3' in text
 
     talk(talked)
+
+
+def test_the_help_of_the_command_names_all_tools() -> None:
+    words = (mcp.__doc__ or "").replace(",", " ").replace(";", " ").split()
+    assert {*TOOLS, "job"} - {*words} == set()

@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tampering import Kept, as_it_is, tampered
 
 import dataflow
 from dataflow.graph import load_text
-from dataflow.recording import Recording
+from dataflow.recording import Recorded, Recording
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
 from dataflow.text import json_text
-from dataflow.tool_server.tools import ToolError, answer
+from dataflow.tool_server.tools import ToolError, _verified, answer
+from dataflow.verification.report import VerifyReport
 
 SKIPPED, DEGREES = 613, 640
 """The first calls of `sum` and `sine` that the bugs change."""
@@ -56,7 +59,8 @@ def test_a_call_is_shown_with_its_difference(bugs: dict[str, str]) -> None:
     assert [each["field"] for each in found["outputs"]["out"]["fields"]] == ["vectors"]
     assert found == ask("goto", bugs["right"], operator="sine", call=str(DEGREES))
     assert ask("goto", bugs["right"], operator="sine", call="@6.4")["number"] == DEGREES
-    assert ask("goto", bugs["right"], operator="sine", call="-1")["number"] == 700
+    for last in ("-1", -1, 700):
+        assert ask("goto", bugs["right"], operator="sine", call=last)["number"] == 700
 
 
 SCALED = """
@@ -186,6 +190,136 @@ def test_a_fix_makes_all_that_is_recorded_of_right_code(bugs: dict[str, str], mo
     assert ask("prove", bugs["wrong"], **arguments)["reasons"] == ["other operators: {'sine': 'culprit'}"]
 
 
+@pytest.fixture(scope="module")
+def torn(bugs: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The recording by the code with bugs, without what the calls from 650 on were given."""
+
+    def before_the_end(found: Recorded) -> Kept:
+        return [] if found.stream.endswith("src/x") and found.seq >= 650 else as_it_is(found)
+
+    file = tmp_path_factory.mktemp("torn") / "torn.mcap"
+    return str(tampered(Path(bugs["wrong"]), file, messages=before_the_end))
+
+
+LOST = "51 calls could not be made again (the first is call 650: bugs/src/x #650 is not recorded)"
+
+
+def test_calls_that_could_not_be_made_are_said_by_each_tool(torn: str) -> None:
+    lost = {"count": 51, "first": 650, "why": "bugs/src/x #650 is not recorded"}
+    with pytest.raises(ToolError, match=re.escape(f"sum: 650 calls give what was recorded; {LOST}")):
+        ask("diff", torn, operator="sum")
+    told = ask("history", torn, operator="sum", field="same")
+    assert (told["calls"], len(told["changes"]), told["not_made"]) == ([0, 700], 1, lost)
+    assert "not_made" not in ask("history", torn, operator="sum", field="same", last=649)
+    with pytest.raises(ToolError, match=r"sum, calls 650 to 660: 11 calls could not be made again"):
+        ask("history", torn, operator="sum", field="same", first=650, last=660)
+    told = ask("verify", torn, only=["sum"])
+    assert told["verdicts"] == {"unverifiable": ["sum"]}
+    assert told["not_made"] == {"sum": "51 of 701 calls could not be made again (bugs/src/x #650 is not recorded)"}
+
+
+def test_what_follows_a_cut_is_not_called_identical() -> None:
+    whole = Verification("whole", firings=3, verified=3)
+    torn = Verification("torn", firings=5, verified=3, unverifiable=2, beyond=2, cut=True, missing="x #3")
+    report = VerifyReport((whole, torn), (), (), 0, 0, 0.0, 0.0)
+
+    told = _verified(report)
+
+    assert torn.verdict == "identical"
+    assert told["verdicts"] == {"identical": ["whole"], "identical up to the cut": ["torn"]}
+    assert told["not_made"] == {"torn": "2 of 5 calls could not be made again (x #3 is not recorded)"}
+
+
+def test_no_fix_is_proven_where_calls_could_not_be_made(torn: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zoo.bugs.Skips.work", lambda self, k, kind: _added(self.state, k))
+    told = ask("prove", torn, operator="sum", call=SKIPPED, expect="out.out.vectors[0, 0] == 188_191")
+
+    assert not told["proven"]
+    own, others = told["reasons"]
+    assert own == f"sum: {LOST}"
+    assert "'sine': '51 of 701 calls could not be made again (bugs/src/x #650 is not recorded)'" in others
+    assert told["changed_calls"]["not_made"]["count"] == 51
+
+
+SHARED = """
+import os
+
+from dataflow.messages import FeatureVector
+from dataflow.operator import In, Operator, Out
+from shared_factor import FACTOR
+
+
+class Scaled(Operator):
+    stateless = True
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(self, x):
+        return {"y": FeatureVector(stamp=x.stamp, vectors=x.vectors * FACTOR, model="scaled")}
+"""
+CHANCE = """
+import os
+
+from dataflow.messages import FeatureVector
+from dataflow.operator import In, Operator, Out
+{imports}
+
+class Chance(Operator):
+    stateless = True
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(self, x):
+        noise = int.from_bytes(os.urandom(4), "big")
+        return {{"y": FeatureVector(stamp=x.stamp, vectors=x.vectors + noise, model="chance")}}
+
+
+class Onwards(Chance):
+    def process(self, x):
+        return {{"y": x}}
+"""
+
+
+@pytest.mark.parametrize("shares", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_an_operator_that_did_not_repeat_before_the_fix_is_named_and_only_judged_where_it_may_be_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shares: bool
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("shared_factor", "fixed_scale", "by_chance"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    factor = tmp_path / "shared_factor.py"
+    factor.write_text("FACTOR = 3\n")
+    (tmp_path / "fixed_scale.py").write_text(SHARED)
+    imports = "from shared_factor import FACTOR" if shares else ""
+    (tmp_path / "by_chance.py").write_text(CHANCE.format(imports=imports))
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=robot", "-c", "user.email=robot@localhost"]
+    for words in (["init", "-q"], ["add", "."], ["commit", "-qm", "Wrong"]):
+        subprocess.run([*git, *words], check=True, timeout=60)
+    graph = load_text(
+        "graph: shared\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 8}}\n"
+        "  scaled: {use: 'fixed_scale:Scaled', inputs: {x: src/x}}\n"
+        "  chance: {use: 'by_chance:Chance', inputs: {x: src/x}}\n"
+        "  onwards: {use: 'by_chance:Onwards', inputs: {x: chance/y}}\n"
+    )
+    recording = str(tmp_path / "wrong.mcap")
+    dataflow.run(graph, record=recording)
+    factor.write_text("FACTOR = 2\n")
+    for name in ("shared_factor", "fixed_scale", "by_chance"):
+        monkeypatch.delitem(sys.modules, name)
+
+    told = ask("prove", recording, operator="scaled", call=4, expect="out.y.vectors[0, 0] == 8")
+
+    if not shares:
+        assert told["reasons"] == []
+        assert told["do_not_repeat"] == {"chance": "differs each time with the code that was recorded"}
+        return
+    assert not told["proven"]
+    assert told["reasons"] == [
+        "other operators: {'chance': 'culprit: differs each time (code changed: shared_factor); "
+        "with the recorded code too'}"
+    ]
+
+
 def _added(state: Any, k: float) -> list[float]:
     state.total += k
     return [state.total]
@@ -231,8 +365,10 @@ def test_why_finds_that_code_repeats_and_differs_from_the_recorded(bugs: dict[st
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"call": "first"}, 'expected a number such as "7" or "-1", "@SECONDS" or "diff"'),
+        ({"call": "first"}, 'expected a number such as 7 or -1, "@SECONDS" or "diff"'),
         ({"call": "701"}, "sine has calls 0 to 700, there is no 701"),
+        ({"call": 701}, "sine has calls 0 to 700, there is no 701"),
+        ({"call": "@nan"}, "call='@nan': expected a number such as 7"),
         ({"call": "0", "operator": "cosine"}, "there are: sine, sum"),
         ({"call": "0", "path": ["nowhere"]}, "path: no such folder: nowhere"),
     ],

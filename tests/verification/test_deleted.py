@@ -155,3 +155,15 @@ operators:
 
     assert report.absent == {"less": "changes:Same has no parameter 'gain' any more"}
     assert verdicts(report) == {"after": "identical"}
+
+
+def test_where_no_operator_is_here_each_reason_is_given_once_with_its_operators(folder: Path) -> None:
+    path = recorded(folder, "**")
+    delete(folder / "stays_here.py")
+    delete(folder / "goes_away.py")
+
+    with pytest.raises(ReplayError) as caught:
+        verify(path, only=["beside"])
+
+    assert "no module 'stays_here' (src, after, beside); no module 'goes_away' (away)" in str(caught.value)
+    assert str(caught.value).count("--path DIR names another folder") == 1

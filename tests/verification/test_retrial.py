@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
 from dataflow.graph.load import load_text
+from dataflow.records.comparison import Difference, Verification
 from dataflow.supervision.run import run
 from dataflow.verification.report import VerifyReport
+from dataflow.verification.retrial import Trial, retry
 from dataflow.verification.verify import verify
 
 Placement = Literal["one_process", "process_each"]
@@ -98,3 +102,37 @@ def test_operators_that_shared_a_module_in_the_run_and_differ_apart_are_named_wi
 
     assert report.culprits == ("one",)
     assert report.repeats("one")
+
+
+def answer(differences: str, got: str = "b") -> dict[str, Any]:
+    """What a trial of the operator `clock` shows, which differs from its third call on."""
+    found = Verification("clock", firings=9, verified=9, outputs=9, differing=4, differences=differences)
+    found.first, found.own_fault = Difference(3, "fire", 30, "out", "a", got), True
+    return {"operators": {"clock": asdict(found)}}
+
+
+@pytest.mark.parametrize(
+    ("again", "repeats"), [(answer("1"), True), (answer("2"), False), (answer("1", got="c"), False)]
+)
+def test_an_operator_repeats_only_where_all_that_differs_is_the_same(again: dict[str, Any], repeats: bool) -> None:
+    asked: list[Trial] = []
+
+    def attempt(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+        asked.extend(trials)
+        return [again] * len(trials)
+
+    found = retry(["clock"], {"clock": answer("1")}, {"clock": frozenset({"clock"})}, attempt)
+
+    assert found.repeated == {"clock": repeats}
+    assert asked[0] == Trial(frozenset({"clock"}), {"clock": (0, 3, "b")})
+
+
+def test_a_parameter_that_another_graph_changes_is_named(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}", "one_process")
+    text = "graph: test\noperators:\n  src: {use: 'sharing_operators:Matrices'}\n"
+    text += "  solve: {use: 'sharing_operators:Solve', inputs: {x: src/out}, params: {since: 6}}"
+
+    report = verify(path, graph=load_text(text), only=["solve"])
+
+    assert report.changes == {"solve": ("parameter since 5 → 6",)}
+    assert report.altered("solve") == ("parameter since 5 → 6",)

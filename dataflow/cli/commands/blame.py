@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,8 +15,8 @@ from dataflow.cli.support.arguments import (
     Json,
     ModuleFolders,
     OtherGraph,
+    OtherSettings,
     RecordingFile,
-    Settings,
     existing_recording,
     number,
     span,
@@ -25,7 +24,7 @@ from dataflow.cli.support.arguments import (
 from dataflow.cli.support.output import count, err, fail, friendly_errors, out, plural, print_json, seconds, table
 
 if TYPE_CHECKING:
-    from dataflow.blame.chain import Chain, Effect, Link
+    from dataflow.blame.links import Chain, Effect, Link
     from dataflow.drops.search import Cost
     from dataflow.graph import Graph
 
@@ -59,7 +58,7 @@ def blame(
         ),
     ] = 1e-4,
     graph: OtherGraph = None,
-    settings: Settings = None,
+    settings: OtherSettings = None,
     path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
@@ -67,9 +66,13 @@ def blame(
 
     Each call on the chain is made again from its state with an input nudged, replaced by the message before, or left
     out, and so are all later calls that this reaches: an input that changes the value is on the chain, and so is the
-    call that made it. Earlier calls of an operator are tried where the value depends on its state.
+    call that made it. Earlier calls of an operator are tried where the value depends on its state. The largest effect
+    is named first.
 
-    Exit code 0; 1: the time was up before the chain was whole; 2: there is no such value, or it does not repeat.
+    Exit codes:
+      0   the chain is whole: it leads to what was sensed, or to a state that an operator was given
+      1   it is not: nothing that was tried changes the value, or changes could not be tried, or the time was up
+      2   there is no such value, or it does not repeat
 
     Examples:
 
@@ -80,11 +83,11 @@ def blame(
     with friendly_errors():
         recording = existing_recording(recording)
         loaded = begin_again(recording, graph, settings, path)
-        chain = _found(recording, field, loaded, budget, tolerance)
+        chain, begin = _found(recording, field, loaded, budget, tolerance)
     if json:
         print_json(chain.as_json())
     else:
-        _print(chain, field)
+        _print(chain, field, begin)
     if not chain.whole:
         raise typer.Exit(1)
 
@@ -97,7 +100,7 @@ def drops(
     ],
     budget: Budget = 60.0,
     graph: OtherGraph = None,
-    settings: Settings = None,
+    settings: OtherSettings = None,
     path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
@@ -131,7 +134,7 @@ def drops(
                 raise fail(f"--worse {worse}: no Python expression: {error.msg}") from None
             begin, _ = span(opened, opened.streams) or (0, 0)
     if json:
-        print_json(asdict(cost))
+        print_json(cost.as_json())
     else:
         _print_cost(cost, worse, begin)
     if not cost.minimal:
@@ -164,7 +167,7 @@ def _print_cost(cost: Cost, worse: str, begin: int) -> None:
     out.print(Text(text), soft_wrap=True)
 
 
-def _found(recording: Path, text: str, graph: Graph | None, budget: float, tolerance: float) -> Chain:
+def _found(recording: Path, text: str, graph: Graph | None, budget: float, tolerance: float) -> tuple[Chain, int]:
     from dataflow.blame.chain import Blame
     from dataflow.blame.field import Field
     from dataflow.recording import Recording
@@ -178,7 +181,9 @@ def _found(recording: Path, text: str, graph: Graph | None, budget: float, toler
         def watch(made: int, links: int) -> None:
             show(f"{plural(made, 'call')} made again, {plural(links, 'link')} found")
 
-        return Blame(opened, field, graph, budget=budget, tolerance=tolerance, watch=watch).find()
+        chain = Blame(opened, field, graph, budget=budget, tolerance=tolerance, watch=watch).find()
+        begin, _ = span(opened, opened.streams) or (0, 0)
+        return chain, begin
 
 
 @contextmanager
@@ -188,21 +193,19 @@ def progress() -> Iterator[Callable[[str], None]]:
         yield lambda text: status.update(Text(text))
 
 
-def _print(chain: Chain, field: str) -> None:
-    out.print(Text(f"{field} is {_text(chain.value)}, made by {_call(chain.target)}"), soft_wrap=True)
+def _print(chain: Chain, field: str, begin: int) -> None:
+    at = f"{(chain.stamp - begin) * 1e-9:.3f} s"
+    late = ", the last one: the recording ends before" if chain.late else ""
+    out.print(Text(f"{field} is {_text(chain.value)}, made by {_call(chain.target)} at {at}{late}"), soft_wrap=True)
     made = table("call", "its", "from", "the value then")
-    for link in chain.links[:MOST_ROWS]:
-        effects = "; ".join(_effect(effect, chain.value) for effect in link.effects)
-        made.add_row(*map(Text, (_call(link.call), link.input or "state", _origin(link), effects)))
-    if chain.links:
+    rows = _rows(chain)
+    for row in rows[:MOST_ROWS]:
+        made.add_row(*map(Text, row))
+    if rows:
         out.print(made)
-    if len(chain.links) > MOST_ROWS:
-        out.print(f"and {count(len(chain.links) - MOST_ROWS)} more: --json has all")
-    sensed = list(dict.fromkeys(_origin(link) for link in chain.sensed))
-    more = f" and {count(len(sensed) - MOST_ROWS)} more" if len(sensed) > MOST_ROWS else ""
-    given = [f"the state given to {_call(link.call)}" for link in chain.links if not link.input and link.maker is None]
-    told = ", ".join(sensed[:MOST_ROWS] + given) + more or "nothing that was sensed: no input changes it"
-    out.print(Text(f"decided by {told}"), soft_wrap=True)
+    if len(rows) > MOST_ROWS:
+        out.print(f"and {count(len(rows) - MOST_ROWS)} more: --json has all")
+    _print_ends(chain)
     for operator, first in chain.ended.items():
         text = f"calls of {operator} before #{first} were not tried: a new operator in front of it gives the same value"
         out.print(Text(text), soft_wrap=True)
@@ -218,15 +221,75 @@ def _print(chain: Chain, field: str) -> None:
     out.print(f"{plural(chain.made, 'call')} made again in {seconds(chain.seconds)}")
 
 
+def _print_ends(chain: Chain) -> None:
+    """Prints what the chain leads to, where it leads to nothing, and what could not be tried."""
+    sensed = list(dict.fromkeys(_origin(link) for link in chain.sensed))
+    more = f" and {count(len(sensed) - MOST_ROWS)} more" if len(sensed) > MOST_ROWS else ""
+    given = [f"the state given to {_call(link.call)}" for link in chain.links if not link.input and link.maker is None]
+    if sensed or given:
+        out.print(Text(f"decided by {', '.join(sensed[:MOST_ROWS] + given) + more}"), soft_wrap=True)
+    tried = ", ".join(f"{count(n)} {way}" for way, n in chain.tried.items())
+    if chain.loose:
+        names = ", ".join(map(_call, chain.loose[:5])) + (", …" if len(chain.loose) > 5 else "")
+        text = f"not known what decided {names}: nothing that was tried there changes the value"
+        what = f"{plural(chain.tried.total(), 'change')} tried in all: {tried}"
+        out.print(Text(f"{text} ({what})", style="yellow"), soft_wrap=True)
+    for each in chain.untried:
+        what = (
+            f"{each.input} of {_call(each.call)}"
+            if each.input
+            else f"{_calls(each.call, each.last)} left out or others"
+        )
+        text = f"could not be tried: {what}: {each.error}"
+        out.print(Text(text, style="yellow"), soft_wrap=True)
+    if chain.raised and not chain.whole:
+        text = (
+            f"{count(chain.raised.total())} of {plural(chain.tried.total(), 'change')} made a call raise, which shows"
+        )
+        out.print(Text(f"{text} nothing", style="yellow"), soft_wrap=True)
+
+
+def _rows(chain: Chain) -> list[tuple[str, str, str, str]]:
+    """The rows of the table; one for links that differ in the numbers of the messages or calls alone, which follow
+    each other."""
+    rows: list[tuple[str, str, str, str]] = []
+    before: Link | None = None
+    first = 0
+    for link in chain.links:
+        shown = "; ".join(_effect(effect, chain.value) for effect in link.effects)
+        row = _call(link.call), link.input or "state", _origin(link), shown
+        if before is not None and rows[-1][:2] + rows[-1][3:] == row[:2] + row[3:] and _follow(link, before):
+            assert link.maker is not None
+            low, high = sorted((first, link.maker.number))
+            rows[-1] = (*row[:2], _calls((link.maker.operator, low), high), row[3])
+        else:
+            rows.append(row)
+            first = link.maker.number if link.maker is not None else 0
+        before = link
+    return rows
+
+
+def _follow(link: Link, other: Link) -> bool:
+    """Returns whether two links are to calls of an operator of which one follows the other."""
+    if link.input or link.maker is None or other.maker is None or link.last is not None or other.last is not None:
+        return False
+    return link.maker.operator == other.maker.operator and abs(link.maker.number - other.maker.number) == 1
+
+
+def _calls(first: tuple[str, int], last: int | None) -> str:
+    return _call(first) if last is None or last == first[1] else f"{_call(first)} to #{last}"
+
+
 def _call(call: tuple[str, int]) -> str:
     return f"{call[0]} #{call[1]}"
 
 
 def _origin(link: Link) -> str:
     if link.message is None:
-        return "given" if link.maker is None else _call(link.maker)
+        return "given" if link.maker is None else _calls(link.maker, link.last)
     stream, _, place = link.message
-    return f"{stream} #{place}" if link.maker is None else f"{_call(link.maker)}: {stream} #{place}"
+    message = _calls((stream, place), link.last)
+    return message if link.maker is None else f"{_call(link.maker)}: {message}"
 
 
 def _effect(effect: Effect, before: Any) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
@@ -221,7 +221,7 @@ def _report(
     *,
     json: bool,
 ) -> int:
-    failed = [s for s in plan.summary() if set(s["outcomes"]) - {"done"}]
+    failed = _failed(plan)
     if json:
         print_json(
             {
@@ -230,16 +230,46 @@ def _report(
                 "figures": [asdict(one) | {"differs": one.differs} for one in figures],
                 "operators": [asdict(one) for one in different],
                 **({} if shares is None else {"explained": [asdict(one) for one in shares]}),
-                "failed": [{"settings": s["settings"], "outcomes": s["outcomes"]} for s in failed],
+                "failed": failed,
             }
         )
     else:
         _print(shown, different)
         if shares is not None:
             _print_shares(shares)
-        for summary in failed:
-            out.print(Text(f"failed: {summary['settings'] or 'as the graph is'}: {summary['outcomes']}", style="red"))
+        for line in _failed_lines(failed):
+            out.print(Text(line, style="red"), soft_wrap=True)
     return 1 if failed else 0
+
+
+def _failed(plan: Sweep) -> list[dict[str, Any]]:
+    """Returns the recordings that were not replayed to their end, by side: outcome, reason, and where its output is."""
+    found = []
+    for task in plan.tasks:
+        result = plan.store.of(task.key)
+        if result is None or result.outcome != "done":
+            side = "ab"[task.settings != plan.choices[0]]
+            told = {"side": side, "recording": task.source.name, "settings": dict(task.settings)}
+            log = plan.store.log(task.key)
+            why = ("not done", "") if result is None else (result.outcome, result.error)
+            found.append(told | {"outcome": why[0], "error": why[1], "log": str(log) if log.exists() else None})
+    return found
+
+
+def _failed_lines(failed: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Returns a line for each recording that failed alike, the first of many."""
+    sides: dict[tuple[str, ...], list[str]] = {}
+    for one in failed:
+        sides.setdefault((one["recording"], one["outcome"], one["error"], one["log"] or ""), []).append(one["side"])
+    lines = [
+        f"failed: {recording} by {' and by '.join(side.upper() for side in by)}: {outcome}"
+        + (f": {error}" if error else "")
+        + (f" (its output: {log})" if log else "")
+        for (recording, outcome, error, log), by in sides.items()
+    ]
+    yield from lines[:MOST_NAMED]
+    if len(lines) > MOST_NAMED:
+        yield f"failed: {count(len(lines) - MOST_NAMED)} more: --json has all"
 
 
 def _print(shown: Sequence[Paired], different: Sequence[Difference]) -> None:

@@ -18,8 +18,8 @@ from dataflow.cli.support.arguments import (
     Json,
     ModuleFolders,
     OtherGraph,
+    OtherSettings,
     RecordingFile,
-    Settings,
     existing_recording,
     number,
     output_file,
@@ -69,7 +69,7 @@ def debug(
         typer.Option("--do", metavar="COMMAND", help="Do this and end, without a prompt. May be given several times."),
     ] = None,
     graph: OtherGraph = None,
-    settings: Settings = None,
+    settings: OtherSettings = None,
     path: ModuleFolders = None,
     live_effects: LiveEffects = False,
     view: ViewTarget = None,
@@ -88,7 +88,7 @@ def debug(
       again                               make it once more, with the source as it was edited since
       step                                make it once more under pdb
 
-    Exit code 0; 1: a --do, or a line of standard input, could not be done; 2: it could not begin.
+    Exit code 0; 1: a --do, or a line of standard input, could not be done, or not of all calls; 2: it could not begin.
 
     Examples:
 
@@ -131,7 +131,7 @@ def capture(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace a file that exists.")] = False,
     graph: OtherGraph = None,
-    settings: Settings = None,
+    settings: OtherSettings = None,
     path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
@@ -141,7 +141,10 @@ def capture(
     does not give what was recorded, that raises an error, or of which --predicate is true. Calls before it are kept as
     far as they are needed.
 
-    Exit code 0; 2: nothing is wrong, or it does not show apart from the recording.
+    The calls are made again some times, in new processes too: what does not repeat would be a test that passes by
+    chance, and is refused (verify --why finds the cause).
+
+    Exit code 0; 2: nothing is wrong, or it does not show apart from the recording, or does not repeat.
 
     Examples:
 

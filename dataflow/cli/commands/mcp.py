@@ -10,7 +10,7 @@ def mcp() -> None:
     """Serve the commands that find the cause of a failure as tools for coding agents, over standard input and output.
 
     An agent starts it by its configuration (Model Context Protocol) and ends it by closing its input. Its tools are
-    verify, why, goto, diff, state, history, what_if, capture, blame, drops and prove.
+    verify, why, goto, diff, lines, state, history, what_if, capture, blame, drops and prove; job has what takes longer.
 
     Examples:
 

@@ -16,7 +16,7 @@ from dataflow.cli.support.arguments import (
     Json,
     ModuleFolders,
     OtherGraph,
-    Settings,
+    OtherSettings,
     check_offset,
     existing,
     find_modules_in,
@@ -78,7 +78,7 @@ def verify(
         list[Path], typer.Argument(metavar="RECORDING", help="Recordings (.mcap), or folders of them.")
     ],
     graph: OtherGraph = None,
-    settings: Settings = None,
+    settings: OtherSettings = None,
     path: ModuleFolders = None,
     first: Annotated[
         str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
@@ -286,7 +286,10 @@ def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None) -> l
 
     if checked.report is None:
         return []
-    say(f"[dim]looking for causes in {escape(', '.join(only or checked.report.culprits) or 'nothing')}[/]")
+    if not (names := only or checked.report.culprits):
+        say("[dim]no causes to look for: there is no culprit[/]")
+        return []
+    say(f"[dim]looking for causes in {escape(', '.join(names))}[/]")
     return reasons(checked.path, checked.report, only or (), graph)
 
 
@@ -319,8 +322,9 @@ def _report(
         print_one(out, checked[0])
         for name in checked[0].culprits[:1]:
             path = shlex.quote(str(checked[0].path))
-            words = ["dataflow capture", path, "--op", name, *options]
-            out.print(Text(f"as a test: {' '.join(words)}", style="dim"), soft_wrap=True)
+            if _may_repeat(checked[0], name, reasons):
+                words = ["dataflow capture", path, "--op", name, *options]
+                out.print(Text(f"as a test: {' '.join(words)}", style="dim"), soft_wrap=True)
             words = ["dataflow debug", path, name, *options, "--do diff"]
             out.print(Text(f"next: {' '.join(words)}", style="dim"), soft_wrap=True)
     elif json:
@@ -335,6 +339,12 @@ def _report(
         from dataflow.cli.support.junit import write_junit
 
         write_junit(junit, checked, explain, reservations)
+
+
+def _may_repeat(checked: Checked, operator: str, reasons: list[list[Why]]) -> bool:
+    """Returns whether an operator that differs did so alike each time, so that a call of it can be a test."""
+    found = any(why.operator == operator and why.repeats is False for each in reasons for why in each)
+    return checked.report is not None and checked.report.repeats(operator) is not False and not found
 
 
 def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, whole: bool) -> None:

@@ -31,6 +31,14 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
 ]
+OtherSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Set a graph parameter, or OPERATOR.PARAM, of the graph that --graph names. May be repeated.",
+    ),
+]
 GraphFile = Annotated[
     Path,
     typer.Argument(

@@ -12,6 +12,21 @@ from dataflow.causes.sources import SOURCES, kind_of
 from dataflow.causes.why import Why
 from dataflow.cli.support.output import count, plural, seconds, table
 
+OUTSIDE = "files that C libraries read, files that are gone, devices, services"
+"""Sources that --why does not see."""
+
+
+def as_recorded(*, code_known: bool) -> str:
+    """Returns what may have changed where all that the recording holds is as it was then."""
+    if code_known:
+        return (
+            "its code, parameters, libraries and machine are as recorded: what it reads from outside may have changed"
+        )
+    return (
+        "its parameters, libraries and machine are as recorded: its code, of which the recording has no digests, or "
+        "what it reads from outside may have changed"
+    )
+
 
 def print_reasons(console: Console, recording: str, reasons: Sequence[Why]) -> None:
     """A table of all causes, then a line for each operator about what was tried."""
@@ -37,6 +52,8 @@ def _lines(found: Why) -> Iterator[str]:
         yield f"{found.operator}: no cause looked for: {found.refused}"
         return
     yield f"{found.operator}: {_outcome(found)} ({plural(found.reruns, 're-run')}, {seconds(found.seconds)})"
+    if found.older:
+        yield f"{found.operator}: it depends on what was not changed since the recording: {', '.join(found.older)}"
     for group in found.open:
         yield f"{found.operator}: not tried by itself, re-runs were used up: {_list(group)}"
     for source, reason in (found.left_out or {}).items():
@@ -49,8 +66,10 @@ def _lines(found: Why) -> Iterator[str]:
 def _outcome(found: Why) -> str:
     if found.causes:
         return "each cause shown by its effect: with it alone free or changed, the results differ"
+    if found.repeats and found.changed:
+        return "it repeats here, and this is not as it was recorded"
     if found.repeats:
-        return "it repeats, so its code, its parameters, its libraries or the machine changed"
+        return f"it repeats here, and {as_recorded(code_known=found.code_known)} ({OUTSIDE})"
     if found.settled is False:
         return "it does not repeat even with all known sources of chance fixed (a device, a service, a thread?)"
     return "with all known sources of chance fixed it repeats, and with each of them free, too"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cmd
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from itertools import chain, count, takewhile
 from rlcompleter import Completer
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,7 @@ from dataflow.messages.display.text import field_text
 from dataflow.sync.entries import entries_of
 
 if TYPE_CHECKING:
-    from dataflow.debugging.debugger import Debugger
+    from dataflow.debugging.debugger import Debugger, Unmade
     from dataflow.debugging.fired import Fired
     from dataflow.view import ViewerSink
 
@@ -80,18 +81,23 @@ class Shell(cmd.Cmd):
         except SyntaxError as error:
             raise WrongCommand(f"until {line}: no Python expression: {error.msg}") from None
         found = self._debugger.until(lambda fired: bool(_evaluated(code, line, fired.names())))
-        if found is None:
-            out.print(f"no call after this one is so: {escape(line)}")
+        unmade = self._debugger.unmade
+        if found is not None:
+            self._show(found, unmade)
+        elif unmade is not None:
+            raise WrongCommand(f"no call after this one that can be made is so: {line}; {unmade}")
         else:
-            self._show(found)
+            out.print(f"no call after this one is so: {escape(line)}")
 
     def do_diff(self, line: str) -> None:
         """diff      to the first call of all that does not give what was recorded"""
         found = self._debugger.first_difference()
         if found is None:
-            out.print(f"{plural(len(self._debugger.calls), 'call')}: all give what was recorded")
+            if (unmade := self._debugger.unmade) is not None:
+                raise WrongCommand(f"{plural(self.calls - unmade.count, 'call')} as recorded; {unmade}")
+            out.print(f"{plural(self.calls, 'call')}: all give what was recorded")
         else:
-            self._show(found)
+            self._show(found, self._debugger.unmade)
             if not self._json:
                 words = f"dataflow capture RECORDING --op {self._debugger.node.name} --firing {found.number}"
                 out.print(Text(f"  as a test: {words}", style="dim"), soft_wrap=True)
@@ -115,7 +121,7 @@ class Shell(cmd.Cmd):
         fired = self._fired()
         before, after = fired.states()
         if before is None or after is None:
-            raise WrongCommand(f"{self._debugger.node.name} has no state")
+            raise WrongCommand(self._debugger.no_state())
         if line and line not in {*before, *after}:
             raise WrongCommand(f"no part {line!r}; there are: {', '.join(sorted({*before, *after}))}")
         pairs = [(line, before.get(line), after.get(line))] if line else changes(before, after)
@@ -204,13 +210,16 @@ class Shell(cmd.Cmd):
         return sorted(n for n in names if n not in ("EOF", "p", "q"))
 
     def number(self, word: str) -> int:
-        """The number of a call that a word names: N, or @SECONDS."""
-        at_time = word.startswith("@")
+        """The number of a call that a word names: N, @SECONDS, or OPERATOR@SECONDS of the operator that is here."""
+        operator, at_time, number = word.rpartition("@")
+        here = self._debugger.node.name
+        if operator and operator != here and not here.endswith(f"/{operator}"):
+            raise WrongCommand(f"goto {word}: the operator here is {here}; expected the number of a call, or @SECONDS")
         try:
-            value = float(word[1:]) if at_time else int(word)
-        except ValueError:
+            value = float(number) if at_time else int(number)
+            return self._debugger.number_at(self._origin + round(value * 1e9)) if at_time else int(value)
+        except (ValueError, OverflowError):
             raise WrongCommand(f"goto {word}: expected the number of a call, or @SECONDS") from None
-        return self._debugger.number_at(self._origin + round(value * 1e9)) if at_time else int(value)
 
     def _here(self) -> int:
         return -1 if self._debugger.at is None else self._debugger.at.number
@@ -220,12 +229,16 @@ class Shell(cmd.Cmd):
             raise WrongCommand("no call was made yet: goto one")
         return self._debugger.at
 
-    def _show(self, fired: Fired) -> None:
+    def _show(self, fired: Fired, unmade: Unmade | None = None) -> None:
+        """Shows a call. `unmade`: calls that the search for it has passed by, of which one may be meant as well."""
         if self._json:
-            print_json_line(fired.as_json(self._debugger.node.name, self._origin))
+            more = {} if unmade is None else {"not_made": asdict(unmade)}
+            print_json_line(fired.as_json(self._debugger.node.name, self._origin) | more)
         else:
             for line in self.lines(fired):  # the state may take a moment longer than the rest
                 out.print(line, soft_wrap=True)
+            if unmade is not None:
+                out.print(Text(f"  on the way to it {unmade}", style="yellow"), soft_wrap=True)
         if self._viewer is not None and fired.firing is not None:
             given = (entry for value in fired.firing.inputs.values() for entry in entries_of(value))
             made = ((made.stream, made.here) for made in fired.made if made.here is not None)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from rich.console import Console
 from rich.text import Text
 
+from dataflow.cli.support.causes import as_recorded
 from dataflow.cli.support.output import count, plural, seconds, size, table
 from dataflow.recording.streams.diff import FieldDifference
 from dataflow.records.comparison import Difference, Verification
@@ -178,7 +179,7 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
             "(it may read the clock, draw numbers that are not self.rng's, or use threads; --why finds the cause)"
         )
     elif repeats and judged.verdict == "culprit":
-        yield f"{v.operator}: run a second time, it differed alike: its code, its libraries or the machine changed"
+        yield f"{v.operator}: run a second time, it differed alike: {_since(report, v)}"
     if v.wrote:
         yield f"{v.operator}: it changed the memory of {v.wrote}; messages are immutable: copy before writing"
     elif judged.verdict == "culprit" and (mates := report.mates.get(v.operator)):
@@ -193,6 +194,16 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
         yield f"{v.operator}: file {file} is not the one that was read then"
     if v.code_changed:
         yield f"{v.operator}: its code is not what it was: {', '.join(v.code_changed)}"
+
+
+def _since(report: VerifyReport, v: Verification) -> str:
+    """Returns what changed since an operator was recorded, as far as the recording holds it."""
+    if not report.altered(v.operator):
+        return f"it repeats here, and {as_recorded(code_known=v.code_known)} (--why looks for it)"
+    found = list(report.changes.get(v.operator, ()))
+    found += ["its code"] * bool(v.code_changed) + ["a file that it read"] * bool(v.files_changed)
+    found += ["libraries or the machine"] * bool(report.facts or v.packages_changed)
+    return f"changed since the recording: {', '.join(found)}"
 
 
 def _cut(report: VerifyReport) -> str:

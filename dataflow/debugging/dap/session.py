@@ -19,7 +19,7 @@ from typing import Any
 
 from dataflow.debugging.dap.variables import Variables
 from dataflow.debugging.dap.wire import Gone, Wire
-from dataflow.debugging.debugger import Debugger
+from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Abandoned, Fired, Process, Through
 from dataflow.debugging.lines import Lines, Spot, homes_of, is_own, lines_of, own_frames
 from dataflow.execution.failure import OperatorFailure, readable
@@ -81,6 +81,8 @@ class Session:
         self._away: Callable[[], Going] | None = None
         """Leads on once the call under way is abandoned."""
         self._done = self._over = self._pauses = False
+        self._left = ""
+        """Why the editor is taken for gone, where that was seen within a call."""
         self._checked: list[int] = []
         """Calls that gave what was recorded, since this was last said."""
         self._handlers: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any] | None]] = {
@@ -103,10 +105,17 @@ class Session:
     def serve(self) -> None:
         """Answers until the editor leaves. Raises `DebugError` and what else goes to a call."""
         try:
-            while not self._done and not self._over:
-                self._answer(self._wire.request(wait=True), None)
-            while not self._over:
-                self._go()
+            try:
+                while not self._done and not self._over:
+                    self._answer(self._wire.request(wait=True), None)
+                while not self._over:
+                    self._go()
+            except (ReplayError, OperatorFailure) as error:
+                self._say(str(error), "stderr")
+                self._wire.event("terminated")
+                raise
+            if self._left:
+                self._say(f"the session ends: {self._left}", "stderr")
             self._wire.event("terminated")
         except Gone:
             self._over = True
@@ -119,6 +128,9 @@ class Session:
             fired = self._debugger.goto(self._going.call, self._watched(self._at_line), lambda: self._touched)
         except Abandoned:  # on the way there
             self._going = self._reached()
+            return
+        except DebugError as error:
+            self._going = self._before(error)
             return
         if self._away is not None:
             self._going = self._led()
@@ -134,6 +146,15 @@ class Session:
             self._say("this was the last call; at its last line again")
             self._away = partial(self._end, going.call + 1)
             self._going = self._led()
+
+    def _before(self, error: DebugError) -> Going:
+        """Goes back to the last line event in front of a call that cannot be made. Raises `DebugError` where no call
+        was made yet."""
+        if (at := self._debugger.at) is None:
+            raise error
+        self._say(f"{error}; at the last line of call {at.number} again", "stderr")
+        self._going, self._away = Going(at.number, self._first_line), partial(self._end, at.number + 1)
+        return self._led()
 
     def _led(self) -> Going:
         """Finds where a command leads; of one that fails, prints the reason and begins the call again."""
@@ -161,13 +182,19 @@ class Session:
         """Makes calls under watch; answers requests that are there when one begins, and on its way."""
 
         def looking(frame: FrameType, count: int) -> None:
-            if not count % LOOKS:
-                self._look()
-            at_line(frame, count)
+            try:
+                if not count % LOOKS:
+                    self._look()
+                at_line(frame, count)
+            except Gone as error:
+                raise self._abandoned(error) from error
 
         def through(process: Process, firing: Firing) -> dict[str, Message]:
             self._touched = False
-            self._look()
+            try:
+                self._look()
+            except Gone as error:
+                raise self._abandoned(error) from error
             self._lines = lines = Lines(looking, self._homes)
             made = lines.through(process, firing)
             if self._away is not None or self._over:
@@ -175,6 +202,11 @@ class Session:
             return made
 
         return through
+
+    def _abandoned(self, error: Gone) -> Abandoned:
+        """Ends the session within a call, whose operator has not raised that error."""
+        self._over, self._left = True, str(error)
+        return Abandoned()
 
     def _look(self) -> None:
         while (request := self._wire.request(wait=False)) is not None:
@@ -355,11 +387,13 @@ class Session:
         for number, each in enumerate(arguments.get("breakpoints", ()), 1):
             text, problem = each.get("condition") or "", ""
             try:
-                line = min(n for n in lines_of(file) if n >= each["line"])
+                line = _line_with_code(file, each["line"])
                 condition = compile(text, "<condition>", "eval") if text else None
                 problem = (
                     "" if is_own(file, self._homes) else "breakpoints are for the operator's source, not for libraries"
                 )
+            except LookupError as error:
+                problem = str(error)
             except (OSError, SyntaxError, ValueError) as error:
                 problem = f"no code there: {readable(error)}"
             if problem:
@@ -451,6 +485,15 @@ class Session:
 
 
 _real = cache(os.path.realpath)
+
+
+def _line_with_code(file: str, wanted: int) -> int:
+    """Returns the first line from `wanted` on that holds code. Raises LookupError behind the last one, OSError,
+    SyntaxError, ValueError."""
+    lines = lines_of(file)
+    if (found := min((n for n in lines if n >= wanted), default=None)) is None:
+        raise LookupError(f"no code from line {wanted} on: the last line with code is {max(lines, default=0)}")
+    return found
 
 
 def _parsed(text: str, *, statements: bool) -> ast.Expression | ast.Module:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 from dataflow.execution.memory import MemoryGuard
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
+from dataflow.records.comparison import Verification
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.sync import Entry
@@ -23,8 +24,9 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
 
     The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
     `incomplete` (recorded streams to be made again), `records` (see `FiringLog.to_wire`), `begin` (stamp, or None),
-    `tolerance`, `slices` (by operator the stamps between which its calls are made), `until` (operators: once each of
-    them has differed, the rest is left), `guard` (watch over messages in every call), `live_effects` (make them again).
+    `tolerance`, `slices` (by operator the stamps between which its calls are made), `until` (by operator a first
+    difference, as `retrial.First`, or None: once each has differed, and not first so, the rest is left), `guard` (watch
+    over messages in every call), `live_effects` (make them again).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
     stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: `operator` and `work` of
     those that are not repeated as a whole.
@@ -55,8 +57,8 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             watcher=board,
             live_effects=request["live_effects"],
         )
-        until = [work.runners[name].result for name in request["until"]]
-        results = work.run(until=lambda: bool(until) and all(result.first is not None for result in until))
+        until = [(work.runners[name].result, first) for name, first in request["until"].items()]
+        results = work.run(until=lambda: bool(until) and all(_differs(*one) for one in until))
         compared = comparer.close(results)
         stored = [check.result().to_wire() for check in checks.values()]
     slices = request["slices"]
@@ -78,6 +80,12 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         "reading": work.reading_cpu_ns,
         "wall": work.wall,
     }
+
+
+def _differs(result: Verification, first: Sequence[Any] | None) -> bool:
+    """Returns whether an operator has differed, and first otherwise than `first`."""
+    found = result.first
+    return found is not None and (first is None or tuple(first) != (found.incarnation, found.index, found.got))
 
 
 def _checks(recording: Recording, graph: Graph, log: FiringLog, request: Mapping[str, Any]) -> dict[str, StoredCheck]:

@@ -1,0 +1,42 @@
+"""Splits items that have effects together into those that have them alone, by halving."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+from dataflow.blame.links import Effect
+
+T = TypeVar("T")
+
+
+def split(
+    items: Sequence[T], shows: Callable[[Sequence[T]], tuple[Effect, ...]]
+) -> Iterator[tuple[Sequence[T], tuple[Effect, ...]]]:
+    """Yields those of some items, the last ones first, that have effects alone, by halving; where none does, the
+    shortest run of them that has, if all together have."""
+    if not items or not (effects := shows(items)):
+        return
+    if len(items) == 1:
+        yield items, effects
+        return
+    half, found = len(items) // 2, False
+    for part in (items[half:], items[:half]):
+        for each in split(part, shows):
+            found = True
+            yield each
+    if not found:
+        begin = _furthest(half, lambda n: bool(shows(items[n:])))
+        items = items[begin:]
+        left_out = _furthest(len(items) - 1, lambda n: bool(shows(items[: len(items) - n])))
+        items = items[: len(items) - left_out]
+        yield items, shows(items)
+
+
+def _furthest(most: int, holds: Callable[[int], bool]) -> int:
+    """The largest number up to `most` for which it holds, by bisection; it does for 0."""
+    low, high = 0, most + 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low

@@ -1,0 +1,144 @@
+"""A chain leads to the reading that decided, names the largest effect first, and claims nothing where none shows."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rangers
+from typer.testing import CliRunner
+
+import dataflow
+from dataflow.blame.chain import Blame
+from dataflow.blame.field import Field
+from dataflow.blame.links import Chain
+from dataflow.blame.nudge import made_finite, nudged
+from dataflow.cli.main import app
+from dataflow.graph import load_text
+from dataflow.messages import FeatureVector, RangeReading
+from dataflow.recording import Recording
+
+GRAPH = """graph: rig
+operators:
+  finder: {use: "rangers:Finder", params: {approaches: %s}}
+  smooth: {use: "rangers:Smooth", inputs: {range: finder/range}}
+  guard: {use: "rangers:Guard", inputs: {value: smooth/out}}
+  brake: {use: "rangers:Brake", inputs: {range: finder/range}}
+  describe: {use: "rangers:Describe", inputs: {range: finder/range}}
+"""
+
+
+@pytest.fixture(scope="module")
+def spiky(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("spiky") / "run.mcap"
+    dataflow.run(load_text(GRAPH % "false"), record=path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def approaching(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("approaching") / "run.mcap"
+    dataflow.run(load_text(GRAPH % "true"), record=path)
+    return path
+
+
+def found(path: Path, field: str) -> Chain:
+    with Recording(path) as recording:
+        return Blame(recording, Field.parse(field)).find()
+
+
+def sensed(chain: Chain) -> list[int]:
+    return [number for link in chain.sensed for _, _, number in link.messages]
+
+
+@pytest.mark.parametrize("step", [40, 59])  # behind it, a block of earlier calls ends among those that tripped it
+def test_a_latch_behind_a_low_pass_leads_to_the_one_reading_behind_all_calls_that_tripped_it(
+    step: int, spiky: Path
+) -> None:
+    chain = found(spiky, f"guard/stop.on@{step / 10}")
+
+    assert sensed(chain) == [rangers.SPIKE]
+    assert chain.whole
+    (row,) = [link for link in chain.links if not link.input]
+    assert row.maker == ("guard", rangers.SPIKE)
+    assert row.last is not None
+    assert {effect.together for effect in row.effects} == {row.last + 1 - rangers.SPIKE}
+
+
+def test_a_lost_echo_that_decided_is_made_finite_and_a_threshold_is_met_from_either_side(approaching: Path) -> None:
+    step = next(k for k in range(rangers.STEPS) if rangers.approaching(k) == pytest.approx(1.9))
+
+    chain = found(approaching, f"brake/stop.on@{step / 10}")
+
+    assert chain.value is False, "two of the last three are 2 m or more: one echo is lost, one is the threshold itself"
+    assert set(sensed(chain)) >= {step - 2, step - 1}
+    assert "made finite" in {effect.way for link in chain.sensed for effect in link.effects}
+    assert chain.whole
+
+
+def test_what_changes_a_value_most_is_named_first(spiky: Path) -> None:
+    chain = found(spiky, "smooth/out.value@4")
+
+    assert sensed(chain)[0] == rangers.SPIKE
+    assert next(link.maker for link in chain.links if not link.input) == ("smooth", rangers.SPIKE)
+
+
+def test_a_value_that_nothing_changes_is_not_said_to_be_decided_by_nothing(spiky: Path) -> None:
+    asked = "brake/stop.on@3"
+    told = CliRunner().invoke(app, ["blame", str(spiky), "--field", asked])
+
+    words = " ".join(told.output.split())
+    assert told.exit_code == 1
+    assert "decided by" not in words
+    assert "not known what decided brake #30: nothing that was tried there changes the value" in words
+    assert "nudged" in words
+    answer = json.loads(CliRunner().invoke(app, ["blame", str(spiky), "--field", asked, "--json"]).stdout)
+    assert (answer["whole"], answer["sensed"], answer["no_change_shows_at"]) == (False, [], [["brake", 30]])
+    assert answer["tried"]["nudged"] >= 2
+
+
+def test_a_link_beyond_which_nothing_shows_ends_the_chain_where_it_is(spiky: Path) -> None:
+    chain = found(spiky, "guard/stop.on@1")
+
+    assert [effect.way for link in chain.links for effect in link.effects] == ["another"]
+    assert chain.loose == [("smooth", 10)]
+    assert not chain.whole
+
+
+def test_changes_that_a_recorded_answer_does_not_fit_could_not_be_tried(spiky: Path) -> None:
+    told = CliRunner().invoke(app, ["blame", str(spiky), "--field", "describe/text.text@3"])
+
+    words = " ".join(told.output.split())
+    assert told.exit_code == 1
+    assert "decided by" not in words
+    assert "could not be tried: range of describe #30: describe #30 raises EffectMiss" in words
+    assert "changes made a call raise, which shows nothing" in words
+
+
+def test_a_time_behind_the_end_is_told(spiky: Path) -> None:
+    told = CliRunner().invoke(app, ["blame", str(spiky), "--field", "smooth/out.value@1000"])
+
+    assert "made by smooth #59 at 5.900 s, the last one: the recording ends before" in " ".join(told.output.split())
+    assert not found(spiky, "smooth/out.value@5.9").late
+
+
+def test_a_nudge_and_its_opposite_lie_on_either_side() -> None:
+    message = FeatureVector(stamp=5, vectors=np.array([[1.0, -2.0, 0.5]]), model="m")
+
+    one, other = (nudged(message, sign=sign)[0].vectors - message.vectors for sign in (1, -1))
+
+    np.testing.assert_allclose(one, -other, rtol=1e-4)
+    assert (one != 0).all()
+
+
+def test_numbers_that_are_not_finite_take_a_neighbour() -> None:
+    lost, heard = (RangeReading(stamp=k, frame="f", range=x) for k, x in ((2, math.inf), (1, 0.8)))
+    rows = FeatureVector(stamp=1, vectors=np.array([[np.nan, 1.0, -np.inf, 3.0]]), model="m")
+
+    assert made_finite(lost, heard).range == 0.8
+    assert made_finite(lost, heard).range_max == math.inf, "the neighbour's is no other"
+    assert made_finite(lost, None) is lost
+    assert made_finite(rows, None).vectors.tolist() == [[1.0, 1.0, 1.0, 3.0]]

@@ -1,0 +1,3 @@
+"""Imported by `looking`: its source and its bytecode are read."""
+
+HELPED = 1
