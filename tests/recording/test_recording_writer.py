@@ -211,6 +211,29 @@ def test_what_a_refused_write_would_have_declared_is_not_in_the_index(
         assert recording.metadata["graph"] == {"text": "graph: g"}
 
 
+def test_a_disk_without_room_for_the_digests_leaves_an_index(
+    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.write
+
+    def refuse(fd: int, data: Any) -> int:
+        monkeypatch.setattr(os, "write", real)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "full.mcap"
+    writer = RecordingWriter(path, metadata={})
+    writer.add_stream("kept", Pose)
+    writer.write("kept", pose(1), seq=0)
+    writer.flush()
+    monkeypatch.setattr(os, "write", refuse)
+    with pytest.raises(RecordingError, match="No space left"):
+        writer.close()
+
+    with Recording(path) as recording:
+        assert not recording.torn
+        assert len(list(recording.messages())) == 1
+
+
 def test_a_file_size_limit_of_the_system_leaves_a_finished_file(tmp_path: Path, noise: Callable[..., Any]) -> None:
     """A real refusal by the kernel; cutting the torn chunk off makes room for the index."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -317,8 +317,8 @@ class ContainerWriter:
             cut = f"its torn end could not be cut off ({second.strerror}), readers skip it"
         until = f", stamps up to {self.last_time}" if self._chunks.count else ""
         self._declared.clear()
-        for declared, lasting in zip((self._schemas, self._channels, self._metadata), self._lasting, strict=True):
-            del declared[lasting:]
+        schemas, channels, metadata = self._lasting
+        del self._schemas[schemas:], self._channels[channels:], self._metadata[metadata:]
         self._failure = (
             f"writing {self.path} failed: {error.strerror or error}. Saved: {self._position} bytes on disk, "
             f"{self._chunks.count} chunks ({self._chunks.content_bytes} bytes of messages{until}); "

@@ -260,6 +260,7 @@ class RecordingWriter:
         try:
             self._file.finish_chunks()
             self._file.add_metadata(DIGESTS, self.digests())
+            self._file.finish_chunks()  # where there is no room for it, there may be for the index
         finally:
             self._file.close()
 
