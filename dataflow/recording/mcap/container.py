@@ -81,7 +81,7 @@ class ContainerWriter:
         self._declared: list[bytes] = []
         """Schemas, channels and metadata that go to the disk with the next chunk, or at a flush."""
         self._lasting = 0, 0, 0
-        """How many schemas, channels and metadata are in the file."""
+        """Numbers of schemas, channels and metadata in the file."""
         self._records: Gathered | None = None
         self._messages: Gathered | None = None
         self.first_time: int | None = None
