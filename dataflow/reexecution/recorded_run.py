@@ -77,11 +77,13 @@ def graph_that_is_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
 
 def _none_here(recording: Recording, absent: Mapping[str, str], found: Mapping[str, type[Operator] | NotFound]) -> str:
     """Returns in words that no operator of a recording is here: each reason once, with its operators."""
+    from dataflow.graph.lookup import NotFound
+
     names: dict[str, list[str]] = {}
     for name, reason in absent.items():
         names.setdefault(reason, []).append(name)
     reasons = "; ".join(f"{reason} ({', '.join(of)})" for reason, of in names.items())
-    hints = [each.hint for name in absent if not isinstance(each := found[name], type) and each.hint]
+    hints = [line for name in absent if isinstance(each := found[name], NotFound) for line in each.hint.splitlines()]
     return "\n".join([f"{recording.path}: the code of its operators is not here: {reasons}", *dict.fromkeys(hints)])
 
 
