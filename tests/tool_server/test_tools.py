@@ -308,7 +308,7 @@ def test_an_operator_that_did_not_repeat_before_the_fix_is_named_and_only_judged
     )
     recording = str(tmp_path / "wrong.mcap")
     dataflow.run(graph, record=recording)
-    factor.write_text("FACTOR = 2\n")
+    factor.write_text("FACTOR = 2  # of another size: bytecode of the same second would be taken for it\n")
     for name in ("shared_factor", "fixed_scale", "by_chance"):
         monkeypatch.delitem(sys.modules, name)
 
