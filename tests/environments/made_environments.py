@@ -19,7 +19,7 @@ def install(environment: Path, version: str, gain: float) -> None:
     folder = packages(environment)
     for old in folder.glob("tiny-*"):
         shutil.rmtree(old)
-    shutil.rmtree(folder / "__pycache__", ignore_errors=True)  # a text of the same size and second would be taken from it
+    shutil.rmtree(folder / "__pycache__", ignore_errors=True)  # it may be of a text of the same size and second
     (folder / "tiny.py").write_text(f"GAIN = {gain}\n")
     about = folder / f"tiny-{version}.dist-info"
     about.mkdir(exist_ok=True)
