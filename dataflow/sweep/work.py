@@ -19,6 +19,8 @@ from dataflow.sweep.plan import Task
 from dataflow.sweep.warm import Worker
 
 Outcome = Literal["done", "failed", "killed", "timed out", "not fetched"]
+ERROR = "error: "
+"""Begins the line by which a command says why it failed; a traceback may follow."""
 TRIES = 2
 """Times that a task is begun whose process was killed from outside."""
 LOG_BYTES = 1 << 16
@@ -85,7 +87,8 @@ def _once(task: Task, timeout: float, worker: Worker, stop: Event | None) -> Res
     outcome: Outcome = (
         "done" if report is not None and (code == 0 or (task.what == "verify" and code == 1)) else "failed"
     )
-    last = next((line for line in reversed(said.splitlines()) if line.strip()), f"exit code {code}")
+    lines = [line for line in said.splitlines() if line.strip()] or [f"exit code {code}"]
+    last = next((line.removeprefix(ERROR) for line in lines if line.startswith(ERROR)), lines[-1])
     if code is None:
         outcome, last = "timed out", f"not over within {timeout:g} s"
     elif code < 0:
