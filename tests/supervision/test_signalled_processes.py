@@ -20,8 +20,10 @@ PACKAGE = Path(dataflow.__file__).parent
 BY_NUMBER = {"kill", "killpg"}
 NOT_WAITED_FOR_YET = {
     "supervision/nursery.py": 1,
-    "sweep/work.py": 1,
     "supervision/nursery_process.py": 3,
+    "process/start.py": 1,
+    "sweep/warm_process.py": 2,
+    "tool_server/jobs.py": 1,
     "verification/workers/prestart.py": 1,
     "verification/workers/worker.py": 1,
 }
