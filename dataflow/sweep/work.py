@@ -20,7 +20,7 @@ from dataflow.sweep.warm import Worker
 
 Outcome = Literal["done", "failed", "killed", "timed out", "not fetched"]
 ERROR = "error: "
-"""Begins the line by which a command says why it failed; a traceback may follow."""
+"""Begins the line of a command with the reason of its failure; a traceback may follow."""
 TRIES = 2
 """Times that a task is begun whose process was killed from outside."""
 LOG_BYTES = 1 << 16
