@@ -91,23 +91,10 @@ class OperatorProcess:
         self.outlet = self._outlet(outgoing, box)
         self.progress = Progress(channel, self.driver, self.live, paced=config.live)
         self.requests = Requests(
-            config,
-            self.driver,
-            self.live,
-            self.progress,
-            self.outlet.recent,
-            self.pace.event_time,
-            channel,
+            config, self.driver, self.live, self.progress, self.outlet.recent, self.pace.event_time, channel
         )
-        self.orders = Control(
-            (self.window, self.backlog),
-            self.driver,
-            self.live,
-            self.inlet,
-            self.outlet,
-            self.requests,
-            self.release,
-        )
+        windows = self.window, self.backlog
+        self.orders = Control(windows, self.driver, self.live, self.inlet, self.outlet, self.requests, self.release)
         self._standing = IdleReport(
             channel,
             self.orders,

@@ -123,19 +123,7 @@ def verify(
     played = task.graph
     options: dict[str, Any] = {"threads": played.threads, "stall_timeout": stall_timeout, "watch": watch}
     options |= {"early": early, "locate": _locate(task)}
-    request = {
-        "path": str(path),
-        "graph": played.to_json(),
-        "records": task.records,
-        "begin": task.begin,
-        "incomplete": sorted(task.incomplete),
-        "tolerance": tolerance,
-        "checks": [],
-        "slices": {},
-        "until": {},
-        "guard": paranoid,
-        "live_effects": live_effects,
-    }
+    request = _request(task, path, tolerance, paranoid=paranoid, live_effects=live_effects)
 
     def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
         function = f"{part.__name__}:{part.verify_part.__name__}"
@@ -153,6 +141,23 @@ def verify(
         retrial = _retry(task, differing, answers, attempt)
         report = _report(task, answers, tolerance, start, retrial)
     return replace(report, total=time.monotonic() - began)
+
+
+def _request(task: _Task, path: Path, tolerance: float | None, *, paranoid: bool, live_effects: bool) -> dict[str, Any]:
+    """Returns what each worker is asked (`job.verify_part`), but for its operators."""
+    return {
+        "path": str(path),
+        "graph": task.graph.to_json(),
+        "records": task.records,
+        "begin": task.begin,
+        "incomplete": sorted(task.incomplete),
+        "tolerance": tolerance,
+        "checks": [],
+        "slices": {},
+        "until": {},
+        "guard": paranoid,
+        "live_effects": live_effects,
+    }
 
 
 def _prepare(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json as jsonlib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
 from operators.training.console import Data, Json, friendly, out_console
+
+if TYPE_CHECKING:
+    from operators.detection.custom.dataset import DetectionData, LabelledImage
 
 learn = typer.Typer(name="learn", no_args_is_help=True, rich_markup_mode="rich")
 
@@ -57,7 +60,6 @@ def learn_object(
 
         import numpy as np
 
-        from operators.detection.custom.dataset import IMAGE_SUFFIXES, LabelledImage
         from operators.detection.custom.folder import read_detection_data
         from operators.recognition.objects.learned_object import learn as fitted
         from operators.recognition.objects.learned_object import shown_in
@@ -65,14 +67,7 @@ def learn_object(
         from operators.weights import shipped
 
         detector = shipped("detector.onnx") if weights is None else weights
-        read = read_detection_data(data, seed).only([name])
-        images = list({image.file: image for image in (*read.training, *read.validation)}.values())
-        nothing = np.zeros((0, 4), np.float32), np.zeros(0, np.int32), np.zeros(0, np.bool_)
-        if background is not None:
-            files = sorted(f for f in background.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES)
-            if not files:
-                raise FileNotFoundError(f"{background} holds no image ({', '.join(sorted(IMAGE_SUFFIXES))})")
-            images += [LabelledImage(file, *nothing) for file in files]
+        images = _images(read_detection_data(data, seed).only([name]), background)
         inner = (*inner_maps(detector), COLOR)
         trunk = Trunk(detector, inner)
         shown = []
@@ -87,12 +82,23 @@ def learn_object(
     if json:
         typer.echo(jsonlib.dumps({"object": name, "file": str(out), "images": learned.images}))
         return
-    file = escape(str(out))
     counted = f"{escape(name)} from {learned.images} images of {len(images)}"
-    out_console.print(f"[green]{file}[/green]: {counted}", highlight=False, soft_wrap=True)
-    out_console.print(
-        f"use it: `use: operators.recognition:LearnedDetector` with `params: {{objects: [{out}]}}`",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    used = escape(f"`use: operators.recognition:LearnedDetector` with `params: {{objects: [{out}]}}`")
+    for line in (f"[green]{escape(str(out))}[/green]: {counted}", f"use it: {used}"):
+        out_console.print(line, highlight=False, soft_wrap=True)
+
+
+def _images(read: DetectionData, background: Path | None) -> list[LabelledImage]:
+    """Returns the images of a class, each once, and those of a folder without it."""
+    import numpy as np
+
+    from operators.detection.custom.dataset import IMAGE_SUFFIXES, LabelledImage
+
+    images = list({image.file: image for image in (*read.training, *read.validation)}.values())
+    if background is None:
+        return images
+    files = sorted(f for f in background.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES)
+    if not files:
+        raise FileNotFoundError(f"{background} holds no image ({', '.join(sorted(IMAGE_SUFFIXES))})")
+    nothing = np.zeros((0, 4), np.float32), np.zeros(0, np.int32), np.zeros(0, np.bool_)
+    return images + [LabelledImage(file, *nothing) for file in files]

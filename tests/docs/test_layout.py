@@ -16,6 +16,19 @@ MOST_ON_A_FLOOR = 25
 MOST_IN_A_FOLDER = 25
 MOST_ARROWS_IN_ODOMETRY = 40
 MOST_LINES = 60
+LONG = {
+    "dataflow.cli.commands.convert:convert": 122,
+    "dataflow.cli.commands.demo:demo": 65,
+    "dataflow.cli.commands.following.live:hz": 63,
+    "dataflow.cli.commands.following.logs:logs": 69,
+    "dataflow.cli.commands.following.recording:record": 70,
+    "dataflow.cli.commands.replay:replay": 142,
+    "dataflow.cli.commands.run:run": 106,
+    "dataflow.cli.commands.verification:verify": 132,
+    "operators.scene.commands:show": 64,
+    "operators.scene.map.cuboid:fit_cuboid": 81,
+}
+"""Functions of more than `MOST_LINES` lines, with their lines. The list only gets shorter, and its numbers smaller."""
 
 
 def allowed(repository: Path) -> dict[str, tuple[str, ...]]:
@@ -162,17 +175,13 @@ def test_no_folder_has_more_files_than_one_looks_through(repository: Path) -> No
 
 
 def lines_of_functions(tree: ast.AST, name: str) -> Iterator[tuple[str, int]]:
-    """Every function below a node, nested ones and methods included, with the lines of its statements.
-
-    Decorators, parameters and docstring are left out: a command's are its options and its help.
-    """
+    """Every function below a node, nested ones and methods included, with its lines without decorators."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             inner = f"{name}{'.' if name[-1] != ':' else ''}{node.name}"
             if not isinstance(node, ast.ClassDef):
-                told = len(node.body) > 1 and ast.get_docstring(node, clean=False) is not None
                 assert node.end_lineno is not None
-                yield inner, node.end_lineno - node.body[told].lineno + 1
+                yield inner, node.end_lineno - node.lineno + 1
             yield from lines_of_functions(node, inner)
         else:
             yield from lines_of_functions(node, name)
@@ -186,7 +195,10 @@ def test_functions_are_short(repository: Path) -> None:
         for function, lines in lines_of_functions(nodes_of(file)[0], f"{module_of(file, repository)}:")
         if lines > MOST_LINES
     }
-    assert not long, f"longer than {MOST_LINES} lines"
+    longer = {function: lines for function, lines in long.items() if lines > LONG.get(function, MOST_LINES)}
+    assert not longer, f"longer than {MOST_LINES} lines, or than the list of long functions allows: {longer}"
+    shorter = {function: long.get(function) for function in LONG if long.get(function) != LONG[function]}
+    assert not shorter, f"take these off the list of long functions, or write down that they are shorter: {shorter}"
 
 
 def test_collecting_tests_imports_no_library_that_takes_seconds(imported_by_collection: set[str]) -> None:
