@@ -25,6 +25,7 @@ from dataflow.blame.others import ANOTHER, Others, Taken, without
 from dataflow.blame.split import split
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph
+from dataflow.graph.reach import upstream
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
@@ -72,7 +73,7 @@ class Blame:
         self.graph = graph_that_is_here(recording)[0] if graph is None else graph
         self._budget, self._deadline = budget, float("inf")
         self._lines: dict[str, Line] = {}
-        above = {name: _above(self.graph, name) for name in self.graph.nodes}
+        above = {name: {name} | upstream(self.graph, [name]) for name in self.graph.nodes}
         self._rank = {name: len(found) for name, found in above.items()}
         """More than that of each operator that is upstream; equal in a cycle."""
         self._in_cycle = {n for n, found in above.items() if any(n in above[m] for m in found if m != n)}
@@ -606,13 +607,3 @@ def _goes_on(link: Link, taken: Taken, effects: tuple[Effect, ...]) -> bool:
     same = link.effects is effects and (link.call, link.input) == (taken.call, taken.input)
     stream, incarnation, number = place_of(taken.entry)
     return same and (stream, incarnation, number - 1) == link.messages[-1]
-
-
-def _above(graph: Graph, operator: str) -> set[str]:
-    """The operator, and all that it depends on."""
-    found, left = {operator}, [operator]
-    while left:
-        makers = {graph.streams[stream].node for stream in graph.nodes[left.pop()].taken} - found
-        found |= makers
-        left += makers
-    return found

@@ -15,13 +15,14 @@ from dataflow.causes.rerun import Rerun, Setting, fake_time, run_again
 from dataflow.causes.sources import COMPILED, FILE, FOLDER, INPUT, MODULE, SOURCES, kind_of, name_of
 from dataflow.causes.traps import Site
 from dataflow.graph.model import Graph
+from dataflow.graph.reach import with_makers
 from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import graph_that_is_here
 from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.books import Books
-from dataflow.verification.choice import accountable, env_of, with_makers
+from dataflow.verification.choice import accountable, env_of
 from dataflow.verification.ledger import incomplete_streams
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.workers.processes import Call, Workers, call_workers

@@ -18,6 +18,7 @@ from dataflow.drops.player import Player
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph
+from dataflow.graph.reach import upstream
 from dataflow.recording import Recording
 from dataflow.records.figures import recorded_summaries
 from dataflow.records.firing import CALLS, FiringRecord
@@ -180,7 +181,7 @@ class Drops:
     def _plan(self) -> tuple[Feeding, list[Loss], Sent]:
         """The operators between losses and figures, with what feeds them, the losses, and the messages sent."""
         graph = self.graph
-        above = _above(graph, self.worse.operators)
+        above = {*self.worse.operators} | upstream(graph, self.worse.operators)
         sent: dict[str, Sequence[tuple[tuple[int, int], int]]] = {}
         for name, records in self._records.items():
             sent |= sent_by(list(graph.nodes[name].outputs.values()), records)
@@ -190,7 +191,7 @@ class Drops:
             if node.taken and not node.external and name in self._records:
                 losses += losses_of(node, self._records[name], sent, graph.static)
         losing = {loss.operator for loss in losses}
-        between = [name for name in graph.nodes if name in above and losing & _above(graph, [name])]
+        between = [name for name in graph.nodes if name in above and losing & ({name} | upstream(graph, [name]))]
         for name in between:
             self._refuse_restarts(name)
         inside = {s for name in between for s in graph.nodes[name].outputs.values()}
@@ -320,18 +321,6 @@ def _reduced(named: Sequence[Loss], heals: Callable[[Sequence[Loss]], bool]) -> 
 def _flat(bursts: Sequence[Sequence[Loss]]) -> list[Loss]:
     """Returns the losses of some bursts, sorted."""
     return sorted(loss for burst in bursts for loss in burst)
-
-
-def _above(graph: Graph, operators: Sequence[str]) -> set[str]:
-    """The operators, and all that they depend on."""
-    found, left = set(operators), list(operators)
-    while left:
-        for stream in graph.nodes[left.pop()].taken:
-            maker = graph.streams[stream].node
-            if maker not in found:
-                found.add(maker)
-                left.append(maker)
-    return found
 
 
 def _firings(records: Sequence[FiringRecord]) -> list[tuple[Any, ...]]:

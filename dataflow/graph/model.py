@@ -330,18 +330,6 @@ class Graph:
             (node, port) for node in self.nodes.values() for port, taken in node.inputs.items() if stream in taken
         )
 
-    def repeated_for(self, name: str) -> frozenset[str]:
-        """The operators that are repeated for a call of one, from a recording of this graph: itself, and those in front
-        whose messages are not recorded."""
-        found, left = {name}, [name]
-        while left:
-            for stream in self.nodes[left.pop()].taken.difference(self.record.streams):
-                maker = self.nodes[self.streams[stream].node]
-                if maker.name not in found and not maker.source:
-                    found.add(maker.name)
-                    left.append(maker.name)
-        return frozenset(found)
-
     def edges(self) -> Iterator[Edge]:
         """Every stream into every input, in graph order."""
         for node in self.nodes.values():

@@ -17,6 +17,7 @@ from dataflow.execution.ports import Emitter
 from dataflow.execution.runner import OperatorRunner
 from dataflow.execution.source import SourceRunner
 from dataflow.graph.model import Graph, Node
+from dataflow.graph.reach import with_makers
 from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.process.live_sources import LiveSources
 from dataflow.recording import Recording
@@ -86,12 +87,13 @@ def _make_runner(
     on_failure: Outlived,
 ) -> OperatorRunner:
     """Makes the runner of an operator that has inputs."""
-    snapshots = graph.record.snapshots
+    recorded = graph.record
+    repeated = len(with_makers(recorded.streams, graph, [node.name]))
     common: dict[str, Any] = {
         "static": graph.static,
         "seed": graph.seed,
         "paranoid": config.paranoid,
-        "snapshots": None if snapshots is None else StateSpacing(snapshots, len(graph.repeated_for(node.name))),
+        "snapshots": None if recorded.snapshots is None else StateSpacing(recorded.snapshots, repeated),
     }
     if config.live:
         live = LiveRunner(node, emitter, **common, event_clock=event_clock, on_failure=on_failure)

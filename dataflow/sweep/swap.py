@@ -10,6 +10,7 @@ from pathlib import Path
 from dataflow.api.local import LocalRun
 from dataflow.api.runs import replay
 from dataflow.graph import Graph
+from dataflow.graph.reach import upstream
 from dataflow.recording import Recording
 from dataflow.supervision.replay import plan_replay
 from dataflow.sweep.plan import SweepError
@@ -83,7 +84,7 @@ def between(graphs: tuple[Graph, Graph], different: Iterable[str], figure: str) 
         and first.nodes[name].outputs == second.nodes[name].outputs
     ]
     judge = figure.partition(":")[0]
-    above = _above(first, judge) if judge in first.nodes else set()
+    above = upstream(first, [judge]) - {judge} if judge in first.nodes else set()
     if not (found := [name for name in there if name in above]):
         raise SweepError(f"{figure}: no operator in front of {judge} has other outputs in B, so none can be swapped")
     return found
@@ -101,15 +102,6 @@ def shares(found: Sequence[Mapping[str, float]]) -> list[Share]:
     means = {name: sum(one[name] for one in found) / len(found) for name in found[0]}
     whole = means.pop("")
     return [Share(name, change, change / whole if whole else math.nan) for name, change in means.items()]
-
-
-def _above(graph: Graph, operator: str) -> set[str]:
-    found, left = set[str](), [operator]
-    while left:
-        makers = {graph.streams[stream].node for stream in graph.nodes[left.pop()].taken}
-        left += makers - found
-        found |= makers
-    return found - {operator}
 
 
 def _named(summaries: Mapping[str, Mapping[str, object]]) -> dict[str, float]:

@@ -6,7 +6,6 @@ files are the recorded ones is none that it has changed: where that does not rep
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from dataflow.debugging.suspects import recorded_code, recorded_text
 from dataflow.execution.failure import OperatorFailure
 from dataflow.graph.code import ReloadError, other_texts
 from dataflow.graph.model import Graph, OperatorImportError
+from dataflow.graph.reach import downstream
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
 
@@ -53,22 +53,22 @@ def judge(recording: Recording, report: VerifyReport, graph: Graph, mended: str)
     """Judges a verification of all operators with a fix, in the code or the graph, of the one that is `mended`."""
     recorded = graph_that_is_here(recording)[0]
     others = Others(dict.fromkeys(report.absent, "not re-executed"))
-    downstream = list[str]()
+    following = list[str]()
     for v in report.operators:
         name = v.operator
         if name == mended:
-            if v.tainted is not None and name not in _downstream(graph, {name}):
+            if v.tainted is not None and name not in downstream(graph, {name}):
                 others.reasons[name] = "is given other messages than recorded, which are made again"
         elif told := unmade(v):
             others.reasons[name] = told
         elif (verdict := report.verdict(v)) == "downstream":
-            downstream.append(name)
+            following.append(name)
         elif verdict == "culprit" and v.first is not None and not v.wrote:
             _judge_culprit(others, recording, report, recorded, graph, v)
         elif verdict != "identical":
             others.reasons[name] = verdict
-    behind = _downstream(graph, {mended, *others.unrepeated})
-    others.reasons |= {name: "downstream" for name in downstream if name not in behind}
+    behind = downstream(graph, {mended, *others.unrepeated})
+    others.reasons |= {name: "downstream" for name in following if name not in behind}
     return others
 
 
@@ -121,14 +121,3 @@ def _differs_as_recorded(recording: Recording, graph: Graph, v: Verification) ->
             return debugger.first_difference() is not None
     except (ReloadError, OperatorImportError, ReplayError, OperatorFailure):
         return None
-
-
-def _downstream(graph: Graph, operators: Iterable[str]) -> set[str]:
-    """Returns the operators that take, directly or not, what some make."""
-    found, waiting = set[str](), list(operators)
-    while waiting:
-        name = waiting.pop()
-        more = {node.name for stream in graph.nodes[name].outputs.values() for node, _ in graph.consumers(stream)}
-        waiting += more - found
-        found |= more
-    return found

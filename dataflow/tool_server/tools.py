@@ -253,7 +253,7 @@ def drops(
 
     _compiled("worse", worse)
     with Recording(_file(recording)) as opened:
-        return asdict(Drops(opened, worse, _loaded(graph), budget=budget, watch=watch).find())
+        return Drops(opened, worse, _loaded(graph), budget=budget, watch=watch).find().as_json()
 
 
 def prove(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from dataflow.environments import EnvError, environment_of
 from dataflow.graph.model import Graph
+from dataflow.graph.reach import downstream
 from dataflow.recording import Recording
 from dataflow.recording.layout import CUT, OUTCOME
 from dataflow.reexecution.engine import plan_feeding
@@ -42,22 +43,7 @@ def chosen_operators(graph: Graph, first: str | None, only: Collection[str] | No
         return set(only)
     if first is None:
         return able
-    following, edges = {first}, list(graph.edges())
-    while new := {e.consumer for e in edges if e.producer in following} - following:
-        following |= new
-    return following & able
-
-
-def with_makers(held: Collection[str], graph: Graph, chosen: set[str]) -> set[str]:
-    """The operators with those that make what they take, as far as it is not held in the recording."""
-    wanted, left = set(chosen), list(chosen)
-    while left:
-        for stream in {s for taken in graph.nodes[left.pop()].inputs.values() for s in taken}:
-            maker = graph.nodes[graph.streams[stream].node]
-            if stream not in held and not (maker.source or maker.external or maker.name in wanted):
-                wanted.add(maker.name)
-                left.append(maker.name)
-    return wanted
+    return ({first} | downstream(graph, [first])) & able
 
 
 def without_environments(graph: Graph) -> tuple[Graph, dict[str, str]]:

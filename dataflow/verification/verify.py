@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.graph.model import Graph
+from dataflow.graph.reach import with_makers
 from dataflow.recording import Recording
 from dataflow.recording.layout import RECOVERED
 from dataflow.recording.streams.cutting import cut_of
@@ -33,7 +34,6 @@ from dataflow.verification.choice import (
     require_records,
     stored_checks,
     unfed_operators,
-    with_makers,
     without_environments,
 )
 from dataflow.verification.compare import OutputComparison

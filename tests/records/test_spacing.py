@@ -6,6 +6,7 @@ import itertools
 
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph
+from dataflow.graph.reach import with_makers
 from dataflow.records.spacing import CPU_SPACING, LARGE, MOST_OFTEN, REPEATING, StateSpacing
 
 CHAIN = """
@@ -59,7 +60,10 @@ def test_operators_in_front_that_are_repeated_count_with_each_call() -> None:
 
 
 def test_what_is_repeated_for_a_call_ends_at_recorded_streams() -> None:
-    graph = chain("cam/**")
-    assert graph.repeated_for("third") == {"first", "second", "third"}
-    assert graph.repeated_for("first") == {"first"}
-    assert chain("cam/**, second/checked").repeated_for("third") == {"third"}
+    def repeated(record: str, name: str) -> set[str]:
+        graph = chain(record)
+        return with_makers(graph.record.streams, graph, [name])
+
+    assert repeated("cam/**", "third") == {"first", "second", "third"}
+    assert repeated("cam/**", "first") == {"first"}
+    assert repeated("cam/**, second/checked", "third") == {"third"}
