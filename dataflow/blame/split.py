@@ -13,8 +13,8 @@ T = TypeVar("T")
 def split(
     items: Sequence[T], shows: Callable[[Sequence[T]], tuple[Effect, ...]]
 ) -> Iterator[tuple[Sequence[T], tuple[Effect, ...]]]:
-    """Yields those of some items, the last ones first, that have effects alone, by halving; where none does, the
-    shortest run of them that has, if all together have."""
+    """Yields those of some items, the last ones first, that have effects alone, by halving; of a part in which none
+    does, the shortest run that has, if all of it together has."""
     if not items or not (effects := shows(items)):
         return
     if len(items) == 1:
