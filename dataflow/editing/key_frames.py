@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.records import Channel
 
 from dataflow.interop.bag import Topic
-from dataflow.interop.topics import TopicReader, reader_of
 from dataflow.messages import CompressedVideo, MessageError
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import Kind
 from dataflow.recording.streams.codecs import SchemaText
 from dataflow.recording.streams.copying import Origin
 from dataflow.video.decoder import is_key
+
+if TYPE_CHECKING:
+    from dataflow.interop.topics import TopicReader
 
 FARTHEST = 3_000
 """Packets that are looked at for a key frame, back from a start: 100 s of 30 Hz."""
@@ -51,6 +54,8 @@ def _keys_before(origin: Origin, channel: Channel, starts: Sequence[int]) -> lis
     schema = origin.file.schemas.get(channel.schema_id)
     if schema is None or schema.name not in _SCHEMAS:
         return nothing
+    from dataflow.interop.topics import reader_of  # needs the extra `bags`, which recordings without video do not
+
     entries = origin.entries(channel.id)
     text = SchemaText(schema.name, schema.encoding, schema.data)
     topic = Topic(
