@@ -1,4 +1,4 @@
-"""A source and an operator that samples its own output."""
+"""A source, an operator for a chain, and one that samples its own output."""
 
 from __future__ import annotations
 
@@ -22,3 +22,11 @@ class Sum(Operator):
 
     def process(self, tick: FeatureVector, last: FeatureVector | None = None) -> FeatureVector:
         return tick
+
+
+class Same(Operator):
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        return x

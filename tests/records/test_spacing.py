@@ -4,24 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from dataflow.graph import load_text
-from dataflow.graph.model import Graph
-from dataflow.graph.reach import with_makers
 from dataflow.records.spacing import CPU_SPACING, LARGE, MOST_OFTEN, REPEATING, StateSpacing
-
-CHAIN = """
-graph: chain
-record: {{topics: [{topics}], snapshots: cpu}}
-operators:
-  cam: {{use: 'operators.sources:SyntheticRgbd'}}
-  first: {{use: 'operators.monitoring:ImageWatch', inputs: {{image: cam/image}}}}
-  second: {{use: 'operators.monitoring:ImageWatch', inputs: {{image: first/checked}}}}
-  third: {{use: 'operators.monitoring:ImageWatch', inputs: {{image: second/checked}}}}
-"""
-
-
-def chain(topics: str) -> Graph:
-    return load_text(CHAIN.format(topics=topics))
 
 
 def due(spacing: StateSpacing, each: int, nbytes: int, calls: int) -> list[int]:
@@ -57,13 +40,3 @@ def test_operators_in_front_that_are_repeated_count_with_each_call() -> None:
     alone, behind = (due(StateSpacing("cpu", repeated), 0, LARGE, 4 * calls) for repeated in (1, 5))
     assert alone[2] - alone[1] == calls
     assert behind[2] - behind[1] == calls // 5
-
-
-def test_what_is_repeated_for_a_call_ends_at_recorded_streams() -> None:
-    def repeated(record: str, name: str) -> set[str]:
-        graph = chain(record)
-        return with_makers(graph.record.streams, graph, [name])
-
-    assert repeated("cam/**", "third") == {"first", "second", "third"}
-    assert repeated("cam/**", "first") == {"first"}
-    assert repeated("cam/**, second/checked", "third") == {"third"}
