@@ -71,7 +71,8 @@ class Agent:
     ) -> None:
         """`patience`: the seconds for which operators go on without the supervisor being heard."""
         self.patience = patience
-        self.name, self._endpoint, self._keys, self._folder, self._notice = name, endpoint, keys, folder, notice
+        self.name, self._endpoint, self._notice = name, endpoint, notice
+        self._keys, self._folder = keys and keys.absolute(), folder.absolute()  # it changes into its folder
         self._id = secrets.token_bytes(8)
         self._offered = ""
         self._over: set[str] = set()
