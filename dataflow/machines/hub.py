@@ -29,7 +29,7 @@ LEAVE_WITHIN = 2.0
 LEASE = 6_000
 """Milliseconds after which a link on which nothing comes is given up, and connected anew."""
 BLOCKED = 3.0
-"""Seconds for which a frame waits for a link that takes nothing. Until then Zenoh opens no other: a router's tables wait."""
+"""Seconds for which a frame waits for a link that takes nothing; a router's tables, and a new link, wait as long."""
 POOL_BYTES = 256 << 20
 
 

@@ -253,8 +253,12 @@ class Code:
         Raises `OSError` for a file that cannot be read.
         """
         if graph is None:
-            homes = sorted({path.stem for path in (*Path().glob("*.py"), *(each.parent for each in Path().glob("*/*.py")))})
-            return _digest((self._base, [self._package(name) for name in ("operators", *filter(str.isidentifier, homes))]))
+            homes = sorted(
+                {path.stem for path in (*Path().glob("*.py"), *(each.parent for each in Path().glob("*/*.py")))}
+            )
+            return _digest(
+                (self._base, [self._package(name) for name in ("operators", *filter(str.isidentifier, homes))])
+            )
         described = graph.to_json()
         parts = [described[part] for part in ("nodes", "streams", "seed", "threads", "namespace")]
         used = sorted({current_path(node.use).partition(":")[0] for node in graph.nodes.values()})

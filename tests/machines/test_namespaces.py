@@ -94,7 +94,13 @@ def test_a_cable_that_is_pulled_loses_nothing_and_only_the_asked_port_listens(
             threading.Thread(target=pull, daemon=True).start()
 
     meeting = Meeting(endpoint, tmp_path / "laptop")
-    report = run(load_text(GRAPH.replace("STEPS", str(steps))), machines=meeting, live=True, record=tmp_path / "cable.mcap", watch=watch)
+    report = run(
+        load_text(GRAPH.replace("STEPS", str(steps))),
+        machines=meeting,
+        live=True,
+        record=tmp_path / "cable.mcap",
+        watch=watch,
+    )
 
     said = end(robot)
     assert listening["there"] == ""

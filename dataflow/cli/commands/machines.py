@@ -41,10 +41,13 @@ def join(
     """
     import signal
 
+    from dataflow.machines.keys import require_machine
     from dataflow.supervision.agent import Agent
 
     find_modules_in(path)
     with friendly_errors():
+        if keys is not None:
+            require_machine(keys, name)
         agent = Agent(name, connect, keys, folder, say, patience=timeout)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: agent.stop())
@@ -85,8 +88,11 @@ def add(
       dataflow keys add robot --authority authority
       dataflow keys add my_tools --authority authority --tools
     """
+    from dataflow.graph.keys import NAME_RULE, name_fault
     from dataflow.machines.keys import TOOLS, issue
 
+    if fault := name_fault(name):
+        raise fail(f"machine name {fault}: {NAME_RULE}")
     if tools and serves:
         raise fail("--tools and --serves exclude each other: tools only connect")
     folder = out or Path(name)
