@@ -176,8 +176,8 @@ def test_what_an_operator_found_wrong_is_among_the_notes() -> None:
     ("silences", "named"),
     [
         ({"camera": 0.1, "detector": 0.1}, []),
-        ({"camera": 0.1, "detector": 14.0}, ["detector: has not fired for 14.0 s; before, every 0.2 s"]),
-        ({"camera": 14.0, "detector": 14.0}, ["camera: has not fired for 14.0 s; before, every 0.1 s"]),
+        ({"camera": 0.1, "detector": 14.0}, ["detector: has not fired for 14.0 s; before, every 0.20 s"]),
+        ({"camera": 14.0, "detector": 14.0}, ["camera: has not fired for 14.0 s; before, every 0.10 s"]),
         ({"camera": 1.9, "detector": 0.9}, []),
     ],
 )
