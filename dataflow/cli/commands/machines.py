@@ -10,14 +10,15 @@ import typer
 from dataflow.cli.support.arguments import FLAG, ModuleFolders, find_modules_in
 from dataflow.cli.support.output import fail, friendly_errors, say
 
+Connect = Annotated[
+    str, typer.Option("--connect", metavar="ENDPOINT", help="Where the run listens (`dataflow run --listen`).")
+]
 Authority = Annotated[Path, typer.Option("--authority", metavar="FOLDER", help="The folder of `dataflow keys new`.")]
 
 
 def join(
     name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name in graphs (`machine:`).")],
-    connect: Annotated[
-        str, typer.Option("--connect", metavar="ENDPOINT", help="Where the run listens (`dataflow run --listen`).")
-    ],
+    connect: Connect,
     keys: Annotated[Path | None, typer.Option("--keys", metavar="FOLDER", help="This machine's keys.")] = None,
     folder: Annotated[
         Path, typer.Option("--folder", metavar="FOLDER", help="Where operators run, and files that are sent lie.")
