@@ -35,5 +35,7 @@ def test_a_type_that_becomes_another_message_is_refused(monkeypatch: pytest.Monk
     source: Any = topics.Imu(topic="/imu", type="sensor_msgs/msg/Image")
     monkeypatch.setattr(source, "join", lambda: SimpleNamespace())
 
-    with pytest.raises(SourceError, match=r"a sensor_msgs/msg/Image becomes .* Image, not Imu: use dataflow\.ros:Image"):
+    with pytest.raises(
+        SourceError, match=r"a sensor_msgs/msg/Image becomes .* Image, not Imu: use dataflow\.ros:Image"
+    ):
         source.setup()
