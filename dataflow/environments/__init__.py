@@ -6,7 +6,16 @@ from dataflow.environments.environment import (
     environment_of,
     imported_packages,
     installed,
+    is_environment,
     require_environment,
 )
 
-__all__ = ["EnvError", "Environment", "environment_of", "imported_packages", "installed", "require_environment"]
+__all__ = [
+    "EnvError",
+    "Environment",
+    "environment_of",
+    "imported_packages",
+    "installed",
+    "is_environment",
+    "require_environment",
+]
