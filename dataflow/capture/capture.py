@@ -192,6 +192,7 @@ def _setting(recording: Recording, debugger: Debugger) -> Setting:
         seeding_of(recording),
         debugger.graph.threads,
         dict(node.outputs),
+        node.env,
     )
 
 

@@ -5,6 +5,7 @@ The file is msgpack, compressed by zlib. It needs neither the recording nor its 
 
 from __future__ import annotations
 
+import subprocess
 import zlib
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -14,12 +15,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from dataflow.environments import environment_of, is_environment
 from dataflow.execution.calls import Calls, value_of
 from dataflow.execution.effects.journal import RecordedJournal
 from dataflow.execution.failure import RAISED, readable
 from dataflow.execution.restarts import close_quietly
 from dataflow.execution.snapshots import pack_state, unpack_state
-from dataflow.execution.threads import limited_threads
+from dataflow.execution.threads import environment, limited_threads
 from dataflow.graph.model import Live, Node
 from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import differences
@@ -28,6 +30,9 @@ from dataflow.sync import NEVER, Entry, Firing, InputValue
 from dataflow.sync.entries import entries_of
 
 FORMAT = 2
+_CHECK = "import pathlib, sys; from dataflow.capture.captured import check; check(pathlib.Path(sys.argv[1]))"
+LONGEST = 600.0
+"""Seconds that the calls may take in another process."""
 BEFORE = 2
 """Calls before the wrong one of which the outputs are compared, too."""
 
@@ -56,7 +61,7 @@ class Shot(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class Setting:
     """The operator: its name and class (`module:Class`), parameters, seed of the graph, version of the seeding,
-    threads of libraries, output ports."""
+    threads of libraries, output ports, environment (`env:`)."""
 
     name: str
     use: str
@@ -65,6 +70,7 @@ class Setting:
     seeding: int
     threads: int
     outputs: Mapping[str, str]
+    env: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +130,7 @@ class Captured:
             inputs={},
             outputs=dict(setting.outputs),
             live=Live("block", 64, {}),
+            env=setting.env,
         )
         journal = RecordedJournal()
         with limited_threads(setting.threads):
@@ -230,9 +237,22 @@ class Predicate:
 
 
 def check(path: Path) -> None:
-    """Makes a captured call again, from its file. Raises `AssertionError`, or what the operator raises, where it is
-    wrong still."""
-    Captured.from_bytes(path.read_bytes()).check()
+    """Makes a captured call again, from its file, in the environment of its operator. Where that is not this process,
+    what the operator raises there becomes the text of an `AssertionError`.
+
+    Raises `AssertionError`, or what the operator raises, where it is wrong still, and `EnvError`.
+    """
+    captured = Captured.from_bytes(path.read_bytes())
+    env, threads = captured.setting.env, captured.setting.threads
+    if env is None or is_environment(env):
+        captured.check()
+        return
+    there = environment_of(env)
+    command = [there.python, "-P", "-c", _CHECK, str(path.resolve())]
+    variables = there.variables(environment(threads))
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=LONGEST, check=False)
+    if done.returncode:
+        raise AssertionError(f"in the environment {env}: {done.stderr.strip() or f'exit code {done.returncode}'}")
 
 
 def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[Shot]) -> Outcome:

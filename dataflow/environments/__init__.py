@@ -6,6 +6,7 @@ from dataflow.environments.environment import (
     environment_of,
     imported_packages,
     installed,
+    is_environment,
     packages_in,
     require_environment,
 )
@@ -16,6 +17,7 @@ __all__ = [
     "environment_of",
     "imported_packages",
     "installed",
+    "is_environment",
     "packages_in",
     "require_environment",
 ]

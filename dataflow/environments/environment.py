@@ -113,11 +113,12 @@ def _state(folder: Path) -> tuple[tuple[int, int, int], ...]:
 
 def require_environment(operator: str, env: str | None) -> None:
     """Raises `EnvError` where this process is not in the environment that an operator needs."""
-    here = os.environ.get(_MARK, "").partition(os.pathsep)[0]
-    if env is not None and str(_folder(env)) != here:
+    if env is not None and not is_environment(env):
+        here = os.environ.get(_MARK, "").partition(os.pathsep)[0]
         raise EnvError(
             f"operator {operator!r} needs the environment {env!r}, and this process is in "
-            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay`, `verify` and `debug` start processes in it"
+            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay`, `verify`, `debug`, "
+            "`capture` and `blame` start processes in it"
         )
 
 
@@ -127,6 +128,11 @@ def packages_in(environment: Environment) -> dict[str, str]:
 
     found = [(each.metadata["Name"], each.version) for each in distributions(path=list(environment.path))]
     return dict(sorted(found, reverse=True))
+
+
+def is_environment(env: str) -> bool:
+    """Returns whether this process is in the environment that `env:` names."""
+    return str(_folder(env)) == os.environ.get(_MARK, "").partition(os.pathsep)[0]
 
 
 def imported_packages() -> dict[str, str]:

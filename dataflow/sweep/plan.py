@@ -181,6 +181,11 @@ def _remote(url: str) -> Iterator[Source]:
         yield Source(visible(name), store.unstrip_protocol(file), _digest((store.ukey(file), mark)))
 
 
+def command_of(what: What) -> str:
+    """Returns the command that does it."""
+    return "verify" if what == "verify" else "replay"
+
+
 def tasks_of(
     what: What,
     sources: Sequence[Source],
@@ -197,7 +202,7 @@ def tasks_of(
     - `words`: further words of the command. `folders`: those in which it finds modules.
     """
     code, made = Code(digests, folders), []
-    verb = "verify" if what == "verify" else "replay"
+    verb = command_of(what)
     given = () if graph is None else ("--graph", graph)
     for settings, loaded in graphs.items():
         chosen = tuple(word for name, value in settings for word in ("--set", f"{name}={value}"))

@@ -154,7 +154,7 @@ def capture(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        loaded = begin_again(recording, graph, settings, path)
+        loaded = begin_again(recording, graph, settings, path, operator)
         words = [] if graph is None else ["--graph", str(graph)]
         words += [word for setting in settings or () for word in ("--set", setting)]
         words += [word for folder in path or () for word in ("--path", str(folder))]
