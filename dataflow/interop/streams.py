@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.interop.account import Account, Unread
-from dataflow.interop.bag import Bag, BagError, Stored, shortfalls
+from dataflow.interop.bag import Bag, BagError, Lost, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
 from dataflow.interop.conversions import NARROWING, convert, in_units, offers
 from dataflow.interop.found import Found
@@ -65,7 +65,7 @@ class BagStreams:
         `accounting`: what messages do not carry over is counted there too."""
         self.path, self.played = Path(path), dict(sorted(played.items()))
         self._strict, self._accounting = strict, accounting
-        self._bag: Bag = open_bag(self.path)
+        self._bag: Bag = open_bag(self.path, strict=strict)
         self._closed = False
         try:
             self.account = Account(list(self._bag.notes), shortfalls(self._bag))
@@ -90,6 +90,7 @@ class BagStreams:
             self.static_notes: dict[str, str] = {}
             self._static = {stream: self._static_message(stream) for stream, p in self.played.items() if p.static}
             self.streams: Mapping[str, StreamInfo] = {stream: self._info(stream) for stream in self.played}
+            self.account.short = shortfalls(self._bag)
         except BaseException:
             self.close()
             raise
@@ -98,6 +99,11 @@ class BagStreams:
     def torn(self) -> bool:
         """Tells False: which of its files has no proper end stands in `notes`."""
         return False
+
+    @property
+    def lost(self) -> Lost:
+        """Messages that damage keeps from being read, as far as they have been read."""
+        return self._bag.lost
 
     @property
     def notes(self) -> tuple[str, ...]:
