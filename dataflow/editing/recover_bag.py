@@ -12,10 +12,13 @@ from dataflow.editing.report import Edited
 from dataflow.interop.salvage import salvage
 from dataflow.interop.typestores import RosType
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.streams.codecs import SchemaText
 
+_COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 
-def recover_bag(path: Path, out: Path) -> Recovered:
+
+def recover_bag(path: Path, out: Path, *, compression: Compression = "zstd") -> Recovered:
     """Saves a broken SQLite or ROS 1 bag. Raises `RecordingError` for what is neither, or holds no whole message."""
     found = salvage(path)
     topics = dict(found.topics())
@@ -24,7 +27,7 @@ def recover_bag(path: Path, out: Path) -> Recovered:
         raise RecordingError(f"{path}: no whole message is left in it")
     counts: Counter[int] = Counter()
     with out.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer = Writer(file, compression=_COMPRESSIONS[compression])
         writer.start(profile="ros1" if found.encoding == "ros1" else "ros2", library="dataflow recover")
         channels = {}
         for number, topic in topics.items():

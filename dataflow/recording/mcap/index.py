@@ -52,7 +52,8 @@ class McapFile:
     """Random access to the messages of an MCAP file.
 
     `torn`: the file has no proper end; it holds what was written up to its last whole chunk. `damage`: what is damaged
-    and was got round, or left out; `left_out`: chunks whose messages are not even counted. Raises `RecordingError` for a file that is no MCAP or is damaged otherwise.
+    and was got round, or left out; `left_out`: chunks whose messages are not even counted. Raises `RecordingError` for
+    a file that is no MCAP or is damaged otherwise.
     """
 
     def __init__(
