@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from made_bags import ROS1, ROS2, SECOND, header, made, ros, transform, xyz, xyzw
+from made_rvl import packed_rvl
 from rosbags.typesys import Stores, get_typestore
 
 from dataflow.interop.conversions import convert
@@ -88,8 +89,21 @@ def test_compressed_depth_of_both_kinds_decodes_to_metres() -> None:
 
     np.testing.assert_allclose(convert(converted(plain), DepthImage).data, [[0, 1.5, 40.0]])
     np.testing.assert_allclose(convert(converted(inverse), DepthImage).data, [[0, 2.0]])
-    with pytest.raises(RecordingError, match="RVL"):
+    with pytest.raises(RecordingError, match="RVL image of 0 pixels"):
         converted(ros("sensor_msgs/CompressedImage", format="16UC1; compressedDepth rvl", data=np.zeros(20, np.uint8)))
+
+
+def test_depth_in_rvl_is_read_as_its_encoder_has_it() -> None:
+    """`compressed_depth_image_transport`: int format, float A, B; columns, rows; RVL."""
+    units = np.array([[0, 1500, 1501], [0, 0, 65535]], np.uint16)
+    body = struct.pack("<iff", 0, 40.0, 1.5) + struct.pack("<II", 3, 2) + packed_rvl(units)
+
+    plain = ros("sensor_msgs/CompressedImage", format="16UC1; compressedDepth rvl", data=np.frombuffer(body, np.uint8))
+    inverse = ros("sensor_msgs/CompressedImage", format="32FC1; compressedDepth rvl", data=plain.data)
+
+    np.testing.assert_array_equal(converted(plain).data, units.astype(np.float32) / np.float32(1000))
+    expected = np.where(units > 0, 40.0 / np.maximum(units - 1.5, 1), 0)
+    np.testing.assert_allclose(converted(inverse).data, expected, rtol=1e-6)
 
 
 def info(store: Any = ROS2, **fields: Any) -> Any:
