@@ -70,6 +70,11 @@ class Clock:
             return logged
         return np.where(times.header > 0, times.header, logged)
 
+    def tells(self, times: Times) -> bool:
+        """Tells whether equal stamps of a topic, with equal content, are one message that was recorded twice: not where
+        most of its stamps are equal, as of a log that was kept in whole seconds, or without times."""
+        return len(times.log) <= 2 * len(np.unique(self.stamps(times)))
+
 
 def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     """Returns the one clock for all topics that are used together.

@@ -33,8 +33,18 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 def open_bag(path: Path, *, strict: bool = False) -> Bag:
     """Opens a bag, and announces what is unusual about it (`notices`). Raises as `bag_at`."""
     bag = bag_at(path, strict=strict)
+    bag.notes = (*bag.notes, *_timeless(bag))
     notice(path, [*bag.notes, *shortfalls(bag)])
     return bag
+
+
+def _timeless(bag: Bag) -> list[str]:
+    """A note where all messages have one log time, so that log times tell nothing."""
+    held = [topic for topic in bag.topics.values() if topic.count and topic.first is not None]
+    times = {time for topic in held for time in (topic.first, topic.last)}
+    if sum(topic.count for topic in held) < 2 or len(times) > 1:
+        return []
+    return [f"all messages have the log time {times.pop()}: those without a time in their header have none"]
 
 
 def bag_at(path: Path, *, strict: bool = False) -> Bag:

@@ -80,7 +80,7 @@ class BagStreams:
             self.repairs: Mapping[str, Repair] = {
                 t.topic: repair(
                     self.clock.stamps(t),
-                    np.frombuffer(self._found[t.topic].digests, np.uint64) if len(t.log) else np.empty(0, np.uint64),
+                    self._found[t.topic].digests_of(distinct=t.shares or self.clock.tells(t)),
                     merge=self._readings[t.topic].merges,
                 )
                 for t in times
@@ -90,7 +90,7 @@ class BagStreams:
             self.static_notes: dict[str, str] = {}
             self._static = {stream: self._static_message(stream) for stream, p in self.played.items() if p.static}
             self.streams: Mapping[str, StreamInfo] = {stream: self._info(stream) for stream in self.played}
-            self.account.short = shortfalls(self._bag)
+            self.recount()
         except BaseException:
             self.close()
             raise
@@ -109,6 +109,10 @@ class BagStreams:
     def notes(self) -> tuple[str, ...]:
         """Notes of what in the file is damaged or unusual, for people."""
         return (*self.account.notes, *self.account.short)
+
+    def recount(self) -> None:
+        """Takes into `account` what damage has kept from being read so far."""
+        self.account.short[:] = shortfalls(self._bag)
 
     def losses(self, topic: str) -> tuple[str, ...]:
         """Names the content of a topic's first message that has no place here."""

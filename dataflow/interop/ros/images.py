@@ -69,7 +69,9 @@ def image(message: Any, stamp: int) -> Raw:
     if rest > 0:
         lose(message, f"{rest:,} bytes behind the last of {message.height} rows (is step right?)")
     if is_depth(message.encoding):
-        if message.encoding == "64FC1" and (rows.astype(np.float32) != rows)[np.isfinite(rows)].any():
+        with np.errstate(over="ignore"):
+            narrowed = message.encoding == "64FC1" and (rows.astype(np.float32) != rows)[np.isfinite(rows)].any()
+        if narrowed:
             lose(message, "depth beyond 32 bits")
         return DepthImage(stamp=stamp, frame=frame, data=as_depth(message.encoding, rows))
     if message.encoding in _CONVERTED:

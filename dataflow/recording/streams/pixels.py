@@ -95,7 +95,8 @@ def as_depth(encoding: str, rows: Pixels) -> npt.NDArray[np.float32]:
         )
     if encoding == "16UC1":
         return rows.astype(np.float32) / MILLIMETRES
-    return np.ascontiguousarray(rows, np.float32)
+    with np.errstate(over="ignore"):  # of 64 bits, infinitely far
+        return np.ascontiguousarray(rows, np.float32)
 
 
 def as_millimetres(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16] | None:
