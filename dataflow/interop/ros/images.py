@@ -159,13 +159,24 @@ def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> Compre
     return CompressedDepth(stamp=stamp, frame=frame, scale=_DEPTH_UNIT, data=body)
 
 
+_MODELS = {
+    **dict.fromkeys(("fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye"), "equidistant"),
+    **dict.fromkeys(("radtan", "radial_tangential", "radial-tangential", "pinhole", "perspective"), "plumb_bob"),
+}
+"""Other names of the distortion models that CameraInfo has."""
+
+
 def camera_info(message: Any, stamp: int) -> CameraInfo:
     """sensor_msgs/CameraInfo, as it is for the image that comes: of the sensor's size where it is binned or a part is
     read out (REP 104), with K and P of those pixels. Raises `RecordingError` for a camera that is not calibrated (K
     of zeros), and for coefficients that its lens model does not have."""
     K, D = first(message, "k", "K"), first(message, "d", "D")
     R, P = first(message, "r", "R"), first(message, "p", "P")
-    model = str(message.distortion_model)
+    named = str(message.distortion_model)
+    model = _MODELS.get(named.lower(), named)
+    if model != named:
+        model = model if len(D) else "none"
+        lose(message, f"the name {named!r} of the distortion model (it is {model!r} here)")
     if model == "plumb_bob" and len(D) in COEFFICIENTS["rational_polynomial"]:
         lose(message, f"the model plumb_bob, which has no {len(D)} coefficients (rational_polynomial has)")
         model = "rational_polynomial"
