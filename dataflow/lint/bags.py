@@ -94,7 +94,10 @@ class BagMaterial:
         reader = self._readings[stream].reader
         found = []
         for stored in self._bag.messages([stream]):
-            carried = reader.stamps(stored.data) if reader is not None else ()
+            try:
+                carried = reader.stamps(stored.data) if reader is not None else ()
+            except (MessageError, RecordingError):
+                continue  # counted in `file_findings`
             found.append(max(carried, default=0) or stored.log_time)
         return np.array(found, np.int64)
 

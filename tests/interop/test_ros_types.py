@@ -16,8 +16,10 @@ from dataflow.interop.conversions import convert
 from dataflow.interop.ros import CONVERSIONS
 from dataflow.interop.ros.clouds import left_out
 from dataflow.interop.ros.outward import OUTWARD
+from dataflow.interop.typestores import RosType
 from dataflow.messages import Boxes3D, DepthImage, Image, Message, MessageError, Odometry, Path, Point, Pose
 from dataflow.recording import RecordingError
+from dataflow.recording.streams.codecs import SchemaText
 
 STAMP = 5 * SECOND
 
@@ -368,3 +370,38 @@ def test_every_mapped_type_converts_when_all_its_fields_are_empty_or_says_why() 
                 assert isinstance(CONVERSIONS[name][1](made(store, name, {}), STAMP), Message)
             except (RecordingError, MessageError):
                 assert name.rpartition("/")[2] in refused
+
+
+TEMPERATURE = """std_msgs/Header header
+float64 temperature
+float64 variance
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+IDL = """module builtin_interfaces { module msg { struct Time { int32 sec; uint32 nanosec; }; }; };
+module std_msgs { module msg { struct Header { builtin_interfaces::msg::Time stamp; string frame_id; }; }; };
+module sensor_msgs { module msg {
+  struct Temperature { std_msgs::msg::Header header; double temperature; double variance; };
+}; };
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "encoding", "text"),
+    [
+        ("sensor_msgs/msg/Temperature", "ros2msg", TEMPERATURE.replace("\n", "\r\n")),
+        ("sensor_msgs/msg/Temperature", "ros2msg", "\ufeff" + TEMPERATURE),
+        ("sensor_msgs/msg/Temperature", "ros2msg", TEMPERATURE.replace("=" * 80, "=" * 40)),
+        ("sensor_msgs::msg::Temperature", "omgidl", IDL),
+    ],
+    ids=["lines of Windows", "byte order mark", "short rule", "IDL of Foxglove"],
+)
+def test_definitions_are_read_as_other_systems_write_them(name: str, encoding: str, text: str) -> None:
+    sent = ros("sensor_msgs/Temperature", header=header(STAMP), temperature=21.5)
+
+    kind = RosType(name, "cdr", SchemaText(name, encoding, text.encode()))
+
+    assert kind.parse(ROS2.serialize_cdr(sent, sent.__msgtype__)).temperature == 21.5
+    assert kind.name == "sensor_msgs/msg/Temperature"
