@@ -57,9 +57,14 @@ class McapBag:
             + list(joined.notes)
         )
         self.lost.parts += [
-            f"{f.path.name}: chunks that cannot be read, with nobody knows how many messages: {f.left_out}"
+            f"{f.path.name}: chunks that cannot be read, and whose messages nothing counts: {f.left_out}"
             for f in self.files
             if f.left_out
+        ]
+        self.lost.parts += [
+            f"{f.path.name}: messages behind byte {f.unread_from:,} of {f.nbytes:,}, if there were any"
+            for f in self.files
+            if f.unread_from is not None
         ]
 
     def _topic(self, file: McapFile, channel: Channel, size: int) -> Topic:

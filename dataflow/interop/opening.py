@@ -26,6 +26,13 @@ HEAD_BYTES = 128
 _PART = re.compile(r"(.*?)_?(?:\d{4}(?:-\d\d){5})?_\d+\.bag")
 """The name that `rosbag record --split` gives to a part: prefix, date and number."""
 ARCHIVES = ((b"\x1f\x8b", "gzip"), (b"PK\3\4", "zip"), (b"BZh", "bzip2"), (b"\xfd7zXZ", "xz"))
+OTHERS = (
+    (b"\x89mcap", "it begins as an MCAP file does whose line ends a transfer as text has changed; fetch it as binary"),
+    (b"version https:/", "it is a pointer of Git LFS, which `git lfs pull` replaces by the file"),
+    (b"<!doctype html", "it is a page of the web, as servers send it in place of a file"),
+    (b"<html", "it is a page of the web, as servers send it in place of a file"),
+)
+"""Beginnings of what is found in place of a bag, in small letters, and what it is."""
 DATASETS = "folders of datasets (TUM, EuRoC, KITTI) are read by sources of a graph: `dataflow operators` lists them"
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
@@ -71,6 +78,7 @@ def bag_at(path: Path, *, strict: bool = False) -> Bag:
         return _of_files(path, Path(path.stem).suffix, [path], strict)
     begins = f"it begins with {head[:8].hex(' ')}" if head else "it is empty"
     begins = next((f"it is a {name} file, to be unpacked first" for m, name in ARCHIVES if head.startswith(m)), begins)
+    begins = next((what for start, what in OTHERS if head.lower().startswith(start)), begins)
     raise BagError(
         f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag), "
         "ROS 2 bags (a folder with metadata.yaml, .db3 or .mcap) and Rerun files (.rrd)"

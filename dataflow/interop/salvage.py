@@ -288,8 +288,10 @@ class Ros1Wreck(Wreck):
         """By the place of its content: compression and size."""
         self._kept: OrderedDict[int, bytes] = OrderedDict()
         lately_broken = False
-        for fields, begin, size, whole in _records(self._data, len(ROS1_START)):
+        behind, skipped = len(ROS1_START), 0
+        for at, fields, begin, size, whole in _records(self._data, len(ROS1_START)):
             op = fields["op"]
+            skipped, behind = skipped + at - behind, begin + size if whole else begin
             if op == _CHUNK:
                 self._chunks[begin] = fields.get("compression", b"none"), size
                 lately_broken = not self._take_chunk(begin)
@@ -297,6 +299,8 @@ class Ros1Wreck(Wreck):
                 self.lost += lately_broken * int.from_bytes(fields.get("count", b""), "little")
             else:
                 self._take(fields, self._data[begin : begin + size], whole, (_IN_FILE, begin, size))
+        if skipped := skipped + len(self._data) - behind:
+            self.notes.append(f"{skipped:,} of its {len(self._data):,} bytes are no whole records")
         self._settle()
 
     def _take_chunk(self, begin: int) -> bool:
@@ -307,7 +311,7 @@ class Ros1Wreck(Wreck):
             compression = self._chunks[begin][0].decode("latin-1")
             self.notes.append(f"the {compression} chunk at byte {begin} cannot be unpacked: {error}")
             return False
-        for fields, at, size, whole in _records(inner, 0):
+        for _, fields, at, size, whole in _records(inner, 0):
             self._take(fields, inner[at : at + size], whole, (begin, at, size))
         return True
 
@@ -350,8 +354,8 @@ class Ros1Wreck(Wreck):
         return content
 
 
-def _records(data: Any, at: int) -> Iterator[tuple[dict[str, bytes], int, int, bool]]:
-    """(header fields, where the content begins, its size, whether it is whole) of the records that follow each other.
+def _records(data: Any, at: int) -> Iterator[tuple[int, dict[str, bytes], int, int, bool]]:
+    """(place, header fields, where the content begins, its size, whether it is whole) of records one after the other.
 
     Behind one that is broken or reaches beyond the end, the search goes on within it.
     """
@@ -362,7 +366,7 @@ def _records(data: Any, at: int) -> Iterator[tuple[dict[str, bytes], int, int, b
         whole = bool(fields) and size <= MAX_PAYLOAD and begin + 4 + size <= end
         packed = fields.get("compression", b"none") != b"none"
         if whole or (fields and (fields["op"] == _MESSAGE or packed)):
-            yield fields, begin + 4, min(size, end - begin - 4), whole
+            yield at, fields, begin + 4, min(size, end - begin - 4), whole
         at = begin + 4 + size if whole else _next_record(data, (begin if fields else at) + 1)
 
 

@@ -251,3 +251,40 @@ def test_a_part_of_which_nothing_is_left_is_left_out(
     assert [f"all_1{suffix} is left out" in text for text in missing] == [True]
     with pytest.raises(RecordingError, match=rf"all_1\{suffix}"):
         held(folder, strict=True)
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
+def test_a_download_whose_second_half_is_zeros_is_read_and_fails_the_command(tmp_path: Path, suffix: str) -> None:
+    rows = imus([STAMPS[0] + i * SECOND // 100 for i in range(1500)])
+    if suffix == ".bag":
+        file = ros1_bag(tmp_path / "a.bag")
+    elif suffix == ".db3":
+        file = write_ros2(tmp_path / "bag", rows, "sqlite3") / "bag.db3"
+    else:
+        file = mcap_of(tmp_path / "a.mcap", CompressionType.NONE)
+    data = file.read_bytes()
+    whole, _ = held(file)
+    file.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+
+    bag = open_bag(file)
+    found = [bytes(stored.data) for stored in bag.messages(list(bag.topics))]
+    bag.close()
+
+    assert len(whole) // 4 < len(found) < len(whole)
+    assert sum(data not in whole for data in found) <= 1  # the one in which the zeros begin: it has no checksum
+    assert shortfalls(bag) or any("no proper end" in note for note in bag.notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"\x89MCAP0\r\r\n\x01" + bytes(60), "a transfer as text has changed"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n", "pointer of Git LFS"),
+        (b"<!DOCTYPE html><html><body>404", "page of the web"),
+    ],
+)
+def test_what_is_found_in_place_of_a_bag_is_named(tmp_path: Path, content: bytes, told: str) -> None:
+    (tmp_path / "a.mcap").write_bytes(content)
+
+    with pytest.raises(BagError, match=told):
+        open_bag(tmp_path / "a.mcap")

@@ -52,8 +52,8 @@ class McapFile:
     """Random access to the messages of an MCAP file.
 
     `torn`: the file has no proper end; it holds what was written up to its last whole chunk. `damage`: what is damaged
-    and was got round, or left out; `left_out`: chunks whose messages are not even counted. Raises `RecordingError` for
-    a file that is no MCAP or is damaged otherwise.
+    and was got round, or left out; `left_out`: chunks whose messages are not even counted; `unread_from`: the byte from
+    which on it cannot be read. Raises `RecordingError` for a file that is no MCAP or is damaged otherwise.
     """
 
     def __init__(
@@ -66,6 +66,7 @@ class McapFile:
         self.torn = False
         self.lost_bytes = 0
         self.damage: list[str] = []
+        self.unread_from: int | None = None
         self._sealed = False
         self.path = path
         self._file = RawFile(path, watch)
@@ -244,6 +245,7 @@ class McapFile:
         if self.torn:
             self.lost_bytes = self._file.size - found.end
         elif not found.whole:
+            self.unread_from = found.end
             self.damage.append(f"it cannot be read beyond byte {found.end} of {self._file.size}")
         return found.contents
 
