@@ -133,7 +133,11 @@ def decoded(data: Any, format_: str) -> Any:
 
     pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if pixels is None:
-        raise RecordingError(f"a {format_} image of {len(data)} bytes cannot be decoded")
+        begin = bytes(data[:4]).hex(" ")
+        raise RecordingError(
+            f"a {format_} image of {len(data)} bytes that begins with {begin} cannot be decoded; JPEG, PNG, WebP, TIFF "
+            "and BMP can, if they are whole"
+        )
     return pixels
 
 

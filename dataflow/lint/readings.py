@@ -7,12 +7,17 @@ from itertools import islice
 
 import numpy as np
 
+from dataflow.interop.conversions import decoded
 from dataflow.lint.finding import Finding
 from dataflow.lint.material import Material
-from dataflow.messages import MagneticField, Measurement, Message, Odometry, Pose
+from dataflow.messages import CompressedDepth, CompressedImage, MagneticField, Measurement, Message, Odometry, Pose
+from dataflow.recording.errors import RecordingError
 
 LOOKED_AT = 2000
 """Messages of a stream that are looked at, evenly spread where their number is known."""
+DECODED = 50
+"""Encoded images of a stream that are looked at."""
+JPEG_END = b"\xff\xd9"
 EARTH = (2.0e-5, 7.0e-5)
 """T, of the earth's magnetic field."""
 STRONGEST = 2.0e-3
@@ -28,15 +33,17 @@ _NUMBERS = {
     "MagneticField": ("field",),
 }
 """By message type, fields whose numbers are all wanted."""
+_ENCODED = ("CompressedImage", "CompressedDepth")
 
 
 def check_readings(material: Material) -> Iterator[Finding]:
     """Looks at some messages of every stream of these types."""
     for name, facts in material.streams.items():
-        if not (facts.readable and facts.count and facts.type in (*_NUMBERS, "Measurement")):
+        if not (facts.readable and facts.count and facts.type in (*_NUMBERS, *_ENCODED, "Measurement")):
             continue
-        step = max(1, facts.count // LOOKED_AT)
-        looked = list(islice(material.messages(name), 0, LOOKED_AT * step, step))
+        most = DECODED if facts.type in _ENCODED else LOOKED_AT
+        step = max(1, facts.count // most)
+        looked = list(islice(material.messages(name), 0, most * step, step))
         if looked:
             yield from (
                 Finding("quantity", name, "warning", text, None, values) for text, values in _doubts(facts.type, looked)
@@ -55,6 +62,8 @@ def _doubts(kind: str, looked: list[Message]) -> Iterator[Doubt]:
         yield from _speeds([m for m in looked if m not in odd])
     elif kind == "MagneticField":
         yield from _strength([m for m in looked if isinstance(m, MagneticField)])
+    elif kind in _ENCODED:
+        yield from _encoded([m for m in looked if isinstance(m, (CompressedImage, CompressedDepth))])
     elif kind == "Measurement":
         yield from _measured([m for m in looked if isinstance(m, Measurement)])
 
@@ -103,3 +112,24 @@ def _measured(looked: list[Measurement]) -> Iterator[Doubt]:
         yield f"a pressure of {value:.4g} Pa: it is in kPa, and Pa is wanted (times 1000)", {"value": value}
     elif unit == "°C" and 250 < value < 330:
         yield f"a temperature of {value:.4g} °C: is it in kelvin?", {"value": value}
+
+
+def _encoded(looked: list[CompressedImage | CompressedDepth]) -> Iterator[Doubt]:
+    """Files that cannot be decoded, and JPEG files without their end, of which the lower part is grey."""
+    broken, first = 0, ""
+    cut_off = 0
+    for message in looked:
+        named = message.format if isinstance(message, CompressedImage) else "png"
+        data = message.data.tobytes().rstrip(b"\0")
+        try:
+            decoded(message.data, named)
+        except RecordingError as error:
+            broken, first = broken + 1, first or f"at {message.stamp} {error}"
+            continue
+        except ModuleNotFoundError:  # OpenCV is of the perception extra
+            return
+        cut_off += named == "jpeg" and JPEG_END not in data[-64:]
+    if broken:
+        yield f"{broken:,} of {len(looked):,} images cannot be decoded, the first: {first}", {"images": broken}
+    if cut_off:
+        yield f"{cut_off:,} of {len(looked):,} JPEG images lack their end: they are cut off", {"images": cut_off}

@@ -132,6 +132,10 @@ ODD: dict[str, tuple[Any, Callable[[Any], bool], str]] = {
         lambda m: m.data.tobytes() == file(".png", GREY16) and m.scale == 0.001,
         "",
     ),
+    "depth_in_capitals": (
+        encoded("16UC1; CompressedDepth PNG", bytes(12) + file(".png", GREY16)),
+        lambda m: m.data.tobytes() == file(".png", GREY16), "",
+    ),
     "short_image": (raw("mono8", 6, 3, 8, 22), lambda m: m.data[2].tolist() == [16, 17, 18, 19, 20, 21], ""),
     "wrong_step": (
         raw("rgb8", 4, 3, 4, 36), lambda m: m.data[1, 0].tolist() == [12, 13, 14], "a step of 4, where rows have 12"

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
+import numpy as np
 import pytest
 from lint_material import MadeMaterial, every
 
 from dataflow.lint.readings import check_readings
-from dataflow.messages import MagneticField, Measurement, Message, Odometry, Pose
+from dataflow.messages import CompressedImage, MagneticField, Measurement, Message, Odometry, Pose
 
 STAMPS = every(0.1)
 
@@ -28,6 +30,13 @@ def measured(stamp: int, value: float, unit: str) -> Measurement:
 def odometry(stamp: int, speed: float) -> Odometry:
     place = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1], "linear": [speed, 0, 0], "angular": [0, 0, 0]}
     return Odometry(stamp=stamp, frame="odom", child_frame="base", **place)
+
+
+JPEG = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))[1]
+
+
+def encoded(stamp: int, length: int) -> CompressedImage:
+    return CompressedImage(stamp=stamp, frame="c", format="jpeg", data=JPEG[:length])
 
 
 Make = Callable[[int, int], Message]
@@ -51,6 +60,9 @@ Make = Callable[[int, int], Message]
         (lambda k, s: pose(s, float("nan") if k == 3 else 0.1 * k), "messages hold numbers that are not finite"),
         (lambda k, s: odometry(s, float("inf") if k % 2 else 1.0), "messages hold numbers that are not finite"),
         (lambda k, s: pose(s, 3.0 * k), ""),
+        (lambda k, s: encoded(s, 300 if k % 10 == 0 else len(JPEG)), "images cannot be decoded, the first: at"),
+        (lambda k, s: encoded(s, len(JPEG) - 2), "JPEG images lack their end: they are cut off"),
+        (lambda k, s: encoded(s, len(JPEG)), ""),
     ],
 )
 def test_readings_that_cannot_be_are_named(make: Make, told: str) -> None:

@@ -96,7 +96,7 @@ def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedIma
 
     A 16-bit grey PNG whose format does not name its pixels (`png`) is depth in millimetres, as devices send it.
     """
-    if "compressedDepth" in format_:
+    if "compresseddepth" in format_.lower():
         return _compressed_depth(format_, data, frame, stamp)
     if not len(data):
         raise RecordingError(f"an image of format {format_!r} without a byte")
