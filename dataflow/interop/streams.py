@@ -118,10 +118,10 @@ class BagStreams:
         """Names the content of a topic's first message that has no place here."""
         return self._readings[topic].losses
 
-    def look_for_unread(self, topics: Collection[str]) -> None:
-        """Reads all messages of topics, so that `account` counts those that cannot be read."""
+    def look_for_unread(self, topics: Collection[str], start: int | None = None, end: int | None = None) -> None:
+        """Reads the messages of topics with start ≤ stamp ≤ end, so that `account` counts those that cannot be read."""
         streams = [stream for stream, played in self.played.items() if played.topic in topics and not played.static]
-        for _ in self._merged(streams, None, None) if streams else ():
+        for _ in self._merged(streams, start, end) if streams else ():
             pass
 
     def opening(self) -> Mapping[str, Any] | None:

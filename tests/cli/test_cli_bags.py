@@ -199,3 +199,64 @@ def test_topics_of_bags_stay_absolute_behind_a_prefix(dataflow, bag: Path, tmp_p
     done = dataflow("merge", file, other, "-o", tmp_path / "both.mcap", "--prefix", f"{other}=rear/", "--json")
 
     assert set(json.loads(done.stdout)["streams"]) == {"/estimate", "/truth", "/rear/estimate", "/rear/truth"}
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images of two cameras at 10 Hz, recorded 2 ms late, the eleventh of the left one without pixels."""
+    rows: list[tuple[str, int, object]] = []
+    for k in range(20):
+        for topic, level in (("/left", 10), ("/right", 200)):
+            stamp = START + k * SECOND // 10
+            pixels = np.full(0 if topic == "/left" and k == 10 else 48, level, np.uint8)
+            about = {"width": 8, "height": 6, "step": 8, "encoding": "mono8"}
+            image = ros("sensor_msgs/Image", header=header(stamp, topic), data=pixels, **about)
+            rows.append((topic, stamp + SECOND // 500, image))
+    return write_ros2(tmp_path_factory.mktemp("film") / "film", rows)
+
+
+WATCH = """graph: watch
+operators:
+  camera: {use: "operators.sources:RecordedCamera"}
+  watch: {use: "operators.monitoring:ImageWatch", inputs: {image: camera/image}}
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("words", "stamps", "said"),
+    [
+        (("--map", "/left=camera/image"), [k / 10 for k in range(20) if k != 10], "1 message that cannot be read"),
+        (("--map", "/right=camera/image"), [k / 10 for k in range(20)], ""),
+        (("--map", "/left=camera/image", "--start", "0.95"), [1.1 + k / 10 for k in range(9)], "1 message that cannot"),
+        (("--map", "/left=camera/image", "--end", "0.95"), [k / 10 for k in range(10)], ""),
+        (("--map", "/right=camera/image", "--clock", "log"), [k / 10 + 0.002 for k in range(20)], "asked for"),
+    ],
+    ids=lambda words: " ".join(words) if isinstance(words, tuple) else "",
+)
+def test_options_of_a_replayed_bag_choose_what_is_played(
+    dataflow, film: Path, tmp_path: Path, words: tuple[str, ...], stamps: list[float], said: str
+) -> None:
+    from dataflow.recording import Recording
+
+    (tmp_path / "watch.yaml").write_text(WATCH)
+
+    told = dataflow("replay", film, "--graph", tmp_path / "watch.yaml", "--record", tmp_path / "o.mcap", *words).stderr
+
+    with Recording(tmp_path / "o.mcap") as recording:
+        played = [round((m.stamp - START) / SECOND, 3) for m in recording.messages(["watch/camera/image"])]
+    assert played == pytest.approx(stamps)
+    assert said in told if said else "cannot be read" not in told
+
+
+@pytest.mark.long
+def test_a_replay_that_is_strict_ends_at_a_message_that_cannot_be_read(dataflow, film: Path, tmp_path: Path) -> None:
+    (tmp_path / "watch.yaml").write_text(WATCH)
+    words = ("replay", film, "--graph", tmp_path / "watch.yaml", "--map", "/left=camera/image", "--one-process")
+
+    assert "topic '/left', message 10 at" in dataflow(*words, "--strict", code=1).stderr
+
+
+def test_options_of_bags_are_refused_when_a_recording_is_replayed(dataflow, recorded) -> None:
+    assert "--strict: " in dataflow("replay", recorded[0], "--strict", code=2).stderr
+    assert "--clock: " in dataflow("replay", recorded[0], "--clock", "log", code=2).stderr

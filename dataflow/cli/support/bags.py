@@ -72,20 +72,21 @@ def replay_bag(
             if kept and not quiet:
                 names = ", ".join(sorted(kept))
                 say(f"[dim]kept as they are: {plural(sum(kept.values()), 'message')} of {escape(names)}[/]")
-        if start is None and end is None:
-            _say_what_was_not_read(opened, {name: held for name, (held, _) in report.streams.items()})
+        _say_what_was_not_read(opened, {name: held for name, (held, _) in report.streams.items()}, begin, finish)
         if opened.account.short:
             raise typer.Exit(DIFFERENT)
 
 
-def _say_what_was_not_read(opened: BagStreams, delivered: Mapping[str, int]) -> None:
-    """Of topics that came with fewer messages than the bag holds of them: how many, and why."""
+def _say_what_was_not_read(
+    opened: BagStreams, delivered: Mapping[str, int], begin: int | None, end: int | None
+) -> None:
+    """Of topics that came with fewer messages than the bag holds of them in the span: how many, and why."""
     missing = {
         played.topic
         for stream, played in opened.played.items()
-        if not played.static and delivered.get(stream, 0) < opened.streams[stream].count
+        if not played.static and delivered.get(stream, 0) < sum(1 for _ in opened.stamps(stream, begin, end))
     }
-    opened.look_for_unread(missing)
+    opened.look_for_unread(missing, begin, end)
     for topic, unread in opened.account.unread.items():
         say(
             f"[yellow]{escape(topic)}: {plural(unread.count, 'message')} that cannot be read passed over, the first: "
