@@ -260,3 +260,34 @@ def test_a_replay_that_is_strict_ends_at_a_message_that_cannot_be_read(dataflow,
 def test_options_of_bags_are_refused_when_a_recording_is_replayed(dataflow, recorded) -> None:
     assert "--strict: " in dataflow("replay", recorded[0], "--strict", code=2).stderr
     assert "--clock: " in dataflow("replay", recorded[0], "--clock", "log", code=2).stderr
+
+
+def test_metadata_records_and_attachments_of_others_are_shown(dataflow, tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    file = tmp_path / "drive.mcap"
+    with file.open("wb") as opened:
+        writer = Writer(opened)
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.add_metadata("vehicle", {"name": "truck 7"})
+        writer.add_attachment(1, 1, "calib.txt", "text/plain", b"P0: 1")
+        writer.finish()
+
+    told = json.loads(dataflow("info", file, "--json").stdout)
+
+    assert told["metadata"] == [{"name": "vehicle", "values": {"name": "truck 7"}}]
+    assert told["attachments"] == 1
+    assert "truck 7" not in dataflow("info", file).stdout
+    assert "truck 7" in dataflow("info", file, "--metadata").stdout
+
+
+def test_a_bag_without_metadata_records_says_so(dataflow, tmp_path: Path) -> None:
+    from made_bags import ROS1
+
+    text = ros("std_msgs/String", ROS1, data="hello")
+    file = write_ros1(tmp_path / "old.bag", [("/said", START, text)])
+
+    assert "holds no metadata records" in dataflow("info", file, "--metadata", code=2).stderr
+    assert "messages of a bag have none" in dataflow("info", file, "--digests", code=2).stderr

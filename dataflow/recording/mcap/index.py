@@ -120,6 +120,11 @@ class McapFile:
             )
         return RawMessage(channel, sequence, log_time, data[start + _MESSAGE.size : end], published)
 
+    @property
+    def attached(self) -> int:
+        """Number of attachments that the file names."""
+        return len(self._attachments)
+
     @cached_property
     def attachments(self) -> Sequence[Place]:
         """The attachments that can be read, in file order; those that cannot are noted in `damage`. Reads all of
