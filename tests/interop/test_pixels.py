@@ -40,7 +40,30 @@ def test_greys_stay_greys_and_16_bits_stay_16_bits() -> None:
     np.testing.assert_array_equal(as_image16("bgr16", rows("bgr16", deep[..., ::-1])), deep)
 
 
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+RANDOM = np.random.default_rng(1)
+CODES = {
+    "rggb": cv2.COLOR_BayerBG2RGB,
+    "bggr": cv2.COLOR_BayerRG2RGB,
+    "gbrg": cv2.COLOR_BayerGR2RGB,
+    "grbg": cv2.COLOR_BayerGB2RGB,
+}
+"""OpenCV names a pattern by the second row's second and third pixel."""
+
+
+@pytest.mark.parametrize("pattern", CODES)
+@pytest.mark.parametrize("shape", [(6, 8), (7, 9), (3, 3)])
+def test_bayer_mosaics_are_what_opencv_makes_of_them(pattern: str, shape: tuple[int, int]) -> None:
+    mosaic = RANDOM.integers(0, 256, shape).astype(np.uint8)
+    deep = RANDOM.integers(0, 65536, shape).astype("<u2")
+
+    image = as_image(f"bayer_{pattern}8", rows(f"bayer_{pattern}8", mosaic))
+    image16 = as_image16(f"bayer_{pattern}16", rows(f"bayer_{pattern}16", deep))
+
+    np.testing.assert_array_equal(image, cv2.cvtColor(mosaic, CODES[pattern]))
+    np.testing.assert_array_equal(image16, cv2.cvtColor(deep, CODES[pattern]))
+
+
+@pytest.mark.parametrize("pattern", CODES)
 def test_bayer_mosaic_of_one_colour_gives_that_colour_back(pattern: str) -> None:
     colour = {"r": 200, "g": 90, "b": 30}
     mosaic = np.zeros((6, 8), np.uint8)
@@ -52,13 +75,55 @@ def test_bayer_mosaic_of_one_colour_gives_that_colour_back(pattern: str) -> None
     np.testing.assert_array_equal(image, np.full((6, 8, 3), [200, 90, 30]))
 
 
-@pytest.mark.parametrize(("encoding", "code"), [("yuv422", cv2.COLOR_YUV2RGB_UYVY), ("yuyv", cv2.COLOR_YUV2RGB_YUY2)])
-def test_packed_yuv_of_full_range_lies_close_to_its_grey(encoding: str, code: int) -> None:
-    grey = np.full((2, 4, 2), 128, np.uint8)
-    grey[..., 1 if encoding == "yuv422" else 0] = 150
+@pytest.mark.parametrize(
+    ("encoding", "code"),
+    [
+        ("yuv422", cv2.COLOR_YUV2RGB_UYVY),
+        ("uyvy", cv2.COLOR_YUV2RGB_UYVY),
+        ("yuyv", cv2.COLOR_YUV2RGB_YUY2),
+        ("yuv422_yuy2", cv2.COLOR_YUV2RGB_YUY2),
+    ],
+)
+def test_packed_yuv_is_what_opencv_makes_of_it(encoding: str, code: int) -> None:
+    stored = RANDOM.integers(0, 256, (64, 64, 2)).astype(np.uint8)
 
-    assert (as_image(encoding, rows(encoding, grey)) == 150).all()
-    assert cv2.cvtColor(grey, code).shape == (2, 4, 3)  # OpenCV takes the same layout
+    np.testing.assert_array_equal(as_image(encoding, rows(encoding, stored)), cv2.cvtColor(stored, code))
+
+
+@pytest.mark.parametrize(("encoding", "code"), [("nv12", cv2.COLOR_YUV2RGB_NV12), ("nv21", cv2.COLOR_YUV2RGB_NV21)])
+@pytest.mark.parametrize("padding", [0, 6])
+def test_planar_yuv_is_what_opencv_makes_of_it(encoding: str, code: int, padding: int) -> None:
+    stored = RANDOM.integers(0, 256, (48, 64 + padding)).astype(np.uint8)
+    width = 64
+
+    found = as_image(encoding, stored_rows(encoding, width, 32, width + padding, stored.reshape(-1)))
+
+    np.testing.assert_array_equal(found, cv2.cvtColor(np.ascontiguousarray(stored[:, :width]), code))
+
+
+def test_planar_yuv_of_every_pixel_has_a_pair_for_each() -> None:
+    grey, pairs = np.full((4, 6), 150, np.uint8), RANDOM.integers(0, 256, (4, 6, 2)).astype(np.uint8)
+    data = np.concatenate([grey.reshape(-1), pairs.reshape(-1)])
+
+    found = as_image("nv24", stored_rows("nv24", 6, 4, 0, data))
+
+    planes = [cv2.resize(plane, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST) for plane in (grey, pairs)]
+    expected = cv2.cvtColorTwoPlane(planes[0], pairs, cv2.COLOR_YUV2RGB_NV12)[::2, ::2]
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("encoding", ["rgba16", "bgra16", "16UC4"])
+def test_16_bit_colours_lose_their_alpha_channel_alone(encoding: str) -> None:
+    deep = RANDOM.integers(0, 65536, (4, 6, 4)).astype("<u2")
+    expected = deep[..., :3] if encoding == "rgba16" else cv2.cvtColor(deep, cv2.COLOR_BGRA2RGB)
+
+    np.testing.assert_array_equal(as_image16(encoding, rows(encoding, deep)), expected)
+
+
+@pytest.mark.parametrize(("encoding", "kind"), [("16SC1", "signed"), ("32FC3", "3 channels"), ("8UC2", "2 channels")])
+def test_arrays_of_opencv_that_are_no_picture_are_refused_with_what_would_be(encoding: str, kind: str) -> None:
+    with pytest.raises(RecordingError, match=f"{kind}.* is no image or depth here: 16UC1"):
+        stored_rows(encoding, 4, 2, 0, np.zeros(500, np.uint8))
 
 
 def test_depth_in_millimetres_becomes_metres() -> None:

@@ -51,10 +51,8 @@ def encode_image16(message: Image16) -> tuple[Parts, tuple[str, ...]]:
 
 
 def decode_image16(proto: RawImage) -> Fields:
-    channels = {"mono16": 1, "rgb16": 3, "bgr16": 3}.get(proto.encoding)
-    if channels is None:
-        raise RecordingError(f"RawImage encoding {proto.encoding!r} is no Image16; those known are rgb16 and mono16")
-    data = as_image16(proto.encoding, rows_of(proto, "<u2", channels))
+    flat = np.frombuffer(proto.data, np.uint8)
+    data = as_image16(proto.encoding, stored_rows(proto.encoding, proto.width, proto.height, proto.step, flat))
     data.flags.writeable = False
     return {"frame": proto.frame_id, "data": data}
 
