@@ -43,8 +43,8 @@ EXACT, JITTER = np.zeros(6), np.array([2e-3] * 3 + [2e-3] * 3)  # metres and rad
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What an odometry takes a frame, their stamps in nanoseconds, the true poses (None where unknown), and the class
-    of the odometry with what it is made of."""
+    """Holds the two images of each frame, stamps in nanoseconds, true poses (None where unknown), and the class of the
+    odometry with the camera it is made for."""
 
     seen: list[tuple[Any, Any]]
     stamps: list[int]
