@@ -35,6 +35,7 @@ from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.processes import Call
 from simulation import reloading
 from simulation.bindings import bound
+from simulation.blocks import by_blocks
 from simulation.flights import check_reasons, check_spans
 from simulation.keeping import check_losses_of_files, files_of, joined, kept_by_flight
 from simulation.run import Machine, Outcome, simulate
@@ -86,9 +87,10 @@ def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
         _verify_from_middle(path)
     drops = 0
     if report is not None and _holds_all(outcome):
-        drops = _check_losses(path, graph, report, live=scenario.live)
+        records = _records_of(path, graph)
+        drops = _check_losses(records, graph, report, live=scenario.live)
         if not scenario.live:
-            _check_window(path, graph, scenario, report)
+            _check_window(records, graph, scenario, report)
     if report is not None and verdict == "identical" and scenario.keeping.topics:
         _check_completion(path, folder / "complete.mcap", graph, report)
     replayed = replay and report is not None and verdict == "identical" and _may_replay(scenario, report)
@@ -293,8 +295,11 @@ def verified(path: Path, *, start: float | None = None, jobs: int = 1) -> Verify
         return verify(path, start=start, jobs=jobs, workers=_call_here)
 
 
-_load_bundle = functools.lru_cache(maxsize=1024)(load_bundle)
-"""The graph in a recording; the same ones come again and again."""
+@functools.lru_cache(maxsize=1024)
+def _load_bundle(bundle: str) -> Graph:
+    """The graph in a recording; the same ones come again and again."""
+    with by_blocks():
+        return load_bundle(bundle)
 
 
 def _call_here(calls: Sequence[Call], **options: Any) -> list[Any]:
@@ -325,17 +330,16 @@ Place = tuple[str, int, int]
 Records = Mapping[str, Sequence[FiringRecord]]
 
 
-def _records(path: Path, graph: Graph) -> Records:
+def _records_of(path: Path, graph: Graph) -> Records:
     """The firing records of a recording, by operator."""
     with Recording(path) as recording:
         log = FiringLog.read(recording)
         return {name: log.of(name) for name in graph.nodes}
 
 
-def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) -> int:
+def _check_losses(records: Records, graph: Graph, report: RunReport, *, live: bool) -> int:
     """Every message that was made is taken by each trigger it reaches, or dropped or missed and counted."""
     counted = 0
-    records = _records(path, graph)
     _check_stale(graph, records)
     for name, node in graph.nodes.items():
         if node.source or report.restarts.get(name):
@@ -397,14 +401,13 @@ def _made(graph: Graph, records: Records, stream: str, report: RunReport) -> dic
 # Flow control
 
 
-def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunReport) -> None:
+def _check_window(records: Records, graph: Graph, scenario: Scenario, report: RunReport) -> None:
     """Sources were never further ahead of the operators than their window; it grew only where the graph needs it."""
     grown = any("further ahead than the window" in note for note in report.notes)
     if grown:
         if graph.name in NO_LOOK_AHEAD:
             raise Violation(f"the window of graph {graph.name!r} had to grow, which looks no stamp ahead")
         return
-    records = _records(path, graph)
     worked = [
         (record.stamp, record.wall_start + record.duration)
         for name, node in graph.nodes.items()

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from dataflow.chaos.plan import Fault
 from dataflow.graph import Graph, GraphError, load_text
 from dataflow.graph.model import Placement
+from simulation.blocks import by_blocks
 from simulation.drawn import NESTED, drawn, nested, repeats
 from simulation.keeping import PLAIN, Keeping, keeping_of
 from simulation.operators import Revised
@@ -190,7 +191,7 @@ def load(
     """Loads one of the graphs; loading takes longer than some runs, so each is loaded once."""
     drawn_here = "".join(f"\n  {part}" for part in parts) + "\n"
     operators = {TICKING: TICKS, DRAWN: drawn_here}.get(graph) or GRAPHS[graph]
-    text = f"graph: {graph}\nnamespace: sim\n{record}operators:{operators}"
+    text = f"graph: {graph}\nnamespace: sim\noperators:{operators}{record}"
     words = {
         "SOURCE": _DEVICE if live else _SOURCE,
         "PAIR": _JUMPS if live else _PAIR,
@@ -207,7 +208,8 @@ def load(
     part = "\n".join(inner)
     for word, meaning in words.items():
         text, part = text.replace(word, meaning), part.replace(word, meaning)
-    return load_text(text, files={NESTED: part} if inner else None)
+    with by_blocks():
+        return load_text(text, files={NESTED: part} if inner else None)
 
 
 def scenario_of(seed: int) -> Scenario:
