@@ -215,7 +215,7 @@ def _find(task: tuple[str, int, int]) -> dict[str, Any]:
         for seed in range(first, first + most):
             scenario = scenario_of(seed)
             try:
-                check(scenario, Path(folder), replay=False)
+                check(scenario, Path(folder), replay=MUTANTS[name].replays)
             except Violation as violation:
                 wall = round(time.monotonic() - begun, 1)
                 small, said = shrink(scenario, Path(folder), violation)
