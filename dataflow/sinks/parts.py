@@ -88,6 +88,8 @@ class PartsSink:
         self._full: Part | None = None
         """The part before the current one, until what belongs into it has come."""
         self._after_gap = False
+        self._lives: dict[str, int] = {}
+        """The newest incarnation of each stream and operator."""
         self._outage = Outage(path.parent)
         self.lost = Lost()
         if options["overwrite"] and self._splits and life == 1:
@@ -102,6 +104,7 @@ class PartsSink:
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
         """Stores a message; begins the next part when it is time to."""
         self._given[stream] += 1
+        self._live(stream, incarnation)
         self._groups.begin(stream, message, incarnation)
         if stream in self._static:
             self._statics[stream] = message, seq, incarnation
@@ -120,6 +123,7 @@ class PartsSink:
 
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Stores firing records; those of calls before the current part in the one before, while it is open."""
+        self._live(operator, records[0].incarnation)
         start = None if self._current is None else self._current.start
         k = 0 if start is None else next((k for k, r in enumerate(records) if r.stamp >= start), len(records))
         if self._full is None and not self._after_gap:
@@ -191,6 +195,14 @@ class PartsSink:
         """Bytes of all parts that there are."""
         closed = sum(part.bytes for part in self._closed) + sum(self._earlier.values())
         return closed + sum(part.sink.writer.saved_bytes for part in self._open_parts())
+
+    def _live(self, name: str, incarnation: int) -> None:
+        """Notes the incarnation of a stream or an operator. What follows a jump of the clock has stamps that were there
+        before, and belongs behind what was given: into the current part."""
+        if incarnation > self._lives.setdefault(name, incarnation):
+            self._lives[name] = incarnation
+            self._after_gap = False
+            self._close_full()
 
     # Parts
 

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,39 @@ def test_a_part_without_calls_of_an_operator_is_verified(
     parts = parts_of(tmp_path / "run.mcap")
     assert len(parts) == 5
     assert [sorted(verdicts(part)) for part in parts] == [["first", "second"]] * 5
+
+
+@pytest.mark.parametrize("first", ["message", "record"])
+def test_nothing_that_follows_a_jump_of_the_clock_is_in_the_part_before(
+    first: str, recorded: Path, graph: Graph, tmp_path: Path
+) -> None:
+    """Stamps that come again belong behind what was given before them, also while the part before is still open."""
+    given = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(every=5 * SECOND)))
+    with Recording(recorded) as recording:
+        messages = [m for m in recording.messages() if m.message.stamp]
+        records = list(_records(recording))
+    begin = messages[0].stamp
+
+    def give(start: float, end: float, life: int) -> None:
+        for found in messages:
+            if start <= (found.stamp - begin) / SECOND < end:
+                calls = [replace(r, incarnation=life) for r in records if r.stamp == found.stamp and r.kind in CALLS]
+                acts = [lambda m=found: given.sink.message(m.stream, m.message, m.seq, life)]
+                acts += [lambda r=r: given.sink.firings(r.operator, [r], encode_batch([r])) for r in calls]
+                for act in acts if first == "message" else reversed(acts):
+                    act()
+
+    give(0, 5.3, 0)
+    give(4.8, 5.3, 1)
+    given.sink.close("complete")
+
+    lives = []
+    for part in parts_of(tmp_path / "run.mcap"):
+        with Recording(part) as recording:
+            log = FiringLog.read(recording)
+            found = {record.incarnation for name in log.operators for record in log.of(name)}
+            lives.append((found, {message.incarnation for message in recording.messages() if message.stamp}))
+    assert lives == [({0}, {0}), ({0, 1}, {0, 1})]
 
 
 def test_the_oldest_parts_are_deleted_and_the_rest_verifies(recorded: Path, graph: Graph, tmp_path: Path) -> None:
