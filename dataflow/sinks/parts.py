@@ -108,11 +108,8 @@ class PartsSink:
         self._groups.begin(stream, message, incarnation)
         if stream in self._static:
             self._statics[stream] = message, seq, incarnation
-        elif message.stamp > self._clock:
-            self._clock = message.stamp
-            self._begun = self._begun or self._clock
-            if self._current is not None and self._splits and self._is_full(self._current):
-                self._split(self._clock)
+        else:
+            self._advance(message.stamp)
         part = self._current if self._full is None else self._part_at(message.stamp)
         if part is not None:
             try:
@@ -124,6 +121,8 @@ class PartsSink:
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Stores firing records; those of calls before the current part in the one before, while it is open."""
         self._live(operator, records[0].incarnation)
+        if self._static.issuperset(self._streams):  # no message tells how far the run is
+            self._advance(records[-1].stamp)
         start = None if self._current is None else self._current.start
         k = 0 if start is None else next((k for k, r in enumerate(records) if r.stamp >= start), len(records))
         if self._full is None and not self._after_gap:
@@ -195,6 +194,14 @@ class PartsSink:
         """Bytes of all parts that there are."""
         closed = sum(part.bytes for part in self._closed) + sum(self._earlier.values())
         return closed + sum(part.sink.writer.saved_bytes for part in self._open_parts())
+
+    def _advance(self, stamp: int) -> None:
+        """Takes note of how far event time is; begins the next part when it is time to."""
+        if stamp > self._clock:
+            self._clock = stamp
+            self._begun = self._begun or self._clock
+            if self._current is not None and self._splits and self._is_full(self._current):
+                self._split(self._clock)
 
     def _live(self, name: str, incarnation: int) -> None:
         """Notes the incarnation of a stream or an operator. What follows a jump of the clock has stamps that were there
@@ -326,13 +333,14 @@ class PartsSink:
         held = self._statics.items()
         self._copied |= {(name, i, k) for name, (_, i, k) in held if part.repeated[name] and saved[name]}
         part.messages, part.bytes = (saved - part.repeated).total(), part.sink.writer.saved_bytes
-        if part.messages or part.start is None:
+        if part.start is None or self._holds_any(part):
             self._closed.append(part)
         else:  # the disk refused before it held anything
             part.path.unlink(missing_ok=True)
 
     def _keep_to_limit(self) -> None:
-        """Deletes the oldest parts while all together take more of the disk than they may; the newest one stays."""
+        """Deletes the oldest parts while all together take more of the disk than they may; the newest one that holds
+        anything stays."""
         most = self._storage.keep
         while most is not None and self._has_older() and self.size > most:
             oldest = next(iter(self._earlier)) if self._earlier else self._closed.pop(0).path
@@ -342,7 +350,12 @@ class PartsSink:
 
     def _has_older(self) -> bool:
         older = len(self._earlier) + len(self._closed)
-        return older > (0 if any(self._open_parts()) else 1)
+        return older > (0 if any(map(self._holds_any, self._open_parts())) else 1)
+
+    def _holds_any(self, part: Part) -> bool:
+        """Tells whether anything is in a part but what is in front of each."""
+        saved = part.sink.writer.saved
+        return part.sink.saved_calls > 0 or any(saved(stream) > part.repeated[stream] for stream in self._streams)
 
     # Firing records
 
