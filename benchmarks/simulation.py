@@ -24,6 +24,7 @@ import gc
 import json
 import multiprocessing
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -130,13 +131,17 @@ def _one(seed: int) -> dict[str, Any]:
     from simulation.world import Violation
 
     scenario = scenario_of(seed)
-    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
-        try:
-            result = check(scenario, Path(folder))
-        except Violation as violation:
-            small, said = shrink(scenario, Path(folder), violation)
-            plan = small.describe()
-            return {"seed": seed, "verdict": "broken", "violation": said, "plan": plan, "counts": {}}
+    memory = MEMORY if MEMORY.is_dir() else Path(tempfile.gettempdir())
+    folder = memory / f"simulated-{seed}"  # it is told in recordings: a seed gives the same bytes each time
+    folder.mkdir(exist_ok=True)
+    try:
+        result = check(scenario, folder)
+    except Violation as violation:
+        small, said = shrink(scenario, folder, violation)
+        plan = small.describe()
+        return {"seed": seed, "verdict": "broken", "violation": said, "plan": plan, "counts": {}}
+    finally:
+        shutil.rmtree(folder)
     outcome = result.outcome
     verdict = result.verdict + (", the run failed" if outcome.failure is not None else "")
     counts: dict[str, Any] = {

@@ -121,7 +121,7 @@ class PartsSink:
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Stores firing records; those of calls before the current part in the one before, while it is open."""
         self._live(operator, records[0].incarnation)
-        if self._static.issuperset(self._streams):  # no message tells how far the run is
+        if self._static.issuperset(self._streams):  # no message shows how far the run is
             self._advance(records[-1].stamp)
         start = None if self._current is None else self._current.start
         k = 0 if start is None else next((k for k, r in enumerate(records) if r.stamp >= start), len(records))
@@ -204,8 +204,8 @@ class PartsSink:
                 self._split(self._clock)
 
     def _live(self, name: str, incarnation: int) -> None:
-        """Notes the incarnation of a stream or an operator. What follows a jump of the clock has stamps that were there
-        before, and belongs behind what was given: into the current part."""
+        """Notes the incarnation of a stream or an operator. Behind a jump of the clock, stamps are new again that lie
+        in the part before: everything goes into the current one from there on."""
         if incarnation > self._lives.setdefault(name, incarnation):
             self._lives[name] = incarnation
             self._after_gap = False

@@ -419,7 +419,7 @@ def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     streams, files = {"robot/nothing/out": (5, "")}, {"@recorder": {"kept": [], "not_kept": 0}}
     report = RunReport("robot", streams, {}, {}, {}, {}, files, 0, 1, 0.0, interrupted=False, notes=())
     with pytest.raises(Violation, match="of 5 messages of robot/nothing/out 0 are stored"):
-        check_losses_of_files(report, RUN)
+        check_losses_of_files(report, RUN, streams)
     monkeypatch.setattr("simulation.check.complete", lambda *_, **__: SimpleNamespace(whole=True))
     with pytest.raises(Violation, match="lacks messages of robot/nothing/out"):
         checks._check_completion(RUN, RUN, PLAIN.load(), report)

@@ -148,8 +148,9 @@ def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
     files = files_of(folder / "run.mcap")
     if len(files) < 2:
         return files[0] if files else folder / "run.mcap"
+    lacks = not (_holds_all(outcome) and _has_sources(scenario.load()))
     for file in _some(files, scenario.seed):
-        _unchanged(file, lacks=not _holds_all(outcome))
+        _unchanged(file, lacks=lacks)
     try:
         path = joined(files, folder / "joined.mcap")
     except RecordingError as error:
@@ -159,7 +160,7 @@ def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
     if outcome.report is not None and "@recorder" not in outcome.killed:
         deleted = outcome.report.files["@recorder"]["deleted"]
         if not deleted:
-            check_losses_of_files(outcome.report, path)
+            check_losses_of_files(outcome.report, path, scenario.load().record.streams)
     return path
 
 

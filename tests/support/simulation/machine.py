@@ -514,6 +514,8 @@ class System:
 class Selector(selectors._BaseSelectorImpl):
     """`selectors.DefaultSelector`: finds what is ready, in any order."""
 
+    _fd_to_key: dict[int, selectors.SelectorKey]
+
     def __init__(self, system: System) -> None:
         super().__init__()
         self._system, self._world = system, system.world
