@@ -9,6 +9,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from mcap.data_stream import ReadDataStream
+from mcap.records import Channel
 from mcap.writer import Writer
 
 from dataflow.editing.merge import merge
@@ -150,6 +152,18 @@ def test_a_part_that_its_writer_died_as_it_began_is_passed_over(folder: Path, tm
         assert any(begun.name in note and "holds nothing" in note for note in done.notes)
         with Recording(KEPT) as expected, Recording(tmp_path / "whole.mcap") as recording:
             assert recording.digests() == expected.digests()
+
+
+def test_what_a_file_declares_is_parsed_once_however_often_it_is_opened(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(stream: ReadDataStream) -> Channel:
+        raise AssertionError("a channel is parsed again")
+
+    with Recording(folder) as expected:
+        monkeypatch.setattr(Channel, "read", staticmethod(refused))
+        with Recording(folder) as recording:
+            assert recording.streams == expected.streams
 
 
 def test_parts_without_what_they_share_follow_each_other(tmp_path: Path, pose: Callable[..., Pose]) -> None:
