@@ -141,9 +141,11 @@ def imported_packages() -> dict[str, str]:
     from importlib.metadata import distributions
 
     _, *path = os.environ.get(_MARK, "").split(os.pathsep)
+    if not path:
+        return {}
     loaded = {name.partition(".")[0] for name in sys.modules}
     found: dict[str, str] = {}
-    for each in distributions(path=path) if path else ():
+    for each in distributions(path=path):
         if each.metadata["Name"] not in found and loaded & _modules(each):
             found[each.metadata["Name"]] = each.version
     return dict(sorted(found.items()))

@@ -62,7 +62,7 @@ class LiveRunner(OperatorRunner):
         operator: Operator | None = None,
         snapshots: StateSpacing | None = None,
         clock: Clock | None = None,
-        event_clock: EventClock = time.time_ns,
+        event_clock: EventClock | None = None,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
         faults: Faults | None = None,
     ) -> None:
@@ -77,7 +77,7 @@ class LiveRunner(OperatorRunner):
         self._log = DropLog()  # of what did not reach an aligner
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
         clock = clock or time.monotonic
-        self._time = EventTime(event_clock)
+        self._time = EventTime(event_clock or time.time_ns)
         self.patience = Patience(node.live.wait, clock, self._time.until)
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
