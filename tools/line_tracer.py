@@ -15,6 +15,8 @@ WHERE = "LINE_TRACER_FILE"
 """Environment: the file to which lines are appended as `test<TAB>file<TAB>line`."""
 WHOSE = "LINE_TRACER_PACKAGE"
 """Environment: the folder or file whose lines are written."""
+WHICH = "LINE_TRACER_TEST"
+"""Environment: the test under way, for the processes that it starts."""
 _open, _write, _close, _flags = os.open, os.write, os.close, os.O_WRONLY | os.O_APPEND | os.O_CREAT
 # kept: a test may replace those of the module
 
@@ -22,16 +24,16 @@ _open, _write, _close, _flags = os.open, os.write, os.close, os.O_WRONLY | os.O_
 class LineTracer:
     """A trace function that writes each line once per test; `None` for frames of other files keeps them fast."""
 
-    def __init__(self, file: str, package: str, test: str = "") -> None:
+    def __init__(self, file: str, package: str) -> None:
         self._file = file
         self._package = package
-        self._test = test
+        self._test = ""
         self._seen: set[tuple[str, int]] = set()
         self._traced: dict[str, bool] = {}
 
     def start(self, test: str) -> None:
-        """Traces the threads of this process from now on under the name of a test, empty while tests are collected."""
-        self._test = test
+        """Traces this process and its threads from now on, under the name of a test, or "" for what several share."""
+        self._test = os.environ[WHICH] = test
         self._seen = set()
         threading.settrace(self.call)
         sys.settrace(self.call)
@@ -59,4 +61,4 @@ def from_environment() -> LineTracer:
 
 
 if __name__ == "sitecustomize" and WHERE in os.environ:
-    from_environment().start(os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0])
+    from_environment().start(os.environ.get(WHICH, ""))

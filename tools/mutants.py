@@ -4,8 +4,8 @@ usage: python tools/mutants.py PACKAGE [--tests FOLDER] [--count N] [--seed N] [
 
 A mutant differs from the package in one place: a comparison, an operator of arithmetic or logic, a number, a returned
 value or a dropped statement. Equal seeds draw equal mutants of equal sources, so that the tests of two commits can be
-compared. The tests run in a copy of the checkout: those that run the mutant's lines first, then the others of their
-modules, up to the first that fails. A mutant in lines that no test runs is one that they do not find.
+compared. In a copy of the checkout, those tests are run that run the mutant's lines, file by file, up to the first that
+fails. A mutant in lines that no test runs is one that they do not find.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import shutil
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,23 +138,20 @@ def lines_of(mutant: Mutant, source: bytes) -> set[int]:
 
 
 class Room:
-    """The tests of a package in a copy of the checkout, which lines each of them runs, and how long it takes."""
+    """The tests of a package in a copy of the checkout: which lines each of them runs, and how long it takes."""
 
     def __init__(self, tests: WarmTests, checkout: Path, package: Path, files: list[str]) -> None:
         self._tests = tests
         self._checkout = checkout
-        self._lines: defaultdict[tuple[str, int], set[str]] = defaultdict(set)
-        self._everywhere: list[str] = []
-        self._files: defaultdict[tuple[str, int], set[str]] = defaultdict(set)
+        self._reaching: dict[str, dict[tuple[str, int], set[str]]] = {}
+        """By file of tests: the tests that run each (file, line); "" stands for all of them."""
+        self._everywhere: set[str] = set()
         for file in files:
-            outcome, lines = tests.traced([file], package)
+            outcome, self._reaching[file] = tests.traced(file, package)
             tests.warm(outcome.modules)
             if not outcome.passed:
                 print(f"{file} is run for every mutant: {outcome.failed} fails while lines are traced", flush=True)
-                self._everywhere.append(file)
-            for place, reaching in lines.items():
-                self._lines[place] |= reaching
-                self._files[place].add(file)
+                self._everywhere.add(file)
         self.whole = tests.run(files, limit=3600)
         os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # a mutant's would pass for that of a file of equal size and second
         sys.dont_write_bytecode = True
@@ -165,26 +161,30 @@ class Room:
         path = self._checkout / mutant.file
         source, status = path.read_bytes(), path.stat()
         places = [(str(mutant.file), line) for line in lines_of(mutant, source)]
-        files = sorted(set(self._everywhere).union(*(self._files[place] for place in places)))
-        if not files:
-            return None
-        tests = self._ordered(mutant, set().union(*(self._lines[place] for place in places)), files)
-        seconds = [self.whole.seconds[test] for test in tests]
+        chosen = {file: tests for file in self._reaching if (tests := self._chosen(file, places))}
         path.write_bytes(mutant.written(source))
         try:
-            outcome = self._tests.run(
-                files, tests, limit=120 + 5 * sum(seconds), timeout=20 + 10 * max(seconds, default=0)
-            )
+            for file, tests in sorted(chosen.items(), key=lambda each: self._duration(each[1])):
+                longest = max(self.whole.seconds[test] for test in tests)
+                limit = 120 + 5 * self._duration(tests)
+                outcome = self._tests.run([file], tests, limit=limit, timeout=20 + 10 * longest)
+                if not outcome.passed:
+                    return str(outcome.failed)
         finally:
             path.write_bytes(source)
             os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
-        return "" if outcome.passed else outcome.failed
+        return "" if chosen else None
 
-    def _ordered(self, mutant: Mutant, reaching: set[str], files: list[str]) -> list[str]:
-        """Returns the tests of files: those that run the mutant, then those that run its file, then the others."""
-        beside = {test for (file, _), tests in self._lines.items() if file == str(mutant.file) for test in tests}
-        chosen = [test for test in self.whole.seconds if test.partition("::")[0] in files]
-        return sorted(chosen, key=lambda test: (test not in reaching, test not in beside, self.whole.seconds[test]))
+    def _chosen(self, file: str, places: list[tuple[str, int]]) -> list[str]:
+        """Returns the tests of a file that run one of some lines, quick ones first; all where they share what does."""
+        reaching = set().union(*(self._reaching[file].get(place, ()) for place in places))
+        every = [test for test in self.whole.seconds if test.partition("::")[0] == file]
+        if file not in self._everywhere and "" not in reaching:
+            every = [test for test in every if test in reaching]
+        return sorted(every, key=self.whole.seconds.__getitem__)
+
+    def _duration(self, tests: list[str]) -> float:
+        return float(sum(self.whole.seconds[test] for test in tests))
 
 
 def main(arguments: list[str] | None = None) -> int:

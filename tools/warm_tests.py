@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,22 +40,37 @@ class Outcome:
 
 
 class _Plugin:
-    """Puts tests in an order, names them to the tracer, and notes the outcome."""
+    """Chooses tests, names them to the tracer, and notes the outcome."""
 
-    def __init__(self, order: Sequence[str], tracer: line_tracer.LineTracer | None) -> None:
-        self._rank = {test: index for index, test in enumerate(order)}
+    def __init__(self, chosen: Sequence[str] | None, tracer: line_tracer.LineTracer | None) -> None:
+        self._rank = None if chosen is None else {test: index for index, test in enumerate(chosen)}
         self._tracer = tracer
+        self._test = ""
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._failed = ""
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        items.sort(key=lambda item: self._rank.get(item.nodeid, len(self._rank)))
+        if (rank := self._rank) is not None:
+            items[:] = sorted((item for item in items if item.nodeid in rank), key=lambda item: rank[item.nodeid])
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> None:
+        self._test = item.nodeid
+        self._trace(item.nodeid)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: pytest.FixtureDef[object]) -> Generator[None, object, object]:
+        """Names what several tests share by none of them."""
+        self._trace(self._test if fixturedef.scope == "function" else "")
+        try:
+            return (yield)
+        finally:
+            self._trace(self._test)
+
+    def _trace(self, test: str) -> None:
         if self._tracer is not None:
-            self._tracer.start(item.nodeid)
+            self._tracer.start(test)
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         self._note(report)
@@ -87,26 +102,29 @@ class WarmTests:
         self._options += ["-m", "not long"] if quick else []
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)  # orphans become children of this process, which ends them
 
-    def run(self, tests: Sequence[str], order: Sequence[str] = (), limit: float = 600, timeout: float = 120) -> Outcome:
-        """Runs tests up to the first that fails, for at most `limit` s, each for at most `timeout` s."""
-        return self._forked(tests, order, limit, timeout, None)
+    def run(
+        self, files: Sequence[str], chosen: Sequence[str] | None = None, limit: float = 600, timeout: float = 120
+    ) -> Outcome:
+        """Runs the tests of files, or those `chosen` of them in that order, up to the first that fails, for at most
+        `limit` s and each for at most `timeout` s."""
+        return self._forked(files, chosen, limit, timeout, None)
 
-    def traced(
-        self, tests: Sequence[str], package: Path, limit: float = 600
-    ) -> tuple[Outcome, dict[tuple[str, int], set[str]]]:
-        """Runs tests and returns which of them ran each (file, line) of a package of the checkout; "" is collection."""
-        file = self._folder / "lines"
-        file.unlink(missing_ok=True)
+    def traced(self, file: str, package: Path, limit: float = 600) -> tuple[Outcome, dict[tuple[str, int], set[str]]]:
+        """Runs the tests of a file; returns also which of them ran each (file, line) of a package of the checkout.
+
+        "" among them is what they share: collection, and fixtures of a module or more.
+        """
+        lines = self._folder / "lines"
+        lines.unlink(missing_ok=True)
         customize = self._checkout / "sitecustomize.py"
         customize.write_bytes(Path(line_tracer.__file__).read_bytes())
+        traced = {line_tracer.WHERE: str(lines), line_tracer.WHOSE: str(self._checkout / package)}
         try:
-            outcome = self._forked(
-                tests, (), limit, 300, {line_tracer.WHERE: str(file), line_tracer.WHOSE: str(self._checkout / package)}
-            )
+            outcome = self._forked([file], None, limit, 300, traced)
         finally:
             customize.unlink()
         reached: defaultdict[tuple[str, int], set[str]] = defaultdict(set)
-        for text in file.read_text().splitlines() if file.exists() else ():
+        for text in lines.read_text().splitlines() if lines.exists() else ():
             test, name, line = text.rsplit("\t", 2)
             reached[os.path.relpath(name, self._checkout), int(line)].add(test)
         return outcome, reached
@@ -118,14 +136,19 @@ class WarmTests:
                 importlib.import_module(name)
 
     def _forked(
-        self, tests: Sequence[str], order: Sequence[str], limit: float, timeout: float, traced: dict[str, str] | None
+        self,
+        files: Sequence[str],
+        chosen: Sequence[str] | None,
+        limit: float,
+        timeout: float,
+        traced: dict[str, str] | None,
     ) -> Outcome:
         file = self._folder / "outcome"
         file.unlink(missing_ok=True)
         child = os.fork()
         if child == 0:
             try:
-                self._child([*tests, "--timeout", f"{timeout:.0f}"], order, traced, file)
+                self._child([*files, "--timeout", f"{timeout:.0f}"], chosen, traced, file)
             finally:
                 os._exit(0)
         try:
@@ -138,7 +161,9 @@ class WarmTests:
             _kill(child)
         return Outcome(**json.loads(file.read_text())) if file.exists() else Outcome()
 
-    def _child(self, arguments: list[str], order: Sequence[str], traced: dict[str, str] | None, file: Path) -> None:
+    def _child(
+        self, arguments: list[str], chosen: Sequence[str] | None, traced: dict[str, str] | None, file: Path
+    ) -> None:
         os.setsid()
         nothing = os.open(os.devnull, os.O_RDWR)
         for standard in range(3):
@@ -150,7 +175,7 @@ class WarmTests:
         tracer = line_tracer.from_environment() if traced else None
         if tracer is not None:
             tracer.start("")
-        plugin = _Plugin(order, tracer)
+        plugin = _Plugin(chosen, tracer)
         code = pytest.main([*self._options, *arguments], plugins=[plugin])
         sys.settrace(None)
         part = file.with_suffix(".part")
