@@ -145,13 +145,15 @@ class Room:
         self._checkout = checkout
         self._reaching: dict[str, dict[tuple[str, int], set[str]]] = {}
         """By file of tests: the tests that run each (file, line); "" stands for all of them."""
-        self._everywhere: set[str] = set()
+        self._always: set[str] = set()
+        """Tests, and files of tests, of which it is not known."""
         for file in files:
             outcome, self._reaching[file] = tests.traced(file, package)
             tests.warm(outcome.modules)
             if not outcome.passed:
-                print(f"{file} is run for every mutant: {outcome.failed} fails while lines are traced", flush=True)
-                self._everywhere.add(file)
+                unknown = outcome.failed or [file]
+                print(f"run for every mutant, as it fails while lines are traced: {', '.join(unknown)}", flush=True)
+                self._always.update(unknown)
         self.whole = tests.run(files, limit=3600)
         os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # a mutant's would pass for that of a file of equal size and second
         sys.dont_write_bytecode = True
@@ -169,7 +171,7 @@ class Room:
                 limit = 120 + 5 * self._duration(tests)
                 outcome = self._tests.run([file], tests, limit=limit, timeout=20 + 10 * longest)
                 if not outcome.passed:
-                    return str(outcome.failed)
+                    return outcome.failed[0] if outcome.failed else f"{file} ended early or late"
         finally:
             path.write_bytes(source)
             os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
@@ -179,8 +181,8 @@ class Room:
         """Returns the tests of a file that run one of some lines, quick ones first; all where they share what does."""
         reaching = set().union(*(self._reaching[file].get(place, ()) for place in places))
         every = [test for test in self.whole.seconds if test.partition("::")[0] == file]
-        if file not in self._everywhere and "" not in reaching:
-            every = [test for test in every if test in reaching]
+        if file not in self._always and "" not in reaching:
+            every = [test for test in every if test in reaching | self._always]
         return sorted(every, key=self.whole.seconds.__getitem__)
 
     def _duration(self, tests: list[str]) -> float:
@@ -208,7 +210,7 @@ def main(arguments: list[str] | None = None) -> int:
         files = sorted({str(file) for name in named for file in test_files(Path(name))})
         room = Room(WarmTests(checkout, Path(folder), given.quick), checkout, package, files)
         if not room.whole.passed:
-            print(f"{room.whole.failed} fails without any mutant", file=sys.stderr)
+            print(f"without any mutant: {room.whole.failed or 'no end'}", file=sys.stderr)
             return 2
         seconds = room.whole.seconds
         print(f"{len(seconds)} tests pass in {sum(seconds.values()):.0f} s", flush=True)

@@ -31,10 +31,11 @@ PR_SET_CHILD_SUBREAPER = 36
 
 @dataclass
 class Outcome:
-    """What a run of tests gave: whether all passed, the first that failed, seconds by test, libraries it imported."""
+    """What a run of tests gave: whether all passed, those that failed, seconds by test, libraries it imported."""
 
     passed: bool = False
-    failed: str = "a limit of time, or the end of the process"
+    failed: list[str] = field(default_factory=list)
+    """Empty where the run itself ended too early or too late."""
     seconds: dict[str, float] = field(default_factory=dict)
     modules: list[str] = field(default_factory=list)
 
@@ -47,7 +48,7 @@ class _Plugin:
         self._tracer = tracer
         self._test = ""
         self._seconds: defaultdict[str, float] = defaultdict(float)
-        self._failed = ""
+        self._failed: list[str] = []
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -80,8 +81,8 @@ class _Plugin:
         self._note(report)
 
     def _note(self, report: pytest.CollectReport | pytest.TestReport) -> None:
-        if report.failed:
-            self._failed = self._failed or report.nodeid
+        if report.failed and report.nodeid not in self._failed:
+            self._failed.append(report.nodeid)
 
     def outcome(self, passed: bool) -> Outcome:
         libraries = [
@@ -98,7 +99,7 @@ class WarmTests:
     def __init__(self, checkout: Path, folder: Path, quick: bool = False) -> None:
         self._checkout = checkout
         self._folder = folder
-        self._options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "--basetemp", str(folder / "tests")]
+        self._options = ["-q", "-n0", "-p", "no:cacheprovider", "--basetemp", str(folder / "tests")]
         self._options += ["-m", "not long"] if quick else []
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)  # orphans become children of this process, which ends them
 
@@ -107,12 +108,13 @@ class WarmTests:
     ) -> Outcome:
         """Runs the tests of files, or those `chosen` of them in that order, up to the first that fails, for at most
         `limit` s and each for at most `timeout` s."""
-        return self._forked(files, chosen, limit, timeout, None)
+        return self._forked(["-x", *files], chosen, limit, timeout, None)
 
     def traced(self, file: str, package: Path, limit: float = 600) -> tuple[Outcome, dict[tuple[str, int], set[str]]]:
         """Runs the tests of a file; returns also which of them ran each (file, line) of a package of the checkout.
 
-        "" among them is what they share: collection, and fixtures of a module or more.
+        "" among them is what they share: collection, and fixtures of a module or more. Where one fails, the others go
+        on.
         """
         lines = self._folder / "lines"
         lines.unlink(missing_ok=True)
@@ -137,7 +139,7 @@ class WarmTests:
 
     def _forked(
         self,
-        files: Sequence[str],
+        arguments: Sequence[str],
         chosen: Sequence[str] | None,
         limit: float,
         timeout: float,
@@ -148,7 +150,7 @@ class WarmTests:
         child = os.fork()
         if child == 0:
             try:
-                self._child([*files, "--timeout", f"{timeout:.0f}"], chosen, traced, file)
+                self._child([*arguments, "--timeout", f"{timeout:.0f}"], chosen, traced, file)
             finally:
                 os._exit(0)
         try:
