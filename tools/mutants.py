@@ -15,6 +15,7 @@ import ast
 import os
 import random
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -203,6 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
     named = given.tests or [str(Path("tests", *package.parts[package.parts[0] == "dataflow" :]))]
     os.environ.setdefault("PERCEPTION_DATA", str(given.checkout.resolve().parent / "shared" / "data"))
     started = time.monotonic()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the copy and its tests are gone then, too
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
         checkout = Path(folder, "checkout")
         copy(given.checkout, checkout)

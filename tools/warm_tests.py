@@ -167,6 +167,7 @@ class WarmTests:
         self, arguments: list[str], chosen: Sequence[str] | None, traced: dict[str, str] | None, file: Path
     ) -> None:
         os.setsid()
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         nothing = os.open(os.devnull, os.O_RDWR)
         for standard in range(3):
             os.dup2(nothing, standard)
