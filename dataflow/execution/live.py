@@ -339,7 +339,7 @@ class LiveRunner(OperatorRunner):
         name = self._input_of(stream)
         self.queue.clear()
         drops, more = self.take_drops()
-        self._begin_alignment(stream)
+        self._begin_alignment()
         self._jumped[_producer(stream)] = entry.incarnation
         self._seen = {other: (incarnation, NEVER) for other, (incarnation, _) in self._seen.items()}
         self._time.begin_at(entry.stamp)
@@ -355,16 +355,15 @@ class LiveRunner(OperatorRunner):
             raise failure from error
         self.records.add("reset", NEVER + 1, started, drops=tuple(drops), detail=detail)
 
-    def _begin_alignment(self, jumped: str) -> None:
+    def _begin_alignment(self) -> None:
         old = self.aligner
         self._earlier.take(old, self.spec)
         self.aligner = make_aligner(old.spec)
         self._told = True
         for static in self._statics.values():
             self.aligner.push(static.stream, static)
-        for stream, end in old.ends.items():
-            if stream != jumped and stream not in self._static:
-                self.aligner.end(stream, None, end.reason)
+        for stream, end in old.ends.items():  # of one that begins again, its message opens it
+            self.aligner.end(stream, None, end.reason)
 
     def _begin_incarnation(self, *, stamps_go_back: bool = False) -> None:
         incarnation = self.records.incarnation + 1

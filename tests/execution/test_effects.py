@@ -462,6 +462,15 @@ def test_an_error_of_a_recording_imports_no_package() -> None:
     assert "antigravity" not in sys.modules
 
 
+def test_an_error_of_a_recording_calls_no_function(capsys: pytest.CaptureFixture[str]) -> None:
+    described = [[["builtins", "print"], ["builtins", "ValueError"]], "t", ["t"], {}, {}]
+
+    error = Answer(True, pack_state({"": described})).error()
+
+    assert type(error) is ValueError
+    assert not capsys.readouterr().out
+
+
 def test_without_a_run_the_call_is_made() -> None:
     assert Asking().effect(ask, answer=3) == 3
 

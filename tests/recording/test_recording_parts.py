@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -20,6 +21,7 @@ from dataflow.messages import Pose
 from dataflow.recording import Recording, RecordingError, RecordingWriter, describe
 from dataflow.recording.mcap.attachments import Attachment
 from dataflow.recording.mcap.contents import Entries
+from dataflow.recording.parts import Splitting, Storage
 from dataflow.recording.streams.copying import Origin
 from dataflow.recording.streams.part_folder import _JoinedIndex, parts_in
 from dataflow.records.reading import FiringLog, whole
@@ -183,3 +185,9 @@ def test_parts_without_what_they_share_follow_each_other(tmp_path: Path, pose: C
         assert recording.metadata["note"] == {"part": "2"}
     (tmp_path / "b.mcap").write_bytes(b"")
     assert parts_in(tmp_path) == []
+
+
+def test_the_storage_that_another_process_is_told_is_the_same() -> None:
+    storage = Storage(Splitting(size=1000, every=60_000_000_000), keep=10**6, on_failure="end", mode=0o640)
+
+    assert Storage.from_json(json.loads(json.dumps(storage.to_json()))) == storage
