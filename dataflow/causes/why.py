@@ -74,9 +74,9 @@ class Why:
     """The answer about one operator. `refused`: the reason for which nothing was tried; `repeats`: whether its re-runs
     agree; `settled`: whether they do with all sources of chance fixed (None where that was not tried or needed).
     `cleared` sources were tried without effect, of each group in `open` one has an effect, `left_out` could not be
-    tried, with the reason. `older`: files and folders that have an effect, and were not changed since the recording.
-    `changed` are facts that the recording holds and that differ now; `code_known`: it holds digests of the operator's
-    code. `seconds` in all."""
+    tried, with the reason. `changed` are facts that the recording holds and that differ now; `also`: sources that have
+    an effect, and need not differ from those of the recording: files and folders that are older than it, and all others
+    where facts differ. `code_known`: it holds digests of the operator's code. `seconds` in all."""
 
     operator: str
     refused: str = ""
@@ -86,15 +86,15 @@ class Why:
     cleared: tuple[str, ...] = ()
     open: tuple[tuple[str, ...], ...] = ()
     left_out: Mapping[str, str] | None = None
-    older: tuple[str, ...] = ()
     changed: tuple[str, ...] = ()
+    also: tuple[Cause, ...] = ()
     code_known: bool = False
     reruns: int = 0
     seconds: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
-        plain = asdict(replace(self, causes=(), left_out=dict(self.left_out or {})))
-        return plain | {"causes": [cause.as_json() for cause in self.causes]}
+        plain = asdict(replace(self, causes=(), also=(), left_out=dict(self.left_out or {})))
+        return plain | {name: [each.as_json() for each in getattr(self, name)] for name in ("causes", "also")}
 
 
 def why(
@@ -126,7 +126,7 @@ def why(
             made = Why(operator, causes=(_cause(INPUT, wrote),), reruns=1)
         else:
             ladder = Ladder(alone.fire, tuple(alone.left_out), MOST - (wrote is not None))
-            made = _answer(operator, ladder.climb(report.repeats(operator)), alone, wrote, verification)
+            made = _answer(ladder.climb(report.repeats(operator)), alone, wrote, verification, changed)
     except RunFailed as failure:
         if failure.interrupted:
             raise
@@ -150,22 +150,33 @@ def refusal(report: VerifyReport, operator: str, found: Verification | None) -> 
     return f"it repeats: {report.verdict(found)}"
 
 
-def _answer(operator: str, findings: Findings, alone: _Alone, wrote: Rerun | None, verification: Verification) -> Why:
-    causes = [_cause(source, findings.first, findings.left) for source in findings.causes]
-    outside = [cause for cause in causes if cause.kind in (FILE, FOLDER)]
-    older = [cause for cause in outside if not alone.is_newer(name_of(cause.source), verification)]
-    causes = [cause for cause in causes if cause not in older]
+def _answer(
+    findings: Findings, alone: _Alone, wrote: Rerun | None, found: Verification, changed: tuple[str, ...]
+) -> Why:
+    """Returns the answer from an operator's findings; `changed` are facts that are not as they were recorded."""
+    effective = [_cause(source, findings.first, findings.left) for source in findings.causes]
+    causes = [cause for cause in effective if _explains(cause, findings, alone, found, changed)]
     first = [] if wrote is None else [_cause(INPUT, wrote)]
     return Why(
-        operator,
+        found.operator,
         repeats=findings.repeats,
         settled=findings.settled,
         causes=(*first, *causes),
         cleared=tuple(findings.cleared),
         open=tuple(findings.open),
-        older=tuple(cause.what for cause in older),
+        also=tuple(cause for cause in effective if cause not in causes),
         reruns=findings.reruns + len(first),
     )
+
+
+def _explains(cause: Cause, findings: Findings, alone: _Alone, found: Verification, changed: tuple[str, ...]) -> bool:
+    """Returns whether a source on which results depend explains why they are not the recorded ones: it makes them
+    differ from run to run, it is newer than the recording, or all that the recording holds is as it was."""
+    if not findings.repeats:
+        return True
+    if cause.kind in (FILE, FOLDER):
+        return alone.is_newer(name_of(cause.source), found)
+    return not changed
 
 
 def _cause(source: str, rerun: Rerun | None, left: tuple[str, ...] = ()) -> Cause:
@@ -237,10 +248,14 @@ class _Alone:
         return self.fire(Setting(lines=True))
 
     def is_newer(self, file: str, found: Verification) -> bool:
-        """Returns whether a file or folder was changed after the operator's last call, or is not the recorded one."""
+        """Returns whether a file or folder was changed or put here after the operator's last call, or is not the
+        recorded one. Copies keep the time of the last change, and not that at which they were put here."""
         if file in found.files_changed:
             return True
-        return os.path.exists(file) and os.stat(file).st_mtime > self.recorded
+        if not os.path.exists(file):
+            return False
+        status = os.stat(file)
+        return max(status.st_mtime, status.st_ctime) > self.recorded
 
 
 def reasons(path: Path, report: VerifyReport, operators: Sequence[str], graph: Graph | None = None) -> list[Why]:

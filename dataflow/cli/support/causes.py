@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from dataflow.causes.sources import SOURCES, kind_of
-from dataflow.causes.why import Why
+from dataflow.causes.sources import FILE, FOLDER, SOURCES, kind_of
+from dataflow.causes.why import Cause, Why
 from dataflow.cli.support.output import count, plural, seconds, table
 
 OUTSIDE = "files that C libraries read, files that are gone, devices, services"
@@ -52,18 +52,26 @@ def _lines(found: Why) -> Iterator[str]:
         yield f"{found.operator}: no cause looked for: {found.refused}"
         return
     yield f"{found.operator}: {_outcome(found)} ({plural(found.reruns, 're-run')}, {seconds(found.seconds)})"
-    if found.older:
-        yield f"{found.operator}: it depends on what was not changed since the recording: {', '.join(found.older)}"
+    if found.repeats:
+        for fact in found.changed:
+            yield f"{found.operator}: not as it was recorded: {fact}"
+    for cause in found.also:
+        yield f"{found.operator}: its results also depend on {_also(cause)}"
     for group in found.open:
         yield f"{found.operator}: not tried by itself, re-runs were used up: {_list(group)}"
     for source, reason in (found.left_out or {}).items():
         yield f"{found.operator}: not tried: {source}: {reason}"
-    if found.repeats:
-        for fact in found.changed:
-            yield f"{found.operator}: not as it was recorded: {fact}"
+
+
+def _also(cause: Cause) -> str:
+    sites = ", ".join(f"{Path(site.file).name}:{site.line}" for site in cause.sites)
+    where = f" ({sites})" if sites else ""
+    return f"{cause.what}{where}, {'older than' if cause.kind in (FILE, FOLDER) else 'not known for'} the recording"
 
 
 def _outcome(found: Why) -> str:
+    if found.repeats and found.changed and found.causes:
+        return "it repeats here; besides the causes above, this is not as it was recorded"
     if found.causes:
         return "each cause shown by its effect: with it alone free or changed, the results differ"
     if found.repeats and found.changed:
