@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -94,21 +95,21 @@ def test_what_repeats_or_cannot_be_run_again_is_refused(found: Verification, mor
 
 
 @pytest.mark.parametrize(
-    ("newer", "changed", "causes", "also"),
+    ("newer", "revised", "causes", "also"),
     [
-        (True, (), {"folder", "environment variable"}, set()),
-        (False, (), {"environment variable"}, {"folder"}),
-        (True, ("code of x",), {"folder"}, {"environment variable"}),
-        (False, ("code of x",), set(), {"folder", "environment variable"}),
+        (True, False, {"folder", "environment variable"}, set()),
+        (False, False, {"environment variable"}, {"folder"}),
+        (True, True, {"folder"}, {"environment variable"}),
+        (False, True, set(), {"folder", "environment variable"}),
     ],
 )
-def test_what_may_be_as_it_was_is_no_cause_where_something_recorded_has_changed(
-    newer: bool, changed: tuple[str, ...], causes: set[str], also: set[str]
+def test_what_may_be_as_it_was_is_no_cause_where_the_operator_itself_has_changed(
+    newer: bool, revised: bool, causes: set[str], also: set[str]
 ) -> None:
     findings = Findings(Rerun(("",)), repeats=True, causes=["folder:models", "environment variable:GAIN"])
     alone: Any = SimpleNamespace(is_newer=lambda file, found: newer)
 
-    found = _answer(findings, alone, None, Verification("x"), changed)
+    found = _answer(findings, alone, None, Verification("x"), revised)
 
     assert {cause.kind for cause in found.causes} == causes
     assert {cause.kind for cause in found.also} == also
@@ -118,7 +119,16 @@ def test_what_may_be_as_it_was_is_no_cause_where_something_recorded_has_changed(
 def test_what_makes_runs_differ_is_a_cause_whatever_has_changed() -> None:
     findings = Findings(Rerun(("",)), repeats=False, settled=True, causes=["wall clock"])
 
-    assert _answer(findings, None, None, Verification("x"), ("code of x",)).causes  # type: ignore[arg-type]
+    assert _answer(findings, None, None, Verification("x"), revised=True).causes  # type: ignore[arg-type]
+
+
+def test_facts_of_the_machine_are_no_change_of_an_operator() -> None:
+    found = Verification("x", code_changed=["op"], packages_changed=["numpy 1 → 2"])
+    made = report(found)
+    made = replace(made, facts=(("cpu", "a", "b"),))
+
+    assert made.revised("x") == ("code of op", "numpy 1 → 2")
+    assert made.altered("x") == ("code of op", "numpy 1 → 2", "cpu: a → b")
 
 
 def test_a_file_that_was_copied_with_its_times_is_newer_than_a_recording_made_before(tmp_path: Path) -> None:
@@ -143,6 +153,21 @@ def test_changed_code_is_reported_before_what_the_results_also_depend_on() -> No
         "x: not as it was recorded: code of op",
         "x: its results also depend on environment variable GAIN (op.py:20), not known for the recording",
     ]
+
+
+def test_sources_of_chance_that_it_reads_in_vain_are_listed_before_devices() -> None:
+    site = Site("/robot/op.py", 60, "process", "time.monotonic")
+    findings = Findings(Rerun(("",), sites=(("monotonic clock", site, 40),)), repeats=True, reruns=5)
+    findings.cleared = ["monotonic clock", "random"]
+    console = Console(file=io.StringIO(), width=200)
+
+    found = _answer(findings, None, None, Verification("x"), revised=False)  # type: ignore[arg-type]
+    print_reasons(console, "", [found])
+
+    first, second = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert first == "x: reads the monotonic clock at op.py:60; no effect seen in 5 re-runs"
+    assert "devices" in second
+    assert [read["calls"] for read in found.as_json()["reads"]] == [40]
 
 
 def test_an_operator_that_is_refused_is_not_run(tmp_path: Path) -> None:

@@ -8,12 +8,40 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from dataflow.causes.sources import FILE, FOLDER, SOURCES, kind_of
+from dataflow.causes.sources import (
+    ENTROPY,
+    FILE,
+    FOLDER,
+    HEAP,
+    IDENTITY,
+    MONOTONIC,
+    NUMPY,
+    PROCESS,
+    RANDOM,
+    SOURCES,
+    THREADS,
+    UUID,
+    WALL,
+    kind_of,
+)
 from dataflow.causes.why import Cause, Why
 from dataflow.cli.support.output import count, plural, seconds, table
 
 OUTSIDE = "files that C libraries read, files that are gone, devices, services"
 """Sources that --why does not see."""
+_READS = {
+    WALL: "reads the wall clock",
+    MONOTONIC: "reads the monotonic clock",
+    ENTROPY: "reads the entropy of the system",
+    PROCESS: "reads the number of its process",
+    RANDOM: "draws from a generator that nothing seeded",
+    NUMPY: "draws from a generator of numpy that nothing seeded",
+    UUID: "makes random identifiers",
+    IDENTITY: "calls id()",
+    THREADS: "starts threads",
+    HEAP: "takes fresh memory",
+}
+"""What an operator does with a source of chance."""
 
 
 def as_recorded(*, code_known: bool) -> str:
@@ -51,6 +79,10 @@ def _lines(found: Why) -> Iterator[str]:
     if found.refused:
         yield f"{found.operator}: no cause looked for: {found.refused}"
         return
+    if not found.causes and not found.changed:
+        for read in found.reads:
+            tried = f"no effect seen in {plural(found.reruns, 're-run')}"
+            yield f"{found.operator}: {_READS.get(read.kind, f'reads {read.kind}')} at {_lines_of(read)}; {tried}"
     yield f"{found.operator}: {_outcome(found)} ({plural(found.reruns, 're-run')}, {seconds(found.seconds)})"
     if found.repeats:
         for fact in found.changed:
@@ -64,9 +96,12 @@ def _lines(found: Why) -> Iterator[str]:
 
 
 def _also(cause: Cause) -> str:
-    sites = ", ".join(f"{Path(site.file).name}:{site.line}" for site in cause.sites)
-    where = f" ({sites})" if sites else ""
+    where = f" ({_lines_of(cause)})" if cause.sites else ""
     return f"{cause.what}{where}, {'older than' if cause.kind in (FILE, FOLDER) else 'not known for'} the recording"
+
+
+def _lines_of(cause: Cause) -> str:
+    return ", ".join(f"{Path(site.file).name}:{site.line}" for site in cause.sites)
 
 
 def _outcome(found: Why) -> str:
