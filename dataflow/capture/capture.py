@@ -102,10 +102,8 @@ def capture(
     """
     fired = _aimed(debugger, number, predicate)
     wrong = Wrong(fired, predicate)
-    expected, recorded_error = None, ""
-    if wrong.digests is not None:
-        recorded_error = fired.recorded_error or ""
-        expected = _recorded(fired)
+    expected = None if wrong.digests is None else _recorded(fired)
+    recorded_error = "" if wrong.error is not None else fired.recorded_error or ""
     setting = _setting(recording, debugger)
     ordered = FiringLog.read(recording).ordered(debugger.node)
     records = [r for r in ordered if r.kind not in CALLS and r.outcome != "error"]

@@ -102,7 +102,8 @@ class Captured:
     one, and the parameters that had been changed by then: before the last `setup()`, and `since`.
 
     Expected of it are the messages in `expected`, by port, or the error `recorded_error`, or, where there is a
-    `predicate`, that this expression is false; where neither is given, that it raises nothing.
+    `predicate`, that this expression is false, and an error none but `recorded_error`; where none of these is given,
+    that it raises nothing.
     """
 
     setting: Setting
@@ -143,8 +144,10 @@ class Captured:
     def check(self) -> None:
         """Makes the calls; raises `AssertionError`, or the operator's own error, where the last one is wrong."""
         outcome = self.play()
+        if outcome.error is not None and outcome.broken:
+            raise outcome.error
         if self.predicate:
-            assert not Predicate(self.predicate).is_true(outcome.names()), f"{self.setting.name}: {self.predicate}"
+            self._check_predicate(outcome)
         elif self.recorded_error:
             error = "nothing" if outcome.error is None else readable(outcome.error)
             assert error == self.recorded_error, f"{self.setting.name}: raised {error}, expected {self.recorded_error}"
@@ -153,6 +156,16 @@ class Captured:
         elif self.expected is not None:
             found = "; ".join(_differences(self.expected, outcome.outputs))
             assert not found, f"{self.setting.name}: {found}"
+
+    def _check_predicate(self, outcome: Outcome) -> None:
+        name, predicate = self.setting.name, Predicate(self.predicate)
+        if outcome.error is not None and readable(outcome.error) != self.recorded_error:
+            raise outcome.error
+        assert not predicate.is_true(outcome.names()), f"{name}: {self.predicate}"
+        assert predicate.problem is None, (
+            f"{name}: {self.predicate} raises {readable(predicate.problem)}: whether the call is right is not known; "
+            "capture it by an expression that is false of a right call"
+        )
 
     def to_bytes(self) -> bytes:
         """Returns the file's content. Raises ValueError for a message that does not come back from it alike."""

@@ -145,7 +145,20 @@ def test_a_silent_output_is_none_for_an_expression(changed: Path) -> None:
     assert [shot.firing.inputs["x"].value.vectors[0, 0] for shot in made.shots] == [5.0]  # type: ignore[union-attr]
     with pytest.raises(AssertionError, match=r"rare: out\.out is None"):
         made.check()
-    replace(made, predicate="out.out.vectors[0, 0] > 3").check()  # raises: not true
+    with pytest.raises(AssertionError, match=r"out\.out\.vectors.* raises AttributeError: .*whether the call is right"):
+        replace(made, predicate="out.out.vectors[0, 0] > 3").check()
+
+
+def test_a_call_that_raises_now_is_not_mended(late: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = captured(late, predicate=f"stamp > {bugs.STAMP + 5 * 10**9}")
+
+    def broken(operator: bugs.LateBatch, x: object, rare: object) -> None:
+        raise RuntimeError("a broken fix")
+
+    monkeypatch.setattr(bugs.LateBatch, "process", broken)
+    with pytest.raises(RuntimeError, match="a broken fix"):
+        replace(made, predicate="out.out is not None and out.out.vectors[0, 0] > 3").check()
+    replace(made, predicate="stamp < 0", recorded_error="RuntimeError: a broken fix").check()  # as recorded
 
 
 @pytest.mark.long
