@@ -71,6 +71,28 @@ def test_a_predicate_about_any_call_is_captured(late: Path) -> None:
     assert made.shots[0].firing.inputs["rare"] == ()  # not needed for that
 
 
+def test_a_state_that_holds_the_bug_is_begun_with_only_where_the_calls_are_too_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = seeded_bugs.recorded(bugs.Case(bugs.Drifts), tmp_path / "run.mcap")
+
+    made = captured(path)
+
+    assert made.state is None
+    assert len(made.shots) == 52
+    with pytest.raises(ValueError, match="out of range"):
+        made.check()
+    with monkeypatch.context() as patch:
+        patch.setenv("ZOO_FIXED", "1")
+        made.check()
+    monkeypatch.setattr("dataflow.capture.capture.LARGE", 100)
+    assert captured(path).state is not None
+    monkeypatch.undo()
+    monkeypatch.setattr("dataflow.capture.capture.check_repeats", lambda made: None)
+    monkeypatch.setattr("dataflow.capture.capture.SLOW", 0.0)
+    assert captured(path).state is not None
+
+
 def test_answers_of_a_service_are_in_the_test(tmp_path: Path) -> None:
     with vision_language.service() as url:
         dataflow.run(vision_language.graph(url), record=tmp_path / "run.mcap")
