@@ -23,6 +23,7 @@ from dataflow.records.cuts import is_known, parameters_at
 from dataflow.records.firing import CALLS, WITHHELD, FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import seeding_of
+from dataflow.state import StateError
 from dataflow.sync.entries import entries_of
 from dataflow.text import visible
 
@@ -305,7 +306,10 @@ def _reduced(whole: Captured, wrong: Wrong, deadline: float) -> Captured | None:
     """
     if not whole.shots:
         return None
-    outcome = whole.play()
+    try:
+        outcome = whole.play()
+    except StateError:  # of another version of the class
+        return None
     here = [shot.here for shot in whole.shots[:-1][-BEFORE:]]
     if not wrong.shows(outcome) or (wrong.digests is not None and list(outcome.before) != here):
         return None

@@ -16,14 +16,14 @@ from typing import Any, NamedTuple
 
 from dataflow.execution.calls import Calls, value_of
 from dataflow.execution.effects.journal import RecordedJournal
-from dataflow.execution.failure import RAISED, readable
+from dataflow.execution.failure import RAISED, OperatorFailure, readable
 from dataflow.execution.restarts import close_quietly
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Live, Node
 from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import differences
-from dataflow.state import plain, typed
+from dataflow.state import StateError, of_another_version, plain, typed
 from dataflow.sync import NEVER, Entry, Firing, InputValue
 from dataflow.sync.entries import entries_of
 
@@ -116,7 +116,8 @@ class Captured:
     predicate: str = ""
 
     def play(self) -> Outcome:
-        """Makes the calls with a new operator. Raises `OperatorFailure` where it cannot be set up."""
+        """Makes the calls with a new operator. Raises `OperatorFailure` where it cannot be set up; `StateError` for a
+        state of another version of its class whose new fields have no default."""
         setting = self.setting
         node = Node(
             name=setting.name,
@@ -136,10 +137,22 @@ class Captured:
                 for name, value in self.since.items():
                     calls.parameter(name, value, (0, NEVER))
                 if self.state is not None:
-                    calls.restore(self.state, (0, self.shots[0].firing.stamp - 1))
+                    self._take_over(calls, self.state)
                 return _made(calls, journal, self.shots)
             finally:
                 close_quietly(calls.operator)
+
+    def _take_over(self, calls: Calls, state: bytes) -> None:
+        try:
+            with of_another_version():
+                calls.restore(state, (0, self.shots[0].firing.stamp - 1))
+        except OperatorFailure as failure:
+            if "StateError" not in failure.summary:
+                raise
+            raise StateError(
+                f"{self.setting.name}: the captured state does not fit the class as it is now: {failure.summary}; "
+                "give new fields a default, or capture the call again"
+            ) from failure
 
     def check(self) -> None:
         """Makes the calls; raises `AssertionError`, or the operator's own error, where the last one is wrong."""

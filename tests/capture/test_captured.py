@@ -19,7 +19,9 @@ from dataflow.capture.capture import capture, write_test
 from dataflow.capture.captured import Captured, Change
 from dataflow.cli.main import app
 from dataflow.debugging.debugger import DebugError, Debugger
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.recording import Recording
+from dataflow.state import StateError
 
 CASES = {case.use.__name__: case for case in bugs.CASES}
 
@@ -169,6 +171,24 @@ def test_a_silent_output_is_none_for_an_expression(changed: Path) -> None:
         made.check()
     with pytest.raises(AssertionError, match=r"out\.out\.vectors.* raises AttributeError: .*whether the call is right"):
         replace(made, predicate="out.out.vectors[0, 0] > 3").check()
+
+
+def test_a_captured_state_is_taken_over_by_a_class_with_more_fields(
+    changed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = captured(changed, "tuned").state
+    assert state is not None
+    former = replace(captured(changed, "tuned"), state=pack_state({}))
+    made = replace(former, state=pack_state(unpack_state(state) | {"gone": 1}))
+
+    monkeypatch.setenv("ZOO_FIXED", "1")
+    made.check()
+    with pytest.raises(AssertionError, match="tuned: out"):
+        former.check()  # begins with a total of 0, the default
+    with pytest.raises(
+        StateError, match=r"tuned: the captured state does not fit the class as it is now: .*capture the"
+    ):
+        replace(former, state=pack_state({"total": "much"})).check()
 
 
 def test_a_call_that_raises_now_is_not_mended(late: Path, monkeypatch: pytest.MonkeyPatch) -> None:
