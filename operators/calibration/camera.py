@@ -43,6 +43,8 @@ ROUGH = 1.0
 """Pixels of residual, root mean square."""
 LOOSE = 0.005
 """Standard deviation of the focal length, as a share of it."""
+LOST = 0.1
+"""That from which on there is no calibration."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -101,7 +103,7 @@ def fit_camera(board: Board, views: Sequence[View], frame: str, size: tuple[int,
     """
     if len(views) < FEWEST:
         raise ValueError(
-            f"{len(views)} usable views of the board; a calibration takes {FEWEST}, a good one {FEW} or more"
+            f"usable views of the board: {len(views)}; a calibration takes {FEWEST}, a good one {FEW} or more"
         )
     first = _fit(board, views, frame, size, model)
     keep = first.errors <= ODD * max(float(np.median(first.errors)), 0.1)
@@ -114,7 +116,7 @@ def fit_camera(board: Board, views: Sequence[View], frame: str, size: tuple[int,
 def _fit(board: Board, views: Sequence[View], frame: str, size: tuple[int, int], model: Model) -> Fitted:
     points = [board.points[view.ids] for view in views]
     try:
-        K, D, rotations, translations, deviations = _solved(points, [view.pixels for view in views], size, model)
+        K, D, rotations, translations = _solved(points, [view.pixels for view in views], size, model)
     except cv2.error as error:
         raise ValueError(
             f"{len(views)} views determine no {model} camera ({error.err}): the board must tilt"
@@ -129,22 +131,48 @@ def _fit(board: Board, views: Sequence[View], frame: str, size: tuple[int, int],
     errors = np.array([np.sqrt((rows**2).sum(axis=1).mean()) for rows in residuals])
     if not np.isfinite(K).all() or not np.isfinite(errors).all() or min(K[0, 0], K[1, 1]) <= 0:
         raise ValueError(f"{len(views)} views determine no {model} camera: the board must tilt, at several distances")
+    off = np.concatenate(residuals)
+    deviations = None if model == "equidistant" else _deviations(points, rotations, translations, K, D, off)
+    if deviations is not None and not max(deviations[:2]) < LOST * min(K[0, 0], K[1, 1]):
+        raise ValueError(
+            f"{len(views)} views do not determine the focal length (±{max(deviations[:2]):.3g} px): the board must "
+            "tilt, at several distances"
+        )
     info = CameraInfo(stamp=0, frame=frame, width=size[0], height=size[1], distortion_model=model, K=K, distortion=D)
-    return Fitted(info, tuple(views), poses, np.array(depths), np.concatenate(residuals), errors, deviations, 0)
+    return Fitted(info, tuple(views), poses, np.array(depths), off, errors, deviations, 0)
+
+
+def _deviations(
+    points: list[Points], rotations: Vectors, translations: Vectors, K: Vectors, D: Vectors, residuals: Pixels
+) -> Vectors:
+    """Returns the standard deviations of fx, fy, cx, cy, with the boards' poses and the distortion unknown; infinite
+    where nothing determines them. OpenCV's own leave out whatever the views determine worst."""
+    information = np.zeros((4 + len(D), 4 + len(D)))
+    for seen, rotation, translation in zip(points, rotations, translations, strict=True):
+        jacobian = cv2.projectPoints(seen, rotation, translation, K, D)[1]
+        pose, camera = jacobian[:, :6], jacobian[:, 6 : 10 + len(D)]
+        information += camera.T @ (camera - pose @ np.linalg.lstsq(pose, camera, rcond=None)[0])
+    scale = np.sqrt(np.diag(information))
+    free = residuals.size - 6 * len(points) - len(information)
+    try:
+        covariance = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+        return np.asarray(np.sqrt(np.diag(covariance)[:4] * (residuals**2).sum() / free))
+    except np.linalg.LinAlgError:
+        return np.full(4, np.inf)
 
 
 def _solved(
     points: list[Points], pixels: list[Pixels], size: tuple[int, int], model: Model
-) -> tuple[NDArray[np.float64], NDArray[np.float64], Vectors, Vectors, NDArray[np.float64] | None]:
-    """K, D, and for each view a rotation vector and a translation; standard deviations of fx, fy, cx, cy."""
+) -> tuple[Vectors, Vectors, Vectors, Vectors]:
+    """K, D, and for each view a rotation vector and a translation."""
     if model == "equidistant":
         flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
         shaped = [p.reshape(1, -1, 3) for p in points], [p.reshape(1, -1, 2) for p in pixels]
         start = np.zeros((3, 3)), np.zeros(4)
         _, K, D, rotations, translations = cv2.fisheye.calibrate(*shaped, size, *start, flags=flags)
-        return _float(K), _float(D).ravel()[:4], _float(rotations), _float(translations), None
+        return _float(K), _float(D).ravel()[:4], _float(rotations), _float(translations)
     flags, count = (cv2.CALIB_RATIONAL_MODEL, 8) if model == "rational_polynomial" else (0, 5)
-    _, K, D, rotations, translations, spread, _, _ = cv2.calibrateCameraExtended(
+    _, K, D, rotations, translations = cv2.calibrateCamera(
         [p.astype(np.float32) for p in points],
         [p.astype(np.float32) for p in pixels],
         size,
@@ -152,9 +180,7 @@ def _solved(
         np.zeros(count),
         flags=flags,
     )
-    return (
-        _float(K), _float(D).ravel()[:count], _float(rotations), _float(translations), _float(spread).ravel()[:4]
-    )  # fmt: skip
+    return _float(K), _float(D).ravel()[:count], _float(rotations), _float(translations)
 
 
 def _float(value: npt.ArrayLike) -> NDArray[np.float64]:

@@ -92,8 +92,18 @@ def test_a_board_that_is_not_flat_shows_as_residual() -> None:
 
 
 def test_too_few_views_are_an_error() -> None:
-    with pytest.raises(ValueError, match="3 usable views of the board; a calibration takes 4, a good one 12"):
+    with pytest.raises(ValueError, match="usable views of the board: 3; a calibration takes 4, a good one 12"):
         fitted(LENS, views_of(LENS)[:3])
+
+
+def test_views_without_tilt_determine_no_focal_length() -> None:
+    """OpenCV's deviations of such a fit are small: they leave out the direction that nothing determines."""
+    rng = np.random.default_rng(2)
+    places = [(x, y, 0.5) for x in (-0.1, -0.05, 0.0) for y in (-0.08, -0.04, 0.0, 0.04)]
+    views = [view(BOARD, LENS, pose(BOARD, turned(0, 0, 0.02 * k), at), rng, k) for k, at in enumerate(places)]
+
+    with pytest.raises(ValueError, match=r"do not determine the focal length \(±.* px\): the board must tilt"):
+        fitted(LENS, views)
 
 
 def test_coverage_names_the_parts_without_a_board() -> None:
