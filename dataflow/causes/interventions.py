@@ -17,10 +17,12 @@ import sys
 import threading
 import time
 import uuid
+import weakref
 from collections import Counter
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date, datetime, tzinfo
+from functools import partial
 from multiprocessing.pool import ThreadPool
 from types import FrameType
 from typing import Any
@@ -69,22 +71,26 @@ class Interventions:
         self._places, self._began = places, began
         self._fixed: frozenset[str] = frozenset()
         self._numbered: dict[str, dict[int, tuple[int, object]]] = {IDENTITY: {}, ADDRESSES: {}}
+        self._count = Counter[str]()
+        self.given: set[str] = set()
+        """The sources of which something fixed was given to code that is not the engine's or the standard library's."""
         self._drawn = Counter[str]()
 
     def fix(self, sources: Collection[str]) -> None:
         """Makes sources give the same in every process; the others give their real values."""
         self._fixed = frozenset(sources)
         ForNumpy.install()
-        self._set_clock(self._ticking(self._began), lambda: WALL in self._fixed)
+        self._set_clock(self._ticking(self._began), partial(self._gives, WALL))
         self._fix_monotonic()
         self._fix_random()
         self._fix_numpy()
         self._fix_identifiers()
         self._fix_entropy()
         self._fix_identities()
-        self._replace(os, "getpid", lambda: 4242, lambda: PROCESS in self._fixed)
+        self._replace(os, "getpid", lambda: 4242, partial(self._gives, PROCESS))
         self._take_turns()
         self._fill(FILL if HEAP in self._fixed else OTHER_FILL)
+        self.given.clear()
 
     def vary(self, sources: Collection[str]) -> None:
         """Makes sources give something else than they do here."""
@@ -103,13 +109,19 @@ class Interventions:
         if HEAP in sources and not self._fixed:
             self._fill(OTHER_FILL)
 
+    def _gives(self, source: str) -> bool:
+        """Returns whether a source is fixed; it is asked for one now."""
+        if source in self._fixed:
+            self.given.add(source)
+        return source in self._fixed
+
     def _replace(self, module: Any, name: str, value: Callable[..., Any], on: Callable[[], bool]) -> None:
         """Has all code but the engine and the standard library get `value` from a function, while it is `on`."""
         real = getattr(module, name)
 
         @functools.wraps(real)
         def replaced(*args: Any, **kwargs: Any) -> Any:
-            return (value if on() and not self._places.passes(sys._getframe(1)) else real)(*args, **kwargs)
+            return (real if self._places.passes(sys._getframe(1)) or not on() else value)(*args, **kwargs)
 
         setattr(module, name, replaced)
 
@@ -148,7 +160,7 @@ class Interventions:
         real_now, real_today, real_utcnow = datetime.now, date.today, datetime.utcnow
 
         def free() -> bool:
-            return not on() or self._places.passes(sys._getframe(2))
+            return self._places.passes(sys._getframe(2)) or not on()
 
         def current(cls: type[datetime], tz: tzinfo | None = None) -> datetime:
             return real_now(tz) if free() else cls.fromtimestamp(now() / 1e9, tz)
@@ -170,8 +182,8 @@ class Interventions:
     def _fix_monotonic(self) -> None:
         now = self._ticking(10**12)
         for name in ("monotonic", "perf_counter", "process_time", "thread_time"):
-            self._replace(time, f"{name}_ns", now, lambda: MONOTONIC in self._fixed)
-            self._replace(time, name, lambda: now() / 1e9, lambda: MONOTONIC in self._fixed)
+            self._replace(time, f"{name}_ns", now, partial(self._gives, MONOTONIC))
+            self._replace(time, name, lambda: now() / 1e9, partial(self._gives, MONOTONIC))
 
     def _fix_random(self) -> None:
         seed = random.Random.seed
@@ -181,14 +193,14 @@ class Interventions:
 
         default = 0 if RANDOM in self._fixed else None
         random.Random.seed = fixed  # type: ignore[method-assign]
-        random.seed = functools.partial(fixed, random._inst)
+        random.seed = partial(fixed, random._inst)
         random.seed()
 
     def _fix_numpy(self) -> None:
         real = BIT_GENERATOR.randbits
 
         def fixed(bits: int) -> int:
-            if NUMPY not in self._fixed:
+            if not self._gives(NUMPY):
                 return int(real(bits))
             return int.from_bytes(self._bytes(NUMPY, (bits + 7) // 8)) >> -bits % 8
 
@@ -198,12 +210,11 @@ class Interventions:
     def _fix_identifiers(self) -> None:
         for name in ("uuid1", "uuid4"):
             real = getattr(uuid, name)
-            fixed = functools.partial(self._identifier, real)
+            fixed = partial(self._identifier, real)
             setattr(uuid, name, fixed)
 
     def _identifier(self, real: Callable[..., uuid.UUID], *args: Any, **kwargs: Any) -> uuid.UUID:
-        fixed = UUID in self._fixed
-        return uuid.UUID(bytes=self._bytes(UUID, 16), version=4) if fixed else real(*args, **kwargs)
+        return uuid.UUID(bytes=self._bytes(UUID, 16), version=4) if self._gives(UUID) else real(*args, **kwargs)
 
     def _fix_entropy(self) -> None:
         urandom, getrandom = os.urandom, os.getrandom
@@ -211,7 +222,7 @@ class Interventions:
         def fixed(size: int) -> bytes:
             frame = sys._getframe(1)  # identifiers and numpy's generators are sources by themselves
             apart = frame.f_globals.get("__name__") == "uuid" or isinstance(frame.f_locals.get("self"), ForNumpy)
-            return urandom(size) if apart or ENTROPY not in self._fixed else self._bytes(ENTROPY, size)
+            return urandom(size) if apart or not self._gives(ENTROPY) else self._bytes(ENTROPY, size)
 
         os.urandom = fixed
         os.getrandom = lambda size, flags=0: fixed(size) if ENTROPY in self._fixed else getrandom(size, flags)
@@ -225,27 +236,42 @@ class Interventions:
 
     def _fix_identities(self) -> None:
         def numbered(thing: object) -> int:
-            if IDENTITY not in self._fixed or self._places.of(sys._getframe(1).f_code) != "own":
+            if self._places.owner(sys._getframe(1)) != "own":
                 return _ADDRESS_OF(thing)
-            return 4096 + 16 * self._number(IDENTITY, thing)
+            return self._number(IDENTITY, thing)
 
         builtins.id = numbered
 
     def _number(self, source: str, thing: object) -> int:
-        """Returns the number of an object, in the order of the calls; it is kept, so no other takes its address."""
-        numbered = self._numbered[source]
-        return numbered.setdefault(_ADDRESS_OF(thing), (len(numbered), thing))[0]
+        """Returns an address for an object: where `source` is fixed by the order of the calls, else the real one. It is
+        counted either way, so that nothing but the number differs between the two."""
+        address, numbered = _ADDRESS_OF(thing), self._numbered[source]
+        if address not in numbered:
+            self._count[source] += 1
+            try:
+                kept: object = weakref.ref(thing, lambda _: numbered.pop(address, None))
+            except TypeError:
+                kept = thing  # or another object would take its address
+            numbered[address] = (4096 + 16 * self._count[source], kept)
+        return numbered[address][0] if self._gives(source) else address
 
-    def number_hashes(self) -> None:
-        """Has objects of own classes hash by a number, where addresses are fixed: sets of them have one order."""
-        if ADDRESSES not in self._fixed:
+    def number_objects(self) -> None:
+        """Has objects of own classes hash and describe themselves by their number, where anything is fixed."""
+        if not self._fixed:
             return
         for module in self._places.modules():
             classes: list[Any] = [each for each in vars(module).values() if isinstance(each, type)]
             for cls in classes:
-                by_address = cls.__hash__ is object.__hash__ and cls.__eq__ is object.__eq__
-                if by_address and cls.__module__ == module.__name__:
-                    cls.__hash__ = lambda thing: self._number(ADDRESSES, thing)
+                if cls.__module__ != module.__name__:
+                    continue
+                if cls.__hash__ is object.__hash__ and cls.__eq__ is object.__eq__:
+                    cls.__hash__ = lambda thing: self._number(ADDRESSES, thing) >> 4
+                if cls.__repr__ is object.__repr__:
+                    cls.__repr__ = lambda thing: self._described(thing)
+
+    def _described(self, thing: object) -> str:
+        kind = type(thing)
+        return f"<{kind.__module__}.{kind.__qualname__} object at {self._number(ADDRESSES, thing):#x}>"
 
     def _take_turns(self) -> None:
         """Has one thread run at a time: on one core, pools have one, and others are waited for where they start."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 from dataflow.causes.rerun import Rerun, Setting
 from dataflow.causes.sources import (
-    ADDRESSES,
     CHANCE,
     COMPILED,
     FILE,
@@ -96,10 +95,11 @@ class Ladder:
             return Rerun((f"failed: {failure}",))
 
     def _find_freed(self, found: Findings) -> None:
-        seen = {source for source, _, _ in found.first.sites} | ({THREADS} if found.first.threads else set())
         fixed = frozenset(CHANCE).difference(self._left_out)
         base = self._fire(Setting(fixed))
-        unseen = [s for s in (HEAP, ADDRESSES, COMPILED) if s in fixed and s not in seen]
+        seen = {source for source, _, _ in found.first.sites} | ({THREADS} if found.first.threads else set())
+        seen |= base.given  # also to compiled code, past the log: `sorted(things, key=id)`
+        unseen = [s for s in (HEAP, COMPILED) if s in fixed and s not in seen]
         trapped = [s for s in CHANCE if s in fixed & seen]
 
         def effect(group: Sequence[str]) -> Rerun | None:
@@ -139,7 +139,7 @@ class Ladder:
         left = [_Group(group) for group in groups if group]
         while left and not found.hopeless:
             room = self._most - self._fired
-            if len(left) > room > 0:  # several at once, where there is not room for each
+            if len(left) > room > 0 and not any(group.rest for group in left[room - 1 :]):  # several at once
                 left[room - 1 :] = [_Group([source for group in left[room - 1 :] for source in group.sources])]
             sources, known = left[0].sources, left[0].known(found.cleared)
             try:

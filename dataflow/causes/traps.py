@@ -153,7 +153,7 @@ class Traps:
             self._note(source, call, frame.f_back)
 
     def _note_built_in(self, source: str, name: str, frame: FrameType, arg: Any) -> None:
-        direct = self._places.of(frame.f_code) == "own"
+        direct = self._places.owner(frame) == "own"
         if source is RANDOM:
             if name == "Random.seed":
                 if frame.f_locals.get("a", 0) is not None:

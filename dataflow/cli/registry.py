@@ -170,7 +170,13 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow new operator NearestObstacle
           dataflow new graph obstacle_watch
         """,
-        (Command("new:operator"), Command("new:graph"), Command("new:project"), Command("new:service")),
+        (
+            Command("new:operator"),
+            Command("new:graph"),
+            Command("new:project"),
+            Command("new:service"),
+            Command("new:agent"),
+        ),
     ),
     Family(
         "keys",

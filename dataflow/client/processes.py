@@ -40,7 +40,8 @@ class ProcessStatus:
     `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
     (input, "timeout" or "late"). `behind`: per source the seconds by which its last message was behind the clock when
     it was read, and when it was sent. `firings`: batches of firing records, where they were asked for. `found`: what
-    operators found wrong with what they were given. `after`: firings behind a cursor (`RecentFirings.after`).
+    operators found wrong with what they were given. `silences`: the seconds since operators last fired. `after`:
+    firings behind a cursor (`RecentFirings.after`).
     """
 
     process: str
@@ -51,6 +52,7 @@ class ProcessStatus:
     behind: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     firings: Sequence[bytes] = ()
     found: Mapping[str, str] = field(default_factory=dict)
+    silences: Mapping[str, float] = field(default_factory=dict)
     after: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -182,6 +184,7 @@ def _status(answer: bytes) -> ProcessStatus:
         {name: (read, sent) for name, (read, sent) in said["behind"].items()},
         said.get("firings", ()),
         said["found"],
+        said.get("silences", {}),
         said.get("after", {}),
     )
 

@@ -7,6 +7,7 @@ from dataflow.environments.environment import (
     imported_packages,
     installed,
     is_environment,
+    packages_in,
     require_environment,
 )
 
@@ -17,5 +18,6 @@ __all__ = [
     "imported_packages",
     "installed",
     "is_environment",
+    "packages_in",
     "require_environment",
 ]

@@ -127,6 +127,14 @@ def is_environment(env: str) -> bool:
     return str(_folder(env)) == os.environ.get(_MARK, "").partition(os.pathsep)[0]
 
 
+def packages_in(environment: Environment) -> dict[str, str]:
+    """Returns the versions of all packages in an environment, by name."""
+    from importlib.metadata import distributions
+
+    found = [(each.metadata["Name"], each.version) for each in distributions(path=list(environment.path))]
+    return dict(sorted(found, reverse=True))
+
+
 def imported_packages() -> dict[str, str]:
     """Returns the versions of the environment's packages of which this process has imported something, by name; none
     in a process that is in no environment."""

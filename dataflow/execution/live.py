@@ -19,6 +19,7 @@ from dataflow.execution.calls import Calls
 from dataflow.execution.earlier import EarlierCounts
 from dataflow.execution.event_time import EventTime
 from dataflow.execution.failure import RAISED, OperatorFailure
+from dataflow.execution.interrupted import interrupted_after
 from dataflow.execution.log import FiringLog, unlisted
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
@@ -37,6 +38,8 @@ MOST_TRIED = 256
 ticks one by one, while new ones come due: its process would never look at anything else."""
 
 KEPT_STATE = "kept"
+SET_UP_WITHIN = 30.0
+"""Seconds for which an operator of new code may be set up: meanwhile its process does nothing else."""
 
 
 class LiveRunner(OperatorRunner):
@@ -311,9 +314,10 @@ class LiveRunner(OperatorRunner):
                 calls.parameter(name, value, (incarnation, NEVER))
             started = time.time_ns()
             try:
-                calls.setup()
-                if state is not None:
-                    calls.restore(state, (incarnation, stamp))
+                with interrupted_after(SET_UP_WITHIN):
+                    calls.setup()
+                    if state is not None:
+                        calls.restore(state, (incarnation, stamp))
                 return started, calls, kept
             except OperatorFailure as failure:
                 close_quietly(calls.operator)

@@ -171,6 +171,7 @@ class Requests:
                 "counts": self._progress.counted,
                 "waits": self._progress.waited,
                 "behind": self._progress.behind,
+                "silences": self._progress.silences(),
                 "found": {name: text for name, text in self._progress.found.items() if text},
                 "restarts": self._restarts(),
                 "ended": [maker.node.name for maker in self._driver.all if maker.ended],

@@ -35,6 +35,7 @@ interventions = Interventions(Places([{module!r}]), 1_700_000_000_000_000_000)
 interventions.fix({fixed!r})
 interventions.vary({varied!r})
 import {module}
+interventions.number_objects()
 print({module}.read())
 """
 
@@ -65,6 +66,7 @@ def logged() -> set[tuple[str, str]]:
         (sources.WALL, '"bound time": now(),'),
         (sources.WALL, '"datetime": datetime.now(),'),
         (sources.WALL, '"date": date.today(),'),
+        (sources.WALL, '"factory": Stamped().made,'),
         (sources.MONOTONIC, '"monotonic": time.monotonic_ns(),'),
         (sources.RANDOM, '"python": random.Random().random(),'),
         (sources.RANDOM, "AT_LOAD = drawn()"),
@@ -121,6 +123,15 @@ def test_a_source_that_is_left_free_is_free_alone(free: str, changes: set[str]) 
     one, other = (eval(ran(p), NAMES) for p in programs)
 
     assert {key for key in one if one[key] != other[key]} == changes
+
+
+def test_what_was_given_is_known_also_where_compiled_code_asked() -> None:
+    program = FIX.format(module="given", fixed=set(CHANCE), varied=set()) + "print(interventions.given)"
+
+    sorted_by_id, given = ran(program).splitlines()
+
+    assert eval(given) == {sources.IDENTITY, sources.ADDRESSES, sources.WALL}
+    assert eval(sorted_by_id) == sorted(eval(sorted_by_id))
 
 
 def test_what_is_varied_differs() -> None:

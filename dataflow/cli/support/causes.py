@@ -72,7 +72,8 @@ def _outcome(found: Why) -> str:
         return f"it repeats here, and {as_recorded(code_known=found.code_known)} ({OUTSIDE})"
     if found.settled is False:
         return "it does not repeat even with all known sources of chance fixed (a device, a service, a thread?)"
-    return "with all known sources of chance fixed it repeats, and with each of them free, too"
+    freed = "those that were tried" if found.open else "each of them"
+    return f"with all known sources of chance fixed it repeats, and with {freed} free, too"
 
 
 def _list(sources: Sequence[str]) -> str:
