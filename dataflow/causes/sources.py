@@ -62,6 +62,8 @@ SOURCES = {
 
 CHANCE = (WALL, MONOTONIC, RANDOM, NUMPY, UUID, ENTROPY, IDENTITY, PROCESS, THREADS, HEAP, ADDRESSES, COMPILED)
 """Sources that may differ between two runs of the same code on the same machine."""
+MOVED = (WALL, MONOTONIC, RANDOM, NUMPY, ENTROPY, IDENTITY, ADDRESSES)
+"""Of these, sources that may give results by which two runs agree: what they give can be changed so that it shows."""
 
 
 def kind_of(source: str) -> str:

@@ -165,8 +165,10 @@ class Traps:
                 return  # noted as numpy's, or as an identifier
         elif source in (IDENTITY, HEAP) and not direct:
             return
-        if self._places.passes(frame) and source in (WALL, MONOTONIC, PROCESS):
+        if self._places.passes(frame) and source in (MONOTONIC, PROCESS):
             return  # waits of the standard library
+        if source is WALL and self._places.asked_by(frame) == "engine":
+            return
         module = "" if getattr(arg, "__module__", None) is None else f"{arg.__module__}."
         self._note(source, module.replace("posix", "os").replace("builtins.", "") + name, frame)
         if name in _ZONED:

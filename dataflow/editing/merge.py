@@ -81,14 +81,20 @@ def merge(
         spool.write(copy, origins)
         before = 0
         for origin, masks, prefix in zip(origins, kept, prefixes, strict=True):
-            topics = {c: prefix + origin.channels[c].topic for c in masks} if prefix else {}
+            topics = {c: prefixed(prefix, origin.channels[c].topic) for c in masks} if prefix else {}
             copy_messages(copy, origin, masks, _further(watch, before, total), topics)
             before += sum(int(mask.sum()) for mask in masks.values())
+            done.lose(origin.path, origin.lost, origin.reasons)
         copy.frames(prefixes[0] + origins[0].namespace, _framing(origins, kept))
     done.bytes = out.stat().st_size
     with Origin(out) as made:
         done.streams, done.span = {s: n for s, n in sorted(made.counts().items()) if n}, made.span()
     return done
+
+
+def prefixed(prefix: str, name: str) -> str:
+    """A stream's name behind a prefix; ROS's absolute names stay absolute: `/imu` behind `rear/` is `/rear/imu`."""
+    return f"/{prefix.strip('/')}{name}" if prefix.endswith("/") and name.startswith("/") else prefix + name
 
 
 def are_of_one_run(origins: Sequence[Origin]) -> bool:
@@ -193,9 +199,9 @@ def _refuse_clashes(origins: Sequence[Origin], prefixes: Sequence[str]) -> None:
     files: tuple[Origin, Origin] | None = None
     for origin, prefix in zip(origins, prefixes, strict=True):
         for name in origin.counts():
-            other = known.setdefault(prefix + name, origin)
+            other = known.setdefault(prefixed(prefix, name), origin)
             if other is not origin:
-                clashing.append(prefix + name)
+                clashing.append(prefixed(prefix, name))
                 files = files or (other, origin)
     if files is not None:
         more = f" and {len(clashing) - 4} more" if len(clashing) > 4 else ""

@@ -136,6 +136,7 @@ def write_part(
                 origin, part, out, firings=read, compression=compression, overwrite=overwrite, watch=watch
             )
     done = Edited(str(out))
+    origin.lost.clear()
     part = decodable([origin], part, done)
     chosen = _chosen(origin, part, firings, done)
     needed = {} if chosen is None else chosen.needed
@@ -153,6 +154,9 @@ def write_part(
         if origin.own:
             copy.frames(origin.namespace, framing(origin.path, kept_stamps(origin, kept)))
     done.bytes = out.stat().st_size
+    for stream, number in origin.lost.items():
+        done.streams[stream] -= number
+    done.lose(origin.path, origin.lost, origin.reasons)
     if origin.file.torn:
         done.notes.append(f"{origin.path} {NO_END}")
     done.notes += [f"{origin.path}: {note}" for note in origin.file.damage]

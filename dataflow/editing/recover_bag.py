@@ -12,31 +12,41 @@ from dataflow.editing.report import Edited
 from dataflow.interop.salvage import salvage
 from dataflow.interop.typestores import RosType
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.streams.codecs import SchemaText
 
+_COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 
-def recover_bag(path: Path, out: Path) -> Recovered:
+
+def recover_bag(path: Path, out: Path, *, compression: Compression = "zstd") -> Recovered:
     """Saves a broken SQLite or ROS 1 bag. Raises `RecordingError` for what is neither, or holds no whole message."""
     found = salvage(path)
-    if not found.messages:
+    topics = dict(found.topics())
+    held = [topic for topic in topics.values() if topic.count]
+    if not held:
         raise RecordingError(f"{path}: no whole message is left in it")
+    counts: Counter[int] = Counter()
     with out.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer = Writer(file, compression=_COMPRESSIONS[compression])
         writer.start(profile="ros1" if found.encoding == "ros1" else "ros2", library="dataflow recover")
         channels = {}
-        for topic, schema in found.schemas.items():
-            text = _defined(schema, found.encoding)
-            number = writer.register_schema(text.name, text.encoding, text.data) if text.name else 0
-            channels[topic] = writer.register_channel(topic, found.encoding, number)
-        counts: Counter[str] = Counter()
-        for topic, time, data in found.messages:
-            writer.add_message(channels[topic], time, data, time, counts[topic] % 2**32)
-            counts[topic] += 1
+        for number, topic in topics.items():
+            if topic.count:
+                text = _defined(topic.schema, found.encoding)
+                schema = writer.register_schema(text.name, text.encoding, text.data) if text.name else 0
+                channels[number] = writer.register_channel(topic.name, found.encoding, schema, dict(topic.channel))
+        for time, number, data in found.rows(list(channels)):
+            writer.add_message(channels[number], time, data, time, counts[number] % 2**32)
+            counts[number] += 1
         writer.finish()  # type: ignore[no-untyped-call]
-    times = [message.log_time for message in found.messages]
-    saved = Edited(str(out), dict(sorted(counts.items())), out.stat().st_size, (min(times), max(times)))
+    found.close()
+    span = min(t.first for t in held if t.first is not None), max(t.last for t in held if t.last is not None)
+    saved: Counter[str] = Counter()
+    for number, count in counts.items():
+        saved[topics[number].name] += count
     lost = [Loss("", found.lost, None)] if found.lost else []
-    return Recovered(saved, True, 0, found.notes, lost)
+    edited = Edited(str(out), dict(sorted(saved.items())), out.stat().st_size, span)
+    return Recovered(edited, True, 0, found.notes, lost)
 
 
 def _defined(schema: SchemaText, encoding: str) -> SchemaText:

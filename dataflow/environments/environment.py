@@ -122,11 +122,6 @@ def require_environment(operator: str, env: str | None) -> None:
         )
 
 
-def is_environment(env: str) -> bool:
-    """Returns whether this process is in the environment that `env:` names."""
-    return str(_folder(env)) == os.environ.get(_MARK, "").partition(os.pathsep)[0]
-
-
 def packages_in(environment: Environment) -> dict[str, str]:
     """Returns the versions of all packages in an environment, by name."""
     from importlib.metadata import distributions
@@ -135,15 +130,22 @@ def packages_in(environment: Environment) -> dict[str, str]:
     return dict(sorted(found, reverse=True))
 
 
+def is_environment(env: str) -> bool:
+    """Returns whether this process is in the environment that `env:` names."""
+    return str(_folder(env)) == os.environ.get(_MARK, "").partition(os.pathsep)[0]
+
+
 def imported_packages() -> dict[str, str]:
     """Returns the versions of the environment's packages of which this process has imported something, by name; none
     in a process that is in no environment."""
     from importlib.metadata import distributions
 
     _, *path = os.environ.get(_MARK, "").split(os.pathsep)
+    if not path:
+        return {}
     loaded = {name.partition(".")[0] for name in sys.modules}
     found: dict[str, str] = {}
-    for each in distributions(path=path) if path else ():
+    for each in distributions(path=path):
         if each.metadata["Name"] not in found and loaded & _modules(each):
             found[each.metadata["Name"]] = each.version
     return dict(sorted(found.items()))

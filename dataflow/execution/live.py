@@ -62,7 +62,7 @@ class LiveRunner(OperatorRunner):
         operator: Operator | None = None,
         snapshots: StateSpacing | None = None,
         clock: Clock | None = None,
-        event_clock: EventClock = time.time_ns,
+        event_clock: EventClock | None = None,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
         faults: Faults | None = None,
     ) -> None:
@@ -77,7 +77,7 @@ class LiveRunner(OperatorRunner):
         self._log = DropLog()  # of what did not reach an aligner
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
         clock = clock or time.monotonic
-        self._time = EventTime(event_clock)
+        self._time = EventTime(event_clock or time.time_ns)
         self.patience = Patience(node.live.wait, clock, self._time.until)
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
@@ -339,7 +339,7 @@ class LiveRunner(OperatorRunner):
         name = self._input_of(stream)
         self.queue.clear()
         drops, more = self.take_drops()
-        self._begin_alignment(stream)
+        self._begin_alignment()
         self._jumped[_producer(stream)] = entry.incarnation
         self._seen = {other: (incarnation, NEVER) for other, (incarnation, _) in self._seen.items()}
         self._time.begin_at(entry.stamp)
@@ -355,16 +355,15 @@ class LiveRunner(OperatorRunner):
             raise failure from error
         self.records.add("reset", NEVER + 1, started, drops=tuple(drops), detail=detail)
 
-    def _begin_alignment(self, jumped: str) -> None:
+    def _begin_alignment(self) -> None:
         old = self.aligner
         self._earlier.take(old, self.spec)
         self.aligner = make_aligner(old.spec)
         self._told = True
         for static in self._statics.values():
             self.aligner.push(static.stream, static)
-        for stream, end in old.ends.items():
-            if stream != jumped and stream not in self._static:
-                self.aligner.end(stream, None, end.reason)
+        for stream, end in old.ends.items():  # of one that begins again, its message opens it
+            self.aligner.end(stream, None, end.reason)
 
     def _begin_incarnation(self, *, stamps_go_back: bool = False) -> None:
         incarnation = self.records.incarnation + 1

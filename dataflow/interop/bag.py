@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.notices import notice
 from dataflow.recording.streams.codecs import SchemaText
 
 
@@ -46,6 +47,34 @@ class Stored(NamedTuple):
     data: bytes | memoryview
 
 
+@dataclass(slots=True)
+class Lost:
+    """Messages that damage keeps from being read.
+
+    - `topics`: by topic, how many, as far as they have been read; `reasons`: by topic, the first reason.
+    - `parts`: damage of which it is not known how many messages it took, for people.
+    """
+
+    topics: dict[str, int] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+    parts: list[str] = field(default_factory=list)
+
+    def take(self, topic: str, number: int, reason: str) -> None:
+        """Notes how many messages of a topic are lost; of several passes over a bag the one that found most counts."""
+        self.reasons.setdefault(topic, reason)
+        self.topics[topic] = max(self.topics.get(topic, 0), number)
+
+    def join(self, other: Lost) -> None:
+        """Takes in what was found when the same bag was opened another time."""
+        for topic, number in other.topics.items():
+            self.take(topic, number, other.reasons[topic])
+        self.parts[:] = dict.fromkeys([*self.parts, *other.parts])
+
+    def announce(self, path: Path) -> None:
+        """Announces the damage of a bag that is closed (`notices`)."""
+        notice(path, [*dict.fromkeys(self.reasons.values()), *self.parts])
+
+
 class Bag(Protocol):
     """A bag opened for reading. Not thread-safe."""
 
@@ -56,6 +85,8 @@ class Bag(Protocol):
     """Damage and oddities of the file, for people."""
     promised: Mapping[str, int]
     """Messages by topic according to the file's metadata, statistics or index; empty where none of them counts."""
+    lost: Lost
+    """What is there and cannot be read; complete when all messages have been read."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -69,8 +100,16 @@ class Bag(Protocol):
 
 
 def shortfalls(bag: Bag) -> list[str]:
-    """Says of which topics a bag holds fewer messages than its metadata promise."""
-    return [_promise(*counts) for counts in _counts(bag) if counts[2] < counts[1]]
+    """Says of which topics a bag holds fewer messages than its metadata promise, and which of those cannot be read."""
+    lost = bag.lost
+    return [
+        *(_promise(*counts) for counts in _counts(bag) if counts[2] < counts[1]),
+        *(
+            f"topic {name}: {number:,} message{'' if number == 1 else 's'} lost to damage: {lost.reasons[name]}"
+            for name, number in sorted(lost.topics.items())
+        ),
+        *lost.parts,
+    ]
 
 
 def surpluses(bag: Bag) -> list[str]:

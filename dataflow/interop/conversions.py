@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from dataflow.messages import (
     CompressedDepth,
@@ -36,14 +37,21 @@ def image_of(message: CompressedImage) -> Image:
 def depth_of(message: CompressedDepth) -> DepthImage:
     """Decodes a 16-bit PNG; 0 stays no return."""
     units = decoded(message.data, "png")
+    if message.quantizer == "inverse":
+        metres = inverse_depth(units, message.scale, message.offset)
+    else:
+        known, metres = units > 0, np.zeros(units.shape, np.float32)
+        metres[known] = units[known] * message.scale + message.offset
+    return DepthImage(stamp=message.stamp, frame=message.frame, data=metres)
+
+
+def inverse_depth(units: Any, scale: float, offset: float) -> npt.NDArray[np.float32]:
+    """Metres of inverse depth in whole steps: scale / (units - offset), 0 where there is no return."""
     known = units > 0
     metres = np.zeros(units.shape, np.float32)
-    if message.quantizer == "linear":
-        metres[known] = units[known] * message.scale + message.offset
-    else:
-        away = units[known] - message.offset
-        metres[known] = np.where(away > 0, message.scale / np.where(away > 0, away, 1), 0)
-    return DepthImage(stamp=message.stamp, frame=message.frame, data=metres)
+    away = units[known] - offset
+    metres[known] = np.where(away > 0, scale / np.where(away > 0, away, 1), 0)
+    return metres
 
 
 def image16_of(message: CompressedImage) -> Image16:
@@ -125,7 +133,11 @@ def decoded(data: Any, format_: str) -> Any:
 
     pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if pixels is None:
-        raise RecordingError(f"a {format_} image of {len(data)} bytes cannot be decoded")
+        begin = bytes(data[:4]).hex(" ")
+        raise RecordingError(
+            f"a {format_} image of {len(data)} bytes that begins with {begin} cannot be decoded; JPEG, PNG, WebP, TIFF "
+            "and BMP can, if they are whole"
+        )
     return pixels
 
 

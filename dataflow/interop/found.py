@@ -44,6 +44,11 @@ class Found:
         header = column(self.headers) if self.stamped else None
         return Times(topic.name, column(self.logs), header, topic.latched, shares)
 
+    def digests_of(self, *, distinct: bool) -> npt.NDArray[np.uint64]:
+        """What tells entries of one stamp apart: their content if that is `distinct`, else nothing joins them."""
+        count = len(self.digests)
+        return np.frombuffer(self.digests, np.uint64) if distinct and count else np.arange(count, dtype=np.uint64)
+
 
 def column(values: array[int]) -> I64:
     """The numbers of an array, without a copy."""

@@ -1,4 +1,4 @@
-"""Saves the messages of broken ROS bags, by reading records wherever they lie and believing no index.
+"""Broken bags, read record by record wherever they lie, believing no index.
 
 SQLite: leaf pages of tables hold rows (SQLite file format 1.6), whose large values go on in overflow pages. ROS 1:
 records follow each other, in chunks or not (ROS bag format 2.0).
@@ -8,88 +8,159 @@ from __future__ import annotations
 
 import bz2
 import mmap
+import re
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from array import array
+from collections import OrderedDict
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
+
+from dataflow.interop.bag import Topic, is_latched
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.codecs import SchemaText
 
 LEAF = 0x0D
 """First byte of a page that holds rows of a table."""
 SQLITE_HEADER = 100
+SQLITE_START = b"SQLite format 3\x00"
 ROS1_START = b"#ROSBAG V2.0\n"
 MAX_PAYLOAD = 1 << 30
+KEPT_CHUNKS = 8
+NO_SCHEMA = SchemaText("", "", b"")
+
+Row = tuple[int, int, bytes]
+"""(log time, number of the topic, message)"""
 
 
-class Saved(NamedTuple):
-    """One message that was found whole."""
+class Wreck:
+    """The messages that are left of a broken file: their places, and what one holds when it is asked for.
 
-    topic: str
-    log_time: int
-    data: bytes
+    `encoding`: of messages; `lost`: how many lack a part, as far as that shows; `notes`: for people.
+    """
+
+    encoding = ""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.lost = path, 0
+        self.notes: list[str] = []
+        self._about: dict[int, tuple[str, SchemaText, str, bool]] = {}
+        """By number of a topic: name, schema, QoS profiles, whether it is latched."""
+        self._columns = [array("q") for _ in range(5)]
+        with path.open("rb") as file:
+            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+    def _add(self, time: int, topic: int, *place: int) -> None:
+        """Takes a message of the log."""
+        for column, value in zip(self._columns, (time, topic, *place), strict=True):
+            column.append(value)
+
+    def _settle(self, *, by_number: bool = False) -> None:
+        """Puts the messages in the order of their times; equal ones in that of the file, or of their last number."""
+        columns = np.array(self._columns, np.int64).reshape(5, -1)
+        ties = columns[4] if by_number else np.arange(columns.shape[1])
+        self._rows = columns[:, np.lexsort((ties, columns[0]))]
+
+    def topics(self) -> Iterator[tuple[int, Topic]]:
+        """The topics by number: those that are declared, and those that hold a message."""
+        times, owners = self._rows[0], self._rows[1]
+        for number in sorted({*self._about, *np.unique(owners).tolist()}):
+            found = times[owners == number]
+            unnamed = (f"/topic_{number}", NO_SCHEMA, "", False)
+            name, schema, profiles, latched = self._about.get(number, unnamed)
+            first, last = (int(found[0]), int(found[-1])) if len(found) else (None, None)
+            latched = latched or is_latched(name, profiles)
+            channel = {"offered_qos_profiles": profiles} if profiles else {}
+            yield number, Topic(name, self.encoding, schema, len(found), first, last, None, latched, channel)
+
+    def losses(self) -> list[str]:
+        """Notes, and how many messages are known to be missing, for people."""
+        return [*self.notes, *([f"messages that are missing: {self.lost:,}"] if self.lost else [])]
+
+    def counts(self) -> dict[int, int]:
+        """Messages by number of their topic."""
+        numbers, held = np.unique(self._rows[1], return_counts=True)
+        return dict(zip(numbers.tolist(), held.tolist(), strict=True))
+
+    def rows(self, topics: Collection[int], time: int | None = None, skip: int = 0) -> Iterator[Row]:
+        """The messages of some topics by log time: those from `time` on, without the first `skip` of that time."""
+        chosen = np.flatnonzero(np.isin(self._rows[1], list(topics)))
+        if time is not None:
+            chosen = chosen[int(np.searchsorted(self._rows[0][chosen], time)) + skip :]
+        for at in chosen.tolist():
+            stamp, topic, *place = self._rows[:, at].tolist()
+            yield stamp, topic, self._read(*place)
+
+    def _read(self, *place: int) -> bytes:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Closes the file. Idempotent."""
+        self._data.close()
 
 
-@dataclass(slots=True)
-class Salvage:
-    """The content that is left of a broken bag. `lost`: messages of which a part is missing; `notes`: for people."""
-
-    encoding: str
-    schemas: dict[str, SchemaText] = field(default_factory=dict)
-    messages: list[Saved] = field(default_factory=list)
-    lost: int = 0
-    notes: list[str] = field(default_factory=list)
-
-
-def salvage(path: Path) -> Salvage:
-    """Reads a broken SQLite bag or ROS 1 bag. Raises `RecordingError` for any other file."""
+def salvage(path: Path) -> Wreck:
+    """Opens a broken SQLite bag or ROS 1 bag. Raises `RecordingError` for any other file."""
     with path.open("rb") as file:
         head = file.read(SQLITE_HEADER)
-    if head.startswith(b"SQLite format 3\x00"):
-        return _Database(path, head).salvage()
+    if head.startswith(SQLITE_START):
+        return DatabaseWreck(path)
     if head.startswith(ROS1_START):
-        return _ros1(path)
+        return Ros1Wreck(path)
     raise RecordingError(f"{path} is neither a SQLite database nor a ROS 1 bag of version 2.0")
 
 
-class _Database:
-    """Pages of a database, the last ones missing or damaged."""
+class DatabaseWreck(Wreck):
+    """Pages of a database, the last ones missing or some damaged. Raises `RecordingError` without a sound header."""
 
-    def __init__(self, path: Path, head: bytes) -> None:
-        self._path = path
+    encoding = "cdr"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        head = self._data[:SQLITE_HEADER]
         size = int.from_bytes(head[16:18], "big")
         self._size = 65536 if size == 1 else size
         self._usable = self._size - (head[20] if len(head) > 20 else 0)
         if self._size < 512 or self._size & (self._size - 1):
+            self.close()
             raise RecordingError(f"{path}: the size of its pages is {self._size}: its header is damaged")
+        stated = int.from_bytes(head[28:32], "big")
+        if stated * self._size > len(self._data):
+            self.notes.append(f"it has {len(self._data) // self._size:,} of its {stated:,} pages")
+        self._find()
+        self._settle(by_number=True)
 
-    def salvage(self) -> Salvage:
-        found = Salvage("cdr")
-        names: dict[int, tuple[str, str]] = {}
+    def _find(self) -> None:
         texts: dict[str, SchemaText] = {}
-        rows: dict[int, tuple[int, int, bytes]] = {}
-        with self._path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            for identity, values in self._rows(data, found):
-                match values:
-                    case [None, int(topic), int(time), bytes(content)]:
-                        rows.setdefault(identity, (topic, time, content))
-                    case [None, str(name), str(kind), "cdr", *_]:
-                        names.setdefault(identity, (name, kind))
-                    case [None, str(kind), "ros2msg" | "ros2idl" as encoding, str(text), *_]:
-                        texts.setdefault(kind, SchemaText(kind, encoding, text.encode()))
-        for topic, time, content in sorted(rows.values(), key=lambda row: row[1]):
-            name, kind = names.get(topic, (f"/topic_{topic}", ""))
-            found.schemas.setdefault(name, texts.get(kind, SchemaText(kind, "", b"")))
-            found.messages.append(Saved(name, time, content))
-        unnamed = {topic for topic, _, _ in rows.values()} - names.keys()
+        numbers: set[int] = set()
+        for identity, values, start, place in self._found():
+            match values:
+                case [None, int(topic), int(time), bytes()] if identity not in numbers:
+                    numbers.add(identity)
+                    self._add(time, topic, start, place, identity)
+                case [None, str(name), str(kind), "cdr", *rest]:
+                    profiles = next((text for text in rest if isinstance(text, str)), "")
+                    self._about.setdefault(identity, (name, SchemaText(kind, "", b""), profiles, False))
+                case [None, str(kind), "ros2msg" | "ros2idl" as encoding, str(text), *_]:
+                    texts.setdefault(kind, SchemaText(kind, encoding, text.encode()))
+        for number, (name, schema, profiles, latched) in self._about.items():
+            self._about[number] = (name, texts.get(schema.name, schema), profiles, latched)
+        if numbers:  # rosbag2 numbers its messages one by one and deletes none
+            self.lost = max(self.lost, max(numbers) - min(numbers) + 1 - len(numbers))
+        unnamed = set(self._columns[1]) - self._about.keys()
         if unnamed:
-            found.notes.append(f"the names of {len(unnamed)} topics are lost: they are called by their numbers")
-        return found
+            self.notes.append(f"the names of {len(unnamed)} topics are lost: they are called by their numbers")
 
-    def _rows(self, data: mmap.mmap, found: Salvage) -> Iterator[tuple[int, list[Any]]]:
-        """(rowid, values) of every row that is whole."""
+    def _read(self, *place: int) -> bytes:
+        content = self._row(place[0], place[1])[1][3]
+        assert isinstance(content, bytes)
+        return content
+
+    def _found(self) -> Iterator[tuple[int, list[Any], int, int]]:
+        """(rowid, values, start of the page, place in it) of every row that is whole."""
+        data = self._data
         for start in range(0, len(data) - self._size + 1, self._size):
             head = start + (SQLITE_HEADER if start == 0 else 0)
             if data[head] != LEAF:
@@ -99,13 +170,15 @@ class _Database:
                 continue
             for place in struct.unpack_from(f">{cells}H", data, head + 8):
                 try:
-                    yield self._row(data, start, place)
+                    yield (*self._row(start, place), start, place)
                 except _Missing:
-                    found.lost += 1
+                    self.lost += 1
                 except (ValueError, IndexError, struct.error):
                     continue  # overflow pages and free pages may begin like one of rows
 
-    def _row(self, data: mmap.mmap, start: int, place: int) -> tuple[int, list[Any]]:
+    def _row(self, start: int, place: int) -> tuple[int, list[Any]]:
+        """(rowid, values) of the row that begins at `place` of the page at `start`."""
+        data = self._data
         length, at = _varint(data, start + place)
         identity, at = _varint(data, at)
         if not 0 < length <= MAX_PAYLOAD:
@@ -121,21 +194,21 @@ class _Database:
             raise ValueError(place)
         parts = [data[at : at + local]]
         if local < length:
-            self._follow(data, int.from_bytes(data[at + local : at + local + 4], "big"), length - local, parts)
+            self._follow(int.from_bytes(data[at + local : at + local + 4], "big"), length - local, parts)
         return identity, _values(b"".join(parts))
 
-    def _follow(self, data: mmap.mmap, page: int, left: int, parts: list[bytes]) -> None:
+    def _follow(self, page: int, left: int, parts: list[bytes]) -> None:
         """Adds the rest of a row, which is in overflow pages."""
         if not 0 < page < 1 << 31:
             raise ValueError(page)
         while left > 0:
             start = (page - 1) * self._size
-            if page == 0 or start + self._size > len(data):
+            if page == 0 or start + self._size > len(self._data):
                 raise _Missing
             taken = min(left, self._usable - 4)
-            parts.append(data[start + 4 : start + 4 + taken])
+            parts.append(self._data[start + 4 : start + 4 + taken])
             left -= taken
-            page = int.from_bytes(data[start : start + 4], "big")
+            page = int.from_bytes(self._data[start : start + 4], "big")
 
 
 class _Missing(Exception):
@@ -194,55 +267,128 @@ def _values(record: bytes) -> list[Any]:
 
 # -------------------------------------------------------------------------------------------------------- ROS 1
 
-_BAG_HEADER, _CHUNK, _CONNECTION, _MESSAGE = 0x03, 0x05, 0x07, 0x02
+_CHUNK, _CONNECTION, _MESSAGE, _INDEX = b"\x05", b"\x07", b"\x02", b"\x04"
+_USEFUL = re.compile(rb"\x04\x00\x00\x00op=[\x02\x05\x07]")
+"""The field of a header that tells a chunk, a connection, or a message."""
+_MAX_HEADER = 1 << 16
+_FIELDS_BEFORE = 256
+"""Bytes of a header before that field, at most: where a record begins is looked for within them."""
+_IN_FILE = -1
+"""In place of a chunk: the message lies outside of chunks."""
 
 
-def _ros1(path: Path) -> Salvage:
-    found = Salvage("ros1")
-    topics: dict[int, str] = {}
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for fields, content, whole in _records(data, len(ROS1_START)):
-            if fields.get("op") == bytes([_CHUNK]):
-                inner = _unpacked(fields.get("compression", b"none"), content, found)
-                for one, body, complete in _records(inner, 0):
-                    _take(one, body, complete, topics, found)
+class Ros1Wreck(Wreck):
+    """Records of a ROS 1 bag; behind a broken one the next that is whole is looked for."""
+
+    encoding = "ros1"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._chunks: dict[int, tuple[bytes, int]] = {}
+        """By the place of its content: compression and size."""
+        self._kept: OrderedDict[int, bytes] = OrderedDict()
+        lately_broken = False
+        behind, skipped = len(ROS1_START), 0
+        for at, fields, begin, size, whole in _records(self._data, len(ROS1_START)):
+            op = fields["op"]
+            skipped, behind = skipped + at - behind, begin + size if whole else begin
+            if op == _CHUNK:
+                self._chunks[begin] = fields.get("compression", b"none"), size
+                lately_broken = not self._take_chunk(begin)
+            elif op == _INDEX:
+                self.lost += lately_broken * int.from_bytes(fields.get("count", b""), "little")
             else:
-                _take(fields, content, whole, topics, found)
-    found.messages.sort(key=lambda message: message.log_time)
-    return found
+                self._take(fields, self._data[begin : begin + size], whole, (_IN_FILE, begin, size))
+        if skipped := skipped + len(self._data) - behind:
+            self.notes.append(f"{skipped:,} of its {len(self._data):,} bytes are no whole records")
+        self._settle()
+
+    def _take_chunk(self, begin: int) -> bool:
+        """Takes the messages of a chunk; tells whether it could be unpacked."""
+        try:
+            inner = self._unpacked(begin)
+        except (OSError, RuntimeError, EOFError, ValueError) as error:
+            compression = self._chunks[begin][0].decode("latin-1")
+            self.notes.append(f"the {compression} chunk at byte {begin} cannot be unpacked: {error}")
+            return False
+        for _, fields, at, size, whole in _records(inner, 0):
+            self._take(fields, inner[at : at + size], whole, (begin, at, size))
+        return True
+
+    def _take(self, fields: dict[str, bytes], content: bytes, whole: bool, place: tuple[int, int, int]) -> None:
+        number = int.from_bytes(fields.get("conn", b""), "little")
+        if fields["op"] == _CONNECTION and whole and "topic" in fields:
+            about = dict(_fields(content))
+            kind = about.get("type", b"").decode("utf-8", "replace")
+            schema = SchemaText(kind, "ros1msg", about.get("message_definition", b""))
+            name = fields["topic"].decode("utf-8", "replace")
+            self._about.setdefault(number, (name, schema, "", about.get("latching") == b"1"))
+        elif fields["op"] == _MESSAGE:
+            time = fields.get("time", b"")
+            if not (whole and number in self._about and len(time) == 8):
+                self.lost += 1
+                return
+            seconds, nanoseconds = struct.unpack("<II", time)
+            self._add(seconds * 10**9 + nanoseconds, number, *place)
+
+    def _read(self, *place: int) -> bytes:
+        chunk, at, size = place
+        return bytes((self._data if chunk == _IN_FILE else self._unpacked(chunk))[at : at + size])
+
+    def _unpacked(self, begin: int) -> bytes:
+        """The records of a chunk, as far as it goes."""
+        if begin in self._kept:
+            self._kept.move_to_end(begin)
+            return self._kept[begin]
+        compression, size = self._chunks[begin]
+        content = self._data[begin : begin + size]
+        if compression == b"bz2":
+            content = bz2.BZ2Decompressor().decompress(content)
+        elif compression == b"lz4":
+            from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+
+            content = bytes(LZ4FrameDecompressor().decompress(content))
+        self._kept[begin] = content
+        while len(self._kept) > KEPT_CHUNKS:
+            self._kept.popitem(last=False)
+        return content
 
 
-def _take(fields: dict[str, bytes], content: bytes, whole: bool, topics: dict[int, str], found: Salvage) -> None:
-    op = fields.get("op")
-    if op == bytes([_CONNECTION]) and whole:
-        number, topic = int.from_bytes(fields["conn"], "little"), fields["topic"].decode()
-        about = dict(_fields(content))
-        topics[number] = topic
-        kind = about.get("type", b"").decode()
-        found.schemas.setdefault(topic, SchemaText(kind, "ros1msg", about.get("message_definition", b"")))
-    elif op == bytes([_MESSAGE]):
-        topic = topics.get(int.from_bytes(fields["conn"], "little"), "")
-        if not (whole and topic):
-            found.lost += 1
-            return
-        seconds, nanoseconds = struct.unpack("<II", fields["time"])
-        found.messages.append(Saved(topic, seconds * 10**9 + nanoseconds, content))
+def _records(data: Any, at: int) -> Iterator[tuple[int, dict[str, bytes], int, int, bool]]:
+    """(place, header fields, where the content begins, its size, whether it is whole) of records one after the other.
 
-
-def _records(data: Any, at: int) -> Iterator[tuple[dict[str, bytes], bytes, bool]]:
-    """(header fields, data, whether it is whole) of the records that follow each other."""
+    Behind one that is broken or reaches beyond the end, the search goes on within it.
+    """
     end = len(data)
-    while at + 4 <= end:
-        length = int.from_bytes(data[at : at + 4], "little")
-        begin = at + 4 + length
-        if begin + 4 > end:
-            return
-        fields = dict(_fields(data[at + 4 : begin]))
-        size = int.from_bytes(data[begin : begin + 4], "little")
-        if "op" not in fields or size > MAX_PAYLOAD:
-            return
-        yield fields, bytes(data[begin + 4 : begin + 4 + size]), begin + 4 + size <= end
-        at = begin + 4 + size
+    while at + 8 <= end:
+        fields, begin = _header(data, at)
+        size = int.from_bytes(data[begin : begin + 4], "little") if fields else 0
+        whole = bool(fields) and size <= MAX_PAYLOAD and begin + 4 + size <= end
+        packed = fields.get("compression", b"none") != b"none"
+        if whole or (fields and (fields["op"] == _MESSAGE or packed)):
+            yield at, fields, begin + 4, min(size, end - begin - 4), whole
+        at = begin + 4 + size if whole else _next_record(data, (begin if fields else at) + 1)
+
+
+def _header(data: Any, at: int) -> tuple[dict[str, bytes], int]:
+    """The fields of a record's header, none where there is no record, and the place behind it."""
+    length = int.from_bytes(data[at : at + 4], "little")
+    begin = at + 4 + length
+    if not 0 < length <= _MAX_HEADER or begin + 4 > len(data):
+        return {}, at
+    fields = dict(_fields(data[at + 4 : begin]))
+    whole = sum(len(name) + len(value) + 5 for name, value in fields.items()) == length
+    return (fields, begin) if whole and "op" in fields else ({}, at)
+
+
+def _next_record(data: Any, at: int) -> int:
+    """The place of the next record that is of use; that of the end where there is none."""
+    while (found := _USEFUL.search(data, at)) is not None:
+        for start in range(found.start() - 4, max(at, found.start() - _FIELDS_BEFORE) - 1, -1):
+            if _header(data, start)[0]:
+                return start
+        at = found.end()
+    return len(data)
 
 
 def _fields(header: bytes) -> Iterator[tuple[str, bytes]]:
@@ -253,18 +399,3 @@ def _fields(header: bytes) -> Iterator[tuple[str, bytes]]:
         if separator:
             yield name.decode("latin-1"), value
         at += 4 + length
-
-
-def _unpacked(compression: bytes, content: bytes, found: Salvage) -> bytes:
-    """The records of a chunk, as far as it goes."""
-    try:
-        if compression == b"bz2":
-            return bz2.BZ2Decompressor().decompress(content)
-        if compression == b"lz4":
-            from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-
-            return bytes(LZ4FrameDecompressor().decompress(content))
-    except (OSError, RuntimeError, EOFError) as error:
-        found.notes.append(f"a {compression.decode()} chunk cannot be unpacked: {error}")
-        return b""
-    return content

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.interop.account import Account, Unread
-from dataflow.interop.bag import Bag, BagError, Stored, shortfalls
+from dataflow.interop.bag import Bag, BagError, Lost, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
 from dataflow.interop.conversions import NARROWING, convert, in_units, offers
 from dataflow.interop.found import Found
@@ -65,7 +65,7 @@ class BagStreams:
         `accounting`: what messages do not carry over is counted there too."""
         self.path, self.played = Path(path), dict(sorted(played.items()))
         self._strict, self._accounting = strict, accounting
-        self._bag: Bag = open_bag(self.path)
+        self._bag: Bag = open_bag(self.path, strict=strict)
         self._closed = False
         try:
             self.account = Account(list(self._bag.notes), shortfalls(self._bag))
@@ -80,7 +80,7 @@ class BagStreams:
             self.repairs: Mapping[str, Repair] = {
                 t.topic: repair(
                     self.clock.stamps(t),
-                    np.frombuffer(self._found[t.topic].digests, np.uint64) if len(t.log) else np.empty(0, np.uint64),
+                    self._found[t.topic].digests_of(distinct=t.shares or self.clock.tells(t)),
                     merge=self._readings[t.topic].merges,
                 )
                 for t in times
@@ -90,6 +90,7 @@ class BagStreams:
             self.static_notes: dict[str, str] = {}
             self._static = {stream: self._static_message(stream) for stream, p in self.played.items() if p.static}
             self.streams: Mapping[str, StreamInfo] = {stream: self._info(stream) for stream in self.played}
+            self.recount()
         except BaseException:
             self.close()
             raise
@@ -100,18 +101,27 @@ class BagStreams:
         return False
 
     @property
+    def lost(self) -> Lost:
+        """Messages that damage keeps from being read, as far as they have been read."""
+        return self._bag.lost
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes of what in the file is damaged or unusual, for people."""
         return (*self.account.notes, *self.account.short)
+
+    def recount(self) -> None:
+        """Takes into `account` what damage has kept from being read so far."""
+        self.account.short[:] = shortfalls(self._bag)
 
     def losses(self, topic: str) -> tuple[str, ...]:
         """Names the content of a topic's first message that has no place here."""
         return self._readings[topic].losses
 
-    def look_for_unread(self, topics: Collection[str]) -> None:
-        """Reads all messages of topics, so that `account` counts those that cannot be read."""
+    def look_for_unread(self, topics: Collection[str], start: int | None = None, end: int | None = None) -> None:
+        """Reads the messages of topics with start ≤ stamp ≤ end, so that `account` counts those that cannot be read."""
         streams = [stream for stream, played in self.played.items() if played.topic in topics and not played.static]
-        for _ in self._merged(streams, None, None) if streams else ():
+        for _ in self._merged(streams, start, end) if streams else ():
             pass
 
     def opening(self) -> Mapping[str, Any] | None:

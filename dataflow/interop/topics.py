@@ -169,7 +169,7 @@ def reader_of(topic: Topic) -> TopicReader:
 def _ros_reader(topic: Topic) -> TopicReader:
     name = ros_type(topic.schema.name)
     if name not in CONVERSIONS:
-        raise RecordingError(f"{name} has no counterpart here")
+        raise RecordingError(f"{name or 'a message without a schema'} has no counterpart here")
     kind = RosType(name, topic.encoding, topic.schema)
     if name in TRANSFORM_SETS:
         return TransformSetReader(kind)

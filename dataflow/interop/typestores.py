@@ -14,12 +14,13 @@ from dataflow.recording.streams.codecs import SchemaText
 
 HEADER = "std_msgs/msg/Header"
 _IDL_SEPARATOR = "=" * 80 + "\n"
+_RULE = re.compile(r"^={10,}[ \t]*$", re.MULTILINE)
 _NAME = re.compile(r"^(\w+)/(?:msg/)?(\w+)$")
 
 
 def ros_type(name: str) -> str:
     """Returns a ROS type by its name of ROS 2: `sensor_msgs/Imu` is `sensor_msgs/msg/Imu`."""
-    found = _NAME.match(name)
+    found = _NAME.match(name.replace("::", "/"))
     return name if found is None else f"{found[1]}/msg/{found[2]}"
 
 
@@ -113,7 +114,7 @@ def _layout(store: Typestore, name: str) -> Any:
 @cache
 def _stores(name: str, encoding: str, schema: SchemaText) -> tuple[Typestore, ...]:
     """The definitions that may be meant, likeliest first."""
-    text = schema.data.decode("utf-8", "replace")
+    text = _plain(schema.data.decode("utf-8", "replace"))
     if not text.strip() and schema.encoding in ("", "ros2msg", "ros1msg"):
         if encoding == "ros1" or schema.encoding == "ros1msg":
             return (get_typestore(Stores.ROS1_NOETIC),)
@@ -139,8 +140,13 @@ def _as_ros2(store: Typestore) -> Typestore:
     return made
 
 
+def _plain(text: str) -> str:
+    """A definition with the line ends and separators that ROS writes, as an editor on another system leaves it."""
+    return _RULE.sub(_IDL_SEPARATOR.rstrip(), text.removeprefix("\ufeff").replace("\r\n", "\n"))
+
+
 def _types(name: str, encoding: str, text: str) -> Any:
-    if encoding != "ros2idl":
+    if encoding not in ("ros2idl", "omgidl"):
         return get_types_from_msg(text, name)
     if not text.startswith(f"{_IDL_SEPARATOR}IDL: "):
         return get_types_from_idl(text)

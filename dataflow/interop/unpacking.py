@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,13 +14,30 @@ from dataflow.interop.mcap_bag import McapBag
 from dataflow.recording.mcap.index import McapFile
 
 
+@dataclass(slots=True)
+class Plain:
+    """Files as they are, and those that were compressed as copies in a temporary folder, if there is one.
+
+    `damage`: by which compressed files are not whole, for people.
+    """
+
+    files: list[Path]
+    copies: TemporaryDirectory[str] | None = None
+    damage: list[str] = field(default_factory=list)
+
+    def close(self) -> None:
+        """Deletes the copies. Idempotent."""
+        if self.copies is not None:
+            self.copies.cleanup()
+
+
 class Unpacked:
     """A bag of unpacked copies, which are deleted when it is closed."""
 
-    def __init__(self, bag: Bag, copies: TemporaryDirectory[str]) -> None:
-        self._bag, self._copies = bag, copies
+    def __init__(self, bag: Bag, plain: Plain) -> None:
+        self._bag, self._plain = bag, plain
         self.path, self.kind = bag.path, f"{bag.kind}, zstd"
-        self.notes, self.promised = bag.notes, bag.promised
+        self.notes, self.promised, self.lost = bag.notes, bag.promised, bag.lost
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -38,27 +56,41 @@ class Unpacked:
     def close(self) -> None:
         """Closes and deletes the copies. Idempotent."""
         self._bag.close()
-        self._copies.cleanup()
+        self._plain.close()
 
 
-def unpack(files: Sequence[Path]) -> tuple[list[Path], TemporaryDirectory[str] | None]:
-    """Returns files as they are, those that end in `.zstd` as unpacked copies in a temporary folder.
+def unpack(files: Sequence[Path], *, strict: bool = False) -> Plain:
+    """Returns files as they are, those that end in `.zstd` unpacked: one that is not whole, as far as it goes.
 
-    Raises `BagError` for one that is not whole.
+    Raises `BagError` for one of which nothing can be unpacked, and where it is `strict` for one that is not whole.
     """
     if all(file.suffix != ".zstd" for file in files):
-        return list(files), None
+        return Plain(list(files))
     folder = TemporaryDirectory(prefix="dataflow-bag-")
-    found = []
+    found = Plain([], folder)
     for file in files:
-        if file.suffix == ".zstd":
-            copy = Path(folder.name) / file.stem
-            try:
-                with file.open("rb") as packed, copy.open("wb") as unpacked:
-                    zstandard.ZstdDecompressor().copy_stream(packed, unpacked)
-            except zstandard.ZstdError as error:
-                folder.cleanup()
-                raise BagError(f"{file} is not a whole zstd file: {error}") from error
-            file = copy
-        found.append(file)
-    return found, folder
+        copy = Path(folder.name) / file.stem if file.suffix == ".zstd" else file
+        reason = _unpacked(file, copy) if file.suffix == ".zstd" else ""
+        if reason and (strict or not copy.stat().st_size):
+            folder.cleanup()
+            raise BagError(f"{file} is not a whole zstd file: {reason}")
+        if reason:
+            found.damage.append(f"{file.name} is not a whole zstd file ({reason}): what is in front of that is read")
+        found.files.append(copy)
+    return found
+
+
+def _unpacked(file: Path, copy: Path) -> str:
+    """Unpacks a file as far as it goes; what is wrong behind that, nothing where it is whole."""
+    reader, begun = zstandard.ZstdDecompressor().decompressobj(), False
+    with file.open("rb") as packed, copy.open("wb") as unpacked:
+        try:
+            while block := packed.read(1 << 20):
+                while block:
+                    unpacked.write(reader.decompress(block))
+                    block, begun = reader.unused_data, True
+                    if reader.eof:
+                        reader, begun = zstandard.ZstdDecompressor().decompressobj(), False
+        except zstandard.ZstdError as error:
+            return str(error)
+    return "it is cut off" if begun else ""

@@ -38,8 +38,6 @@ class BagMaterial:
         """Notes of the file, messages that are missing or cannot be read, and what has no place here."""
         for note in self._bag.notes:
             yield Finding("file", "", "warning", note)
-        for text in shortfalls(self._bag):
-            yield Finding("missing", "", "error", text)
         for name, reading in self._readings.items():
             if reading.topic.count and reading.reader is None and is_known(reading.topic):
                 yield Finding("unreadable", name, "warning", reading.reason)
@@ -49,6 +47,8 @@ class BagMaterial:
                 yield Finding("empty", name, "note", "it is declared, and holds no message")
         if whole:
             yield from self._read_all()
+        for text in shortfalls(self._bag):
+            yield Finding("missing", "", "error", text)
 
     def _read_all(self) -> Iterator[Finding]:
         """Reads every message once."""
@@ -94,7 +94,10 @@ class BagMaterial:
         reader = self._readings[stream].reader
         found = []
         for stored in self._bag.messages([stream]):
-            carried = reader.stamps(stored.data) if reader is not None else ()
+            try:
+                carried = reader.stamps(stored.data) if reader is not None else ()
+            except (MessageError, RecordingError):
+                continue  # counted in `file_findings`
             found.append(max(carried, default=0) or stored.log_time)
         return np.array(found, np.int64)
 

@@ -15,6 +15,7 @@ from dataflow.lint.material import Material
 from dataflow.lint.motion import check_motion
 from dataflow.lint.publishers import check_publishers
 from dataflow.lint.quantities import check_quantities
+from dataflow.lint.readings import check_readings
 from dataflow.lint.timing import Timing, check_ends, check_gaps, check_order, check_unit, timing_of
 from dataflow.lint.turning import READERS, Turning, turning_of
 
@@ -82,6 +83,7 @@ def lint(material: Material, contract: Contract | None = None, *, clocks: bool =
             report.findings += check_gaps(name, stamps, timing, None if wanted is None else wanted.max_gap)
     report.findings += check_ends(report.timings)
     report.findings += check_quantities(material, report.timings)
+    report.findings += check_readings(material)
     report.findings += check_cameras(material)
     report.findings += check_publishers(material)
     tree = _frames_of(material)

@@ -165,7 +165,7 @@ def require_serving(keys: Path) -> None:
     """Raises `KeysError` for keys of a machine that others cannot reach."""
     if (keys / _MACHINE).is_file() and not (keys / _NAME).is_file():
         raise KeysError(
-            f"{keys} holds keys that serve nobody: those of the machine that runs the graph are made with "
+            f"{keys} holds keys that cannot serve: those of the machine that runs the graph are made with "
             "`dataflow keys add NAME --serves ADDRESS`"
         )
 

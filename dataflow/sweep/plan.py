@@ -219,7 +219,7 @@ def tasks_of(
 
 def _recorded(source: Source) -> Graph | None:
     """Returns the graph inside a recording; None of a URL, which is not opened, and of what no graph can be read from:
-    its run fails, and says why."""
+    its run fails with the reason."""
     if "://" in source.where:
         return None
     try:
@@ -230,7 +230,7 @@ def _recorded(source: Source) -> Graph | None:
 
 
 def _apart(graph: Graph | None) -> bool:
-    """Returns whether operators need several processes, since they have environments of their own."""
+    """Returns whether operators need several processes, since they are in several environments."""
     return graph is None or len({node.env for node in graph.nodes.values()}) > 1
 
 

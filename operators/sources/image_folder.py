@@ -18,6 +18,7 @@ import numpy as np
 from dataflow.messages import Message
 from dataflow.operator import Duration, Param, SourceError
 from operators.sources.pacing import frame_stamp
+from operators.sources.passed_over import TRIED, PassedOver
 from operators.sources.video import CalibratedImages, Pixels
 
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"))
@@ -41,7 +42,8 @@ class ImageFolder(CalibratedImages):
 
     An image is stamped by the last number in its name, `first_stamp` + number / `rate` (`rate: 1e9`: names are
     nanoseconds), or with `stamps: file_time` by the time at which its file was last changed, on the clock of the
-    machine that wrote it; at least 1 ns after the one before.
+    machine that wrote it; at least 1 ns after the one before. One that cannot be decoded, or has another size than the
+    first, is passed over with a warning.
     """
 
     path: str = Param(min_length=1, doc="the folder")
@@ -49,28 +51,43 @@ class ImageFolder(CalibratedImages):
     stamps: Literal["number", "file_time"] = Param("number", doc="origin of the stamps")
     rate: float = Param(30.0, gt=0, unit="Hz", doc="numbers a second")
     first_stamp: int = Param(0, ge=0, unit="ns", doc="stamp of number 0")
+    strict: bool = Param(False, doc="what cannot be read is an error, instead of being passed over and counted")
 
     def setup(self) -> None:
         """Raises SourceError for a folder without images, or an image that cannot be stamped or read."""
         self._folder = self._existing()
+        self._passed = PassedOver(self.log, strict=self.strict)
         self._files = sorted(self._look())
         if not self._files:
             raise SourceError(f"{self._folder} has no image whose name is {self.pattern!r}")
         if self._files[0].stamp < 0:
             raise SourceError(f"{self._folder / self._files[0].name} has no number: `stamps: file_time` needs none")
-        self._calibrate(self._read(self._files[0]))
+        self._calibrate(self._first_image())
+
+    def _first_image(self) -> Pixels:
+        refused: SourceError | None = None
+        for file in self._files[: 1 if self.strict else TRIED]:
+            try:
+                return self._read(file)
+            except SourceError as error:
+                refused = refused or error
+        assert refused is not None
+        raise refused
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         last = -1
         for file in self._files:
             last = max(file.stamp, last + 1)
-            yield self._sized(last, file.name, self._read(file))
+            try:
+                yield self._sized(last, file.name, self._read(file))
+            except SourceError as error:
+                self._passed.take(error)
 
     def length(self) -> int | None:
         return len(self._files) if hasattr(self, "_files") else None
 
     def summary(self) -> Mapping[str, int | str]:
-        return {"clock": self.stamps}
+        return {"clock": self.stamps, "passed_over": self._passed.number}
 
     def _existing(self) -> Path:
         folder = Path(self.path).expanduser()
@@ -135,6 +152,7 @@ class GrowingImageFolder(ImageFolder):
     def setup(self) -> None:
         """Raises SourceError where there is no folder, or no image in time."""
         self._stopped = threading.Event()
+        self._passed = PassedOver(self.log, strict=self.strict)
         self._folder = self._existing()
         self._done: set[str] = set()
         self._before: dict[str, _File] = {}
@@ -150,8 +168,12 @@ class GrowingImageFolder(ImageFolder):
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         for found in itertools.chain([self._first], self._new):
-            if found is not None:
+            if found is None:
+                continue
+            try:
                 yield self._sized(*found)
+            except SourceError as error:
+                self._passed.take(error)
 
     def stop_reading(self) -> None:
         self._stopped.set()
@@ -160,7 +182,7 @@ class GrowingImageFolder(ImageFolder):
         return None
 
     def summary(self) -> Mapping[str, int | str]:
-        return {**super().summary(), "left_out": self._left_out}
+        return {"clock": self.stamps, "left_out": self._left_out + self._passed.number}
 
     def _first_stamp(self) -> int:
         return self._first[0]
@@ -177,6 +199,8 @@ class GrowingImageFolder(ImageFolder):
                 try:
                     bgr = self._read(file)
                 except SourceError as error:
+                    if self.strict:
+                        raise
                     self._leave_out(file.name, str(error))
                     continue
                 newest, last = file.stamp, max(file.stamp, last + 1)

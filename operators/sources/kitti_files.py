@@ -33,10 +33,15 @@ def calibration_files(folder: Path) -> tuple[Path, ...]:
 
 
 def read_stamps(file: Path, names: list[str], what: str) -> dict[str, int]:
-    """Returns the stamp of every frame, ns since the epoch; nothing where there is no such file."""
+    """Returns the stamp of every frame, ns since the epoch; nothing where there is no such file.
+
+    Of a drive that lacks files, whose times are all there, a line belongs to the frame of its number.
+    """
     if not file.is_file():
         return {}
     lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    if len(lines) > len(names) and all(name.isdecimal() and int(name) < len(lines) for name in names):
+        lines = [lines[int(name)] for name in names]
     if len(lines) != len(names):
         raise SourceError(f"{file} has {len(lines)} lines for {len(names)} {what}")
     stamps = []

@@ -13,6 +13,7 @@ from dataflow.messages import CameraInfo, Image, Message, Pose
 from dataflow.operator import Out, Param, Source, SourceError
 from operators.geometry.se3 import orthonormalised
 from operators.sources.pacing import frame_stamp
+from operators.sources.passed_over import TRIED, PassedOver
 
 Array = NDArray[np.float64]
 FOLDERS = (("image_l", "image_r"), ("image_0", "image_1"), ("image_2", "image_3"))
@@ -23,7 +24,9 @@ class KittiOdometry(Source):
 
     The folder holds two folders of images (image_0 and image_1, or image_2 and image_3, or image_l and image_r),
     `calib.txt` with the projection of each (3, 4), and where they are known `poses.txt`, twelve numbers a line. Images
-    are numbered; frame N is at first_stamp + N / rate. Geiger et al., "Are we ready for autonomous driving?", 2012.
+    are numbered; frame N is at first_stamp + N / rate. A pair of which an image is missing, cannot be decoded or has
+    another size than the first is passed over with a warning. Geiger et al., "Are we ready for autonomous driving?",
+    2012.
     """
 
     left: Out[Image] = Out(doc="left image, grey or colour")
@@ -38,6 +41,7 @@ class KittiOdometry(Source):
     start: int = Param(0, ge=0, doc="first pair read")
     stop: int | None = Param(None, ge=1, doc="pair to stop before; none reads to the end")
     color: bool = Param(False, doc="RGB instead of grey")
+    strict: bool = Param(False, doc="what cannot be read is an error, instead of being passed over and counted")
     world_frame: str = Param("world", min_length=1, doc="frame of the ground truth: the first left camera")
     left_frame: str = Param("stereo_left_optical", min_length=1, doc="optical frame of the left camera")
     right_frame: str = Param("stereo_right_optical", min_length=1, doc="optical frame of the right camera")
@@ -52,9 +56,7 @@ class KittiOdometry(Source):
         if not lefts:
             raise SourceError(f"{folder / pair[0]} holds no image *.png from {self.start} to {self.stop}")
         self._pairs = [(left, folder / pair[1] / left.name) for left in lefts]
-        for _, right in self._pairs:
-            if not right.is_file():
-                raise SourceError(f"no file {right}, which the left image of that name needs")
+        self._passed = PassedOver(self.log, strict=self.strict)
         cameras = (2, 3) if pair[0] == "image_2" else (0, 1)
         self._P = read_projections(self.use_file(folder / "calib.txt"), cameras)
         truth = folder / "poses.txt"
@@ -62,7 +64,17 @@ class KittiOdometry(Source):
         self._poses = poses[self.start : self.stop]
         if poses and len(self._poses) < len(self._pairs):
             raise SourceError(f"{truth} has {len(poses)} poses, and there are more images")
-        self._size = self._read(self._pairs[0][0]).shape[1::-1]
+        self._size = self._first_size()
+
+    def _first_size(self) -> tuple[int, ...]:
+        refused: SourceError | None = None
+        for left, _ in self._pairs[: 1 if self.strict else TRIED]:
+            try:
+                return self._read(left).shape[1::-1]
+            except SourceError as error:
+                refused = refused or error
+        assert refused is not None
+        raise refused
 
     def static_outputs(self) -> Mapping[str, Message]:
         frames = (self.left_frame, self.right_frame)
@@ -80,12 +92,17 @@ class KittiOdometry(Source):
         }
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
-        """Raises SourceError that names an image that cannot be read or has another size."""
+        """Raises SourceError, where it is strict, that names an image that cannot be read or has another size."""
         for i, (left, right) in enumerate(self._pairs):
             stamp = frame_stamp(self.start + i, self.rate, self.first_stamp)
+            try:
+                pixels = self._read(left), self._read(right)
+            except SourceError as error:
+                self._passed.take(error)
+                continue
             messages: dict[str, Message] = {
-                "left": Image(stamp=stamp, frame=self.left_frame, data=self._read(left)),
-                "right": Image(stamp=stamp, frame=self.right_frame, data=self._read(right)),
+                "left": Image(stamp=stamp, frame=self.left_frame, data=pixels[0]),
+                "right": Image(stamp=stamp, frame=self.right_frame, data=pixels[1]),
             }
             if self._poses:
                 messages["ground_truth"] = Pose.from_matrix(
@@ -96,10 +113,13 @@ class KittiOdometry(Source):
     def length(self) -> int | None:
         return len(self._pairs) if hasattr(self, "_pairs") else None
 
+    def summary(self) -> Mapping[str, int]:
+        return {"passed_over": self._passed.number}
+
     def _read(self, file: Path) -> NDArray[np.uint8]:
         pixels = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB if self.color else cv2.IMREAD_GRAYSCALE)
         if pixels is None:
-            raise SourceError(f"cannot decode {file}")
+            raise SourceError(f"cannot decode {file}" if file.is_file() else f"no file {file}, of a pair")
         size = getattr(self, "_size", None)
         if size is not None and pixels.shape[1::-1] != size:
             raise SourceError(

@@ -16,6 +16,7 @@ from dataflow.operator import Out, Param, Source, SourceError
 from operators.geometry.se3 import orthonormalised
 from operators.sources.kitti_files import Numbers, calibration_files, files_in, read_stamps
 from operators.sources.kitti_oxts import messages_of, read_packet
+from operators.sources.passed_over import TRIED, PassedOver
 
 Array = NDArray[np.float64]
 
@@ -39,7 +40,8 @@ class KittiRaw(Source):
     The folder holds `image_02` and `velodyne` with a `calib.txt`, or it is a drive as KITTI distributes it
     (`image_02/data`, `velodyne_points/data`, calibration files there or in the folder above). Image and scan of a frame
     carry one stamp: that of `velodyne_points/timestamps.txt`, else first_stamp + N / rate. The scans are as the sensor
-    gave them: not deskewed, and the files do not say when each point was measured.
+    gave them: not deskewed, and the files do not say when each point was measured. A frame that lacks image or
+    scan, or whose files cannot be read, is passed over with a warning.
 
     Where there is an `oxts` folder, each of its packets gives `imu`, `fix` and `odometry` at its own time of
     `oxts/timestamps.txt`, else at that of the frame of its number: those from the first to the last frame read,
@@ -65,6 +67,7 @@ class KittiRaw(Source):
     start: int = Param(0, ge=0, doc="first frame read")
     stop: int | None = Param(None, ge=1, doc="frame to stop before; none reads to the end")
     stride: int = Param(1, ge=1, doc="read every stride-th frame")
+    strict: bool = Param(False, doc="what cannot be read is an error, instead of being passed over and counted")
     lidar_frame: str = Param("velodyne", min_length=1, doc="frame of the scans")
     image_frame: str = Param("camera_optical", min_length=1, doc="optical frame of the camera")
     imu_frame: str = Param("imu", min_length=1, doc="frame of the inertial unit: x front, y left, z up")
@@ -76,6 +79,9 @@ class KittiRaw(Source):
         images = {file.stem: file for file in files_in(folder, _IMAGES, ".png")}
         scans = {file.stem: file for file in files_in(folder, _SCANS, ".bin")}
         both = sorted(images.keys() & scans.keys())
+        self._passed = PassedOver(self.log, strict=self.strict)
+        for name in sorted(images.keys() ^ scans.keys()):
+            self._passed.take(SourceError(f"frame {name} has no {'scan' if name in images else 'image'}"))
         stamps = read_stamps(folder / "velodyne_points" / "timestamps.txt", sorted(scans), "scans")
         chosen = list(enumerate(both))[self.start : self.stop : self.stride]
         if not chosen:
@@ -89,9 +95,19 @@ class KittiRaw(Source):
         self._packets = self._chosen_packets(folder, times)
         files = calibration_files(folder)
         self._calibration = read_calibration(*(self.use_file(file) for file in files))
-        self._size = _read_image(next(iter(self._frames.values()))[0]).shape[:2]
+        self._size = self._first_size()
         mounting = next((h / _IMU for h in (folder, folder.parent) if (h / _IMU).is_file()), None)
         self._mounting = None if mounting is None else read_mounting(self.use_file(mounting))
+
+    def _first_size(self) -> tuple[int, ...]:
+        refused: SourceError | None = None
+        for image, _ in list(self._frames.values())[: 1 if self.strict else TRIED]:
+            try:
+                return _read_image(image).shape[:2]
+            except SourceError as error:
+                refused = refused or error
+        assert refused is not None
+        raise refused
 
     def _chosen_packets(self, folder: Path, times: Mapping[str, int]) -> dict[int, Path]:
         """The packets by stamp, from the first to the last frame; those before and after, where all frames are read."""
@@ -131,19 +147,27 @@ class KittiRaw(Source):
         return made
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
-        """Raises SourceError that names a file that cannot be read."""
+        """Raises SourceError that names a file that cannot be read, where it is strict."""
         for stamp in sorted(self._frames.keys() | self._packets.keys()):
             messages: dict[str, Message] = {}
-            if stamp in self._frames:
-                messages |= self._frame(stamp, *self._frames[stamp])
-            if stamp in self._packets:
-                packet = read_packet(self._packets[stamp])
-                messages |= messages_of(
-                    packet, stamp, origin=self._origin, frame=self.imu_frame, odometry_frame=self.odometry_frame
-                )
-            yield messages
+            for read in (self._frame, self._packet):
+                try:
+                    messages |= read(stamp)
+                except SourceError as error:
+                    self._passed.take(error)
+            if messages:
+                yield messages
 
-    def _frame(self, stamp: int, image_file: Path, scan_file: Path) -> Mapping[str, Message]:
+    def _packet(self, stamp: int) -> Mapping[str, Message]:
+        if stamp not in self._packets:
+            return {}
+        packet = read_packet(self._packets[stamp])
+        return messages_of(packet, stamp, origin=self._origin, frame=self.imu_frame, odometry_frame=self.odometry_frame)
+
+    def _frame(self, stamp: int) -> Mapping[str, Message]:
+        if stamp not in self._frames:
+            return {}
+        image_file, scan_file = self._frames[stamp]
         image, scan = _read_image(image_file), read_scan(scan_file)
         if image.shape[:2] != self._size:
             raise SourceError(f"{image_file} has another size than the first image: {image.shape[:2]}, {self._size}")
@@ -159,6 +183,9 @@ class KittiRaw(Source):
 
     def length(self) -> int | None:
         return len(self._frames.keys() | self._packets.keys()) if hasattr(self, "_packets") else None
+
+    def summary(self) -> Mapping[str, int]:
+        return {"passed_over": self._passed.number}
 
 
 def read_scan(file: Path) -> NDArray[np.float32]:

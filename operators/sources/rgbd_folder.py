@@ -15,6 +15,7 @@ from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Tran
 from dataflow.messages.depth_units import FIFTHS, INVALID, MILLIMETRES, DepthSpan
 from dataflow.messages.geometry import normalize
 from dataflow.operator import Out, Param, Source, SourceError
+from operators.sources.passed_over import TRIED, PassedOver
 from operators.sources.rgbd_layouts import (
     Dataset,
     Frame,
@@ -37,7 +38,8 @@ class RgbdFolder(Source):
 
     Image and depth of a frame carry one stamp: the colour image's in TUM, first_stamp + N / rate for frame N of
     7-Scenes, exact in nanoseconds and the same for any start, stop and stride. Ground truth is the depth camera's pose
-    and absent at frames that have none. Every frame's files must be there when the graph starts.
+    and absent at frames that have none. A frame whose files are missing, cannot be decoded or have another size than
+    the first is passed over with a warning, and so is a pose that is none.
 
     Without `depth_scale`, a unit is the layout's, unless depth images from all over the folder show that it is the
     other common one: a depth camera sees little that is nearer than 0.3 m or farther than 10 m. That is logged as a
@@ -93,6 +95,7 @@ class RgbdFolder(Source):
         doc="x, y, z, qx, qy, qz, qw of the depth camera on what carries it, z up; none leaves the base out",
         unit="m",
     )
+    strict: bool = Param(False, doc="what cannot be read is an error, instead of being passed over and counted")
     base_frame: str = Param("base_link", min_length=1, doc="frame of what carries the camera")
     world_frame: str = Param("world", min_length=1, doc="frame of the ground truth")
     image_frame: str = Param("camera_color_optical", min_length=1, doc="optical frame of the colour camera")
@@ -103,26 +106,41 @@ class RgbdFolder(Source):
         if self.image_frame == self.depth_frame:
             raise SourceError(f"image_frame and depth_frame must differ, both are {self.image_frame!r}")
         folder = Path(self.path).expanduser()
+        self._passed = PassedOver(self.log, strict=self.strict)
         self._dataset = self._list(folder)
-        self._frames = self._dataset.frames[self.start : self.stop : self.stride]
+        for reason in self._dataset.lacking:
+            self._passed.take(SourceError(reason))
+        self._frames = [f for f in self._dataset.frames[self.start : self.stop : self.stride] if self._is_there(f)]
         if not self._frames:
             raise SourceError(
                 f"{folder} has {len(self._dataset.frames)} frames: start={self.start}, stop={self.stop}, "
                 f"stride={self.stride} leaves none"
             )
-        for frame in self._frames:
-            for file in (frame.image, frame.depth):
-                if not file.is_file():
-                    raise SourceError(f"frame {frame.name}: no file {file}")
         if (folder / "camera-intrinsics.txt").is_file():
             self.use_file(folder / "camera-intrinsics.txt")
-        self._image_size = _size(read_color(self._frames[0]))
-        self._depth_size = _size(read_depth(self._frames[0]))
+        self._image_size, self._depth_size = self._sizes()
         self._place = self._placed()
         self._image_camera, self._depth_camera = self._cameras()
         self._scale = self._dataset.depth_scale if self.depth_scale is None else self.depth_scale
         if self.depth_scale is None:
             self._scale = self._probed(self._scale)
+
+    def _is_there(self, frame: Frame) -> bool:
+        missing = next((file for file in (frame.image, frame.depth) if not file.is_file()), None)
+        if missing is not None:
+            self._passed.take(SourceError(f"frame {frame.name}: no file {missing}"))
+        return missing is None
+
+    def _sizes(self) -> tuple[Size, Size]:
+        """Those of the first frame that can be read."""
+        refused: SourceError | None = None
+        for frame in self._frames[: 1 if self.strict else TRIED]:
+            try:
+                return _size(read_color(frame)), _size(read_depth(frame))
+            except SourceError as error:
+                refused = refused or error
+        assert refused is not None
+        raise refused
 
     def static_outputs(self) -> Mapping[str, Message]:
         stamp = self._frames[0].stamp
@@ -142,25 +160,39 @@ class RgbdFolder(Source):
         }
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
-        """Raises SourceError that names the frame and file where one cannot be read."""
+        """Raises SourceError that names the frame and file where it is strict and one cannot be read."""
         for frame in self._frames:
-            color, raw = read_color(frame), read_depth(frame)
-            self._check_size(frame, frame.image, _size(color), self._image_size)
-            self._check_size(frame, frame.depth, _size(raw), self._depth_size)
+            try:
+                color, raw = read_color(frame), read_depth(frame)
+                self._check_size(frame, frame.image, _size(color), self._image_size)
+                self._check_size(frame, frame.depth, _size(raw), self._depth_size)
+            except SourceError as error:
+                self._passed.take(error)
+                continue
             depth = depth_in_metres(raw, self._scale, self.max_depth)
             messages: dict[str, Message] = {
                 "image": Image(stamp=frame.stamp, frame=self.image_frame, data=color),
                 "depth": DepthImage(stamp=frame.stamp, frame=self.depth_frame, data=depth),
             }
-            T = frame.T_world_camera()
+            T = self._truth(frame)
             if T is not None:
                 messages["ground_truth"] = Pose.from_matrix(
                     T, stamp=frame.stamp, frame=self.world_frame, child_frame=self.depth_frame
                 )
             yield messages
 
+    def _truth(self, frame: Frame) -> NDArray[np.float64] | None:
+        try:
+            return frame.T_world_camera()
+        except SourceError as error:
+            self._passed.take(error)
+            return None
+
     def length(self) -> int | None:
         return len(self._frames) if hasattr(self, "_frames") else None
+
+    def summary(self) -> Mapping[str, int]:
+        return {"passed_over": self._passed.number}
 
     def _list(self, folder: Path) -> Dataset:
         layout = detect_layout(folder) if self.layout == "auto" else self.layout

@@ -66,7 +66,7 @@ class Dataset:
     """A listed folder, as its layout has it. One unit of a depth image is `1 / depth_scale` metres.
 
     `T_depth_image` is x, y, z (m), qx, qy, qz, qw of the colour camera in the depth camera's frame; None: depth is
-    registered to colour, so that one camera took both.
+    registered to colour, so that one camera took both. `lacking`: what is there of frames that are not whole.
     """
 
     frames: Sequence[Frame]
@@ -74,6 +74,7 @@ class Dataset:
     image_intrinsics: Intrinsics
     depth_intrinsics: Intrinsics
     T_depth_image: Place | None
+    lacking: Sequence[str] = ()
 
     @property
     def registered(self) -> bool:
@@ -110,19 +111,24 @@ def list_7scenes(folder: Path, rate: float, first_stamp: int) -> Dataset:
     if not numbers:
         raise SourceError(f"{folder} has no frame-NNNNNN.color.jpg, as the 7-Scenes layout has")
     frames = []
+    lacking: list[str] = []
     for number in sorted(numbers):
         stem = f"frame-{numbers[number]}"
         image = next((f"{stem}.color.{s}" for s in ("jpg", "png") if f"{stem}.color.{s}" in present), None)
         if image is None:
-            raise SourceError(f"frame {numbers[number]} has no colour image: no {folder / stem}.color.jpg (or .png)")
+            lacking.append(f"frame {numbers[number]} has no colour image: no {folder / stem}.color.jpg (or .png)")
+            continue
         if f"{stem}.depth.png" not in present:
-            raise SourceError(f"frame {numbers[number]} has no depth image: no {folder / stem}.depth.png")
+            lacking.append(f"frame {numbers[number]} has no depth image: no {folder / stem}.depth.png")
+            continue
         pose = folder / f"{stem}.pose.txt" if f"{stem}.pose.txt" in present else None
         stamp = frame_stamp(number, rate, first_stamp)
         frames.append(Frame(numbers[number], stamp, folder / image, folder / f"{stem}.depth.png", pose))
     depth = _intrinsics_file(folder) or Intrinsics(585.0, 585.0, 320.0, 240.0)
     color = Intrinsics(525.0, 525.0, depth.cx, depth.cy)
-    return Dataset(frames, MILLIMETRES, color, depth, (0.025, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    if not frames:
+        raise SourceError(lacking[0])
+    return Dataset(frames, MILLIMETRES, color, depth, (0.025, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), lacking)
 
 
 def list_tum(folder: Path) -> Dataset:
@@ -184,8 +190,8 @@ def _tum_list(file: Path, values: int) -> list[tuple[int, list[str]]]:
     if not file.is_file():
         raise SourceError(f"the TUM RGB-D layout needs {file.name} (looked for {file.absolute()})")
     rows = []
-    for number, line in enumerate(file.read_text().splitlines(), 1):
-        words = line.split()
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), 1):
+        words = line.split(maxsplit=1) if values == 1 else line.split()  # names of files may have spaces
         if not words or words[0].startswith("#"):
             continue
         try:
@@ -198,8 +204,9 @@ def _tum_list(file: Path, values: int) -> list[tuple[int, list[str]]]:
             raise SourceError(f"{file}:{number}: {words[0]} s is no time from 1970 to 2262{hint}")
         if len(words) != values + 1:
             raise SourceError(f"{file}:{number}: expected a time and {values} values, found {line!r}")
-        rows.append((stamp, words[1:]))
-    return rows
+        rows.append((stamp, [word.rstrip() for word in words[1:]]))
+    rows.sort(key=lambda row: row[0])
+    return [row for k, row in enumerate(rows) if not k or row != rows[k - 1]]
 
 
 def _tum_pose(folder: Path, stamp: int, words: Sequence[str]) -> Matrix:

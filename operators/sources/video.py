@@ -120,6 +120,7 @@ class VideoFile(CalibratedImages):
         for number in range(self.stop if self.stop is not None else 2**62):
             read, bgr = self._video.read()
             if not read:
+                self._compare(number)
                 return
             if number < self.start:
                 continue
@@ -128,6 +129,14 @@ class VideoFile(CalibratedImages):
                 stamp = max(self.first_stamp + round(self._video.get(cv2.CAP_PROP_POS_MSEC) * 1e6), last + 1)
             last = stamp
             yield self._image(stamp, np.asarray(bgr, np.uint8))
+
+    def _compare(self, came: int) -> None:
+        """Warns where a file that counts its frames (MP4, AVI) has given fewer."""
+        promised = int(self._video.get(cv2.CAP_PROP_FRAME_COUNT))
+        with Path(self.input).expanduser().open("rb") as file:
+            head = file.read(8)
+        if came < promised and (head.startswith(b"RIFF") or head[4:] == b"ftyp"):
+            self.log.warning("%s states %s frames, and %s can be decoded", self.input, f"{promised:,}", f"{came:,}")
 
     def close(self) -> None:
         if hasattr(self, "_video"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import random
 import secrets
@@ -54,6 +55,7 @@ def read() -> dict[str, object]:
         "system": random.SystemRandom().random(),
         "id": id(order),
         "factory": Stamped().made,
+        "log record": logging.makeLogRecord({}).created,
         "hash": hash(Thing()),
         "repr": repr(Thing()),
         "pid": os.getpid(),

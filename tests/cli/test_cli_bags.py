@@ -126,3 +126,168 @@ def test_latencies_of_a_file_without_firing_records_are_refused_with_the_reason(
     dataflow("convert", bag, tmp_path / "drive.mcap", "--to", "mcap")
 
     assert "holds no firing records" in dataflow("latency", tmp_path / "drive.mcap", code=2).stderr
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """Another program's MCAP of 400 poses in chunks, one of them damaged, and how many are in that."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    folder = tmp_path_factory.mktemp("damaged")
+    source = write_ros2(folder / "bag", [row for _ in range(20) for row in poses(("/pose",))])
+    file = folder / "drive.mcap"
+    with (source / "bag.mcap").open("rb") as opened, file.open("wb") as target:
+        writer = Writer(target, chunk_size=4096)
+        writer.start("ros2")
+        channel = None
+        for k, (schema, known, message) in enumerate(make_reader(opened).iter_messages()):
+            assert schema is not None
+            if channel is None:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channel = writer.register_channel(known.topic, known.message_encoding, number)
+            stamp = START + k * SECOND // 100
+            writer.add_message(channel, stamp, message.data, stamp, k)
+        writer.finish()
+    with file.open("rb") as opened:
+        summary = make_reader(opened).get_summary()
+        assert summary is not None
+        chunk = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)[3]
+    data = bytearray(file.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    file.write_bytes(data)
+    return file, (chunk.message_end_time - chunk.message_start_time) * 100 // SECOND + 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["convert", "FILE", "OUT", "--to", "mcap", "--clock", "log", "--json"],
+        ["convert", "FILE", "OUT", "--to", "csv", "--clock", "log", "--json"],
+        ["convert", "FILE", "OUT", "--to", "ros2", "--json"],
+        ["lint", "FILE", "--json"],
+        ["cut", "FILE", "-o", "OUT", "--from", "0", "--json"],
+        ["filter", "FILE", "-o", "OUT", "--stream", "/pose", "--json"],
+    ],
+    ids=lambda words: " ".join(words[:1] + words[3:5]),
+)
+def test_commands_pass_over_a_damaged_chunk_and_count_it(
+    dataflow, damaged: tuple[Path, int], tmp_path: Path, words: list[str]
+) -> None:
+    file, lost = damaged
+    suffix = "" if "csv" in words or "ros2" in words else ".mcap"
+    places = {"FILE": file, "OUT": tmp_path / f"out{suffix}"}
+
+    done = dataflow(*(places.get(word, word) for word in words), code=1)
+
+    assert f"{lost} messages lost to damage" in done.stdout + done.stderr
+    assert "chunk 3 at byte" in done.stdout
+
+
+def test_strict_refuses_a_damaged_chunk(dataflow, damaged: tuple[Path, int], tmp_path: Path) -> None:
+    told = dataflow("convert", damaged[0], tmp_path / "a.mcap", "--to", "mcap", "--strict", code=2).stderr
+
+    assert "topic /pose: chunk 3 at byte" in told
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_topics_of_bags_stay_absolute_behind_a_prefix(dataflow, bag: Path, tmp_path: Path) -> None:
+    file = bag / "drive.mcap"
+    other = tmp_path / "other.mcap"
+    other.write_bytes(file.read_bytes())
+
+    done = dataflow("merge", file, other, "-o", tmp_path / "both.mcap", "--prefix", f"{other}=rear/", "--json")
+
+    assert set(json.loads(done.stdout)["streams"]) == {"/estimate", "/truth", "/rear/estimate", "/rear/truth"}
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images of two cameras at 10 Hz, recorded 2 ms late, the eleventh of the left one without pixels."""
+    rows: list[tuple[str, int, object]] = []
+    for k in range(20):
+        for topic, level in (("/left", 10), ("/right", 200)):
+            stamp = START + k * SECOND // 10
+            pixels = np.full(0 if topic == "/left" and k == 10 else 48, level, np.uint8)
+            about = {"width": 8, "height": 6, "step": 8, "encoding": "mono8"}
+            image = ros("sensor_msgs/Image", header=header(stamp, topic), data=pixels, **about)
+            rows.append((topic, stamp + SECOND // 500, image))
+    return write_ros2(tmp_path_factory.mktemp("film") / "film", rows)
+
+
+WATCH = """graph: watch
+operators:
+  camera: {use: "operators.sources:RecordedCamera"}
+  watch: {use: "operators.monitoring:ImageWatch", inputs: {image: camera/image}}
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("words", "stamps", "said"),
+    [
+        (("--map", "/left=camera/image"), [k / 10 for k in range(20) if k != 10], "1 message that cannot be read"),
+        (("--map", "/right=camera/image"), [k / 10 for k in range(20)], ""),
+        (("--map", "/left=camera/image", "--start", "0.95"), [1.1 + k / 10 for k in range(9)], "1 message that cannot"),
+        (("--map", "/left=camera/image", "--end", "0.95"), [k / 10 for k in range(10)], ""),
+        (("--map", "/right=camera/image", "--clock", "log"), [k / 10 + 0.002 for k in range(20)], "asked for"),
+    ],
+    ids=lambda words: " ".join(words) if isinstance(words, tuple) else "",
+)
+def test_options_of_a_replayed_bag_choose_what_is_played(
+    dataflow, film: Path, tmp_path: Path, words: tuple[str, ...], stamps: list[float], said: str
+) -> None:
+    from dataflow.recording import Recording
+
+    (tmp_path / "watch.yaml").write_text(WATCH)
+
+    told = dataflow("replay", film, "--graph", tmp_path / "watch.yaml", "--record", tmp_path / "o.mcap", *words).stderr
+
+    with Recording(tmp_path / "o.mcap") as recording:
+        played = [round((m.stamp - START) / SECOND, 3) for m in recording.messages(["watch/camera/image"])]
+    assert played == pytest.approx(stamps)
+    assert said in told if said else "cannot be read" not in told
+
+
+@pytest.mark.long
+def test_a_replay_that_is_strict_ends_at_a_message_that_cannot_be_read(dataflow, film: Path, tmp_path: Path) -> None:
+    (tmp_path / "watch.yaml").write_text(WATCH)
+    words = ("replay", film, "--graph", tmp_path / "watch.yaml", "--map", "/left=camera/image", "--one-process")
+
+    assert "topic '/left', message 10 at" in dataflow(*words, "--strict", code=1).stderr
+
+
+def test_options_of_bags_are_refused_when_a_recording_is_replayed(dataflow, recorded) -> None:
+    assert "--strict: " in dataflow("replay", recorded[0], "--strict", code=2).stderr
+    assert "--clock: " in dataflow("replay", recorded[0], "--clock", "log", code=2).stderr
+
+
+def test_metadata_records_and_attachments_of_others_are_shown(dataflow, tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    file = tmp_path / "drive.mcap"
+    with file.open("wb") as opened:
+        writer = Writer(opened)
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.add_metadata("vehicle", {"name": "truck 7"})
+        writer.add_attachment(1, 1, "calib.txt", "text/plain", b"P0: 1")
+        writer.finish()
+
+    told = json.loads(dataflow("info", file, "--json").stdout)
+
+    assert told["metadata"] == [{"name": "vehicle", "values": {"name": "truck 7"}}]
+    assert told["attachments"] == 1
+    assert "truck 7" not in dataflow("info", file).stdout
+    assert "truck 7" in dataflow("info", file, "--metadata").stdout
+
+
+def test_a_bag_without_metadata_records_says_so(dataflow, tmp_path: Path) -> None:
+    from made_bags import ROS1
+
+    text = ros("std_msgs/String", ROS1, data="hello")
+    file = write_ros1(tmp_path / "old.bag", [("/said", START, text)])
+
+    assert "holds no metadata records" in dataflow("info", file, "--metadata", code=2).stderr
+    assert "messages of a bag have none" in dataflow("info", file, "--digests", code=2).stderr

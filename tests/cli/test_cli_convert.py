@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from made_bags import SECOND, header, imus, ros, transform, write_ros2, xyz, xyzw
+from made_bags import ROS2, SECOND, header, imus, ros, transform, write_ros2, xyz, xyzw
 from typer import Context
 from typer.main import get_command
 
@@ -20,6 +20,8 @@ from dataflow.recording import Recording
 
 START = 1_700_000_000 * SECOND
 STAMPS = [START + i * SECOND // 10 for i in range(12)]
+LATE = SECOND // 500
+"""By which the log is behind the headers."""
 K = np.array([20.0, 0, 4, 0, 20, 3, 0, 0, 1])
 
 
@@ -50,7 +52,28 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ("/imu", stamp, ros("sensor_msgs/Imu", header=header(stamp, "imu"), linear_acceleration=xyz(0, 0, 9.8))),
         ]
     rows.append(("/tf_static", START, ros("tf2_msgs/TFMessage", transforms=[transform(START, "lidar", "camera")])))
+    rows = [(topic, stamp + LATE, message) for topic, stamp, message in rows]
     return write_ros2(tmp_path_factory.mktemp("bags") / "drive", rows)
+
+
+@pytest.fixture(scope="module")
+def odd(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive with what commands have to be asked about: an image without pixels, and a cloud of 64 bits."""
+    from mcap.reader import make_reader
+
+    rows: list[Any] = []
+    with (drive / "drive.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            rows.append((channel.topic, message.log_time, ROS2.deserialize_cdr(message.data, schema.name)))
+    end = STAMPS[-1] + LATE
+    rows.append(("/color", end, picture(STAMPS[-1] + 1, "rgb8", np.zeros((6, 8, 3), np.uint8), "camera")))
+    rows[-1][2].data = np.zeros(3, np.uint8)
+    fields = [ros("sensor_msgs/PointField", name=n, offset=8 * k, datatype=8, count=1) for k, n in enumerate("xyz")]
+    layout = {"width": 1, "height": 1, "point_step": 24, "row_step": 24, "fields": fields}
+    far = np.array([5e6 + 0.123, 4e5, 10.25]).view(np.uint8)
+    rows.append(("/far", end, ros("sensor_msgs/PointCloud2", header=header(STAMPS[-1], "utm"), data=far, **layout)))
+    return write_ros2(tmp_path_factory.mktemp("bags") / "odd", rows)
 
 
 SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
@@ -78,34 +101,108 @@ def test_every_format_is_written_from_the_command_line(
     assert set(told["source"]) == {"notes", "missing", "repaired", "unread", "lost", "static", "doubted"}
 
 
-OPTIONS = {
-    "--out": ("--to", "csv", "--out", "OUT"),
-    "--to": ("OUT", "--to", "7scenes"),
-    "--stream": ("OUT", "--to", "csv", "--stream", "/imu"),
-    "--without": ("OUT", "--to", "csv", "--without", "/p*"),
-    "--start": ("OUT", "--to", "csv", "--start", "0.5"),
-    "--end": ("OUT", "--to", "csv", "--end", "0.5"),
-    "--clock": ("OUT", "--to", "csv", "--clock", "log"),
-    "--action": ("OUT", "--to", "lerobot", "--action", "/pose"),
-    "--task": ("OUT", "--to", "lerobot", "--task", "look"),
-    "--depth": ("OUT", "--to", "csv", "--depth", "/depth=5000"),
-    "--lossy": ("OUT", "--to", "kitti-raw", "--lossy"),
-    "--strict": ("OUT", "--to", "csv", "--strict"),
-    "--overwrite": ("OUT.mcap", "--to", "mcap", "--overwrite"),
-    "--quiet": ("OUT", "--to", "tum", "--quiet"),
-    "--json": ("OUT", "--to", "euroc", "--json"),
+CSV = ("OUT", "--to", "csv")
+OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "--out": (CSV, ("--to", "csv", "--out", "OTHER")),
+    "--to": (CSV, ("OUT", "--to", "7scenes")),
+    "--stream": (CSV, (*CSV, "--stream", "/imu")),
+    "--without": (CSV, (*CSV, "--without", "/p*")),
+    "--start": (CSV, (*CSV, "--start", "0.5")),
+    "--end": (CSV, (*CSV, "--end", "0.5")),
+    "--clock": (CSV, (*CSV, "--clock", "log")),
+    "--action": (("OUT", "--to", "lerobot"), ("OUT", "--to", "lerobot", "--action", "/pose")),
+    "--task": (("OUT", "--to", "lerobot"), ("OUT", "--to", "lerobot", "--task", "look")),
+    "--depth": (("OUT", "--to", "tum"), ("OUT", "--to", "tum", "--depth", "/depth=5000")),
+    "--lossy": (("OUT.mcap", "--to", "foxglove"), ("OUT.mcap", "--to", "foxglove", "--lossy")),
+    "--strict": (CSV, (*CSV, "--strict")),
+    "--overwrite": (("THERE.mcap", "--to", "mcap"), ("THERE.mcap", "--to", "mcap", "--overwrite")),
+    "--json": (("OUT", "--to", "euroc"), ("OUT", "--to", "euroc", "--json")),
 }
+"""By option: a command without it, and one with it, which does something else."""
+
+
+def outcome(
+    dataflow: Any, source: Path, folder: Path, words: tuple[str, ...], code: int
+) -> tuple[str, dict[str, bytes]]:
+    """Standard output without the folder's name, and what each file of the folder holds."""
+    folder.mkdir()
+    (folder / "THERE.mcap").write_bytes(b"")
+    places = [str(folder / word) if word.partition(".")[0] in ("OUT", "OTHER", "THERE") else word for word in words]
+    done = dataflow("convert", source, *places, code=code)
+    files = {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+    return done.stdout.replace(str(folder), ""), files
 
 
 @pytest.mark.parametrize("option", OPTIONS)
-def test_every_option_works_from_the_command_line(dataflow, drive: Path, tmp_path: Path, option: str) -> None:
-    if "lerobot" in OPTIONS[option]:
+def test_every_option_does_something(dataflow, odd: Path, tmp_path: Path, option: str) -> None:
+    if "lerobot" in OPTIONS[option][0]:
         pytest.importorskip("pyarrow")
-    words = [str(tmp_path / word) if word.startswith("OUT") else word for word in OPTIONS[option]]
 
-    dataflow("convert", drive, *words)
+    words = OPTIONS[option]
+    without = outcome(dataflow, odd, tmp_path / "a", words[0], {"--lossy": 2, "--overwrite": 2}.get(option, 0))
+    given = outcome(dataflow, odd, tmp_path / "b", words[1], {"--strict": 2}.get(option, 0))
 
-    assert any(tmp_path.iterdir())
+    assert given[0] != without[0] if option == "--json" else given[1] != without[1]
+
+
+@pytest.mark.parametrize("format_", get_args(Format))
+def test_a_span_and_the_choice_of_streams_count_in_every_format(
+    dataflow, drive: Path, tmp_path: Path, format_: str
+) -> None:
+    if format_ in NEEDS:
+        pytest.importorskip(NEEDS[format_])
+
+    def messages(*words: str) -> int:
+        target = tmp_path / f"out{len(list(tmp_path.iterdir()))}{SUFFIXES.get(format_, '')}"
+        told = json.loads(dataflow("convert", drive, target, "--to", format_, *words, "--json").stdout)
+        return int(told["messages"] if format_ == "rrd" else sum(told["written"].values()))
+
+    whole = messages()
+    assert 0 < messages("--start", "0.45") < whole
+    assert 0 < messages("--end", "0.45") < whole
+    if format_ != "kitti-raw":
+        assert 0 < messages("--without", "/pose", "--without", "/imu") < whole or "lerobot" in format_
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--start", "100"), "ends 1.10 s after its first message"),
+        (("--start", "1", "--end", "0.5"), "--end 0.5 must be greater than --start 1"),
+        (("--start", "-1"), "expected seconds from the recording's first message"),
+        (("--end", "nan"), "expected seconds from the recording's first message"),
+    ],
+)
+@pytest.mark.parametrize("format_", ["mcap", "ros2", "csv", "tum", "lerobot"])
+def test_a_span_without_a_message_is_refused(
+    dataflow, drive: Path, tmp_path: Path, format_: str, words: tuple[str, ...], told: str
+) -> None:
+    target = tmp_path / f"out{SUFFIXES.get(format_, '')}"
+
+    assert told in dataflow("convert", drive, target, "--to", format_, *words, code=2).stderr
+    assert not target.exists()
+
+
+@pytest.mark.parametrize("format_", ["mcap", "rrd"])
+@pytest.mark.parametrize("words", [("--clock", "log"), ("--strict",)])
+def test_options_of_bags_are_refused_for_a_recording(
+    dataflow, drive: Path, tmp_path: Path, format_: str, words: tuple[str, ...]
+) -> None:
+    dataflow("convert", drive, tmp_path / "own.mcap", "--to", "mcap")
+
+    told = dataflow("convert", tmp_path / "own.mcap", tmp_path / f"o.{format_}", "--to", format_, *words, code=2).stderr
+
+    assert f"{words[0]}: " in told
+    assert "of bags alone" in told
+
+
+def test_strict_counts_for_a_viewer_file_too(dataflow, odd: Path, tmp_path: Path) -> None:
+    said = dataflow("convert", odd, tmp_path / "a.rrd").stderr
+    refused = dataflow("convert", odd, tmp_path / "b.rrd", "--strict", code=2).stderr
+
+    assert "1 message that cannot be read passed over" in said
+    assert "topic '/color', message 12" in refused
+    assert "1 message that cannot be read passed over" in dataflow("view", odd, "--to", tmp_path / "c.rrd").stderr
 
 
 def test_every_option_of_the_help_is_among_those_tried() -> None:
@@ -114,7 +211,7 @@ def test_every_option_of_the_help_is_among_those_tried() -> None:
     offered = {option for p in command.params for option in p.opts if option.startswith("--") and option != "--help"}
     described = set(re.findall(r"--to ([\w-]+)", convert.__doc__ or ""))
 
-    assert offered == set(OPTIONS)
+    assert offered == {*OPTIONS, "--quiet"}  # that shows nothing where there is no terminal
     assert described == set(get_args(Format))
 
 

@@ -140,6 +140,11 @@ def _fire(runner: LiveRunner, stamp: int) -> None:
         ("step_of_reload", "STEP = \n", "SyntaxError"),
         ("sum_to_reload", "", "has no operator 'Sum'"),
         ("sum_to_reload", CODE.replace("    y: Out", "    z: Out"), "its outputs are declared otherwise now"),
+        (
+            "sum_to_reload",
+            CODE.replace("(Operator)", "(Operator, merge=True)"),
+            "its inputs are declared otherwise now",
+        ),
         ("sum_to_reload", CODE + "\n    def setup(self):\n        1 / 0\n", "ZeroDivisionError"),
         ("sum_to_reload", CODE + "\n    def setup(self):\n        while True: pass\n", r"not over within 0\.05 s"),
     ],

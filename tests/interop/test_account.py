@@ -90,7 +90,7 @@ def test_a_message_that_is_cut_off_is_counted_while_times_are_looked_for(tmp_pat
 
 
 def test_what_a_type_has_no_place_for_is_named_with_its_number(tmp_path: Path) -> None:
-    scan = {"ranges": np.ones(5, np.float32), "angle_increment": 0.1, "range_max": 9.0}
+    scan = {"ranges": np.ones(5, np.float32), "angle_increment": 0.1, "angle_max": 0.4, "range_max": 9.0}
     rows = [
         ("/scan", s, ros("sensor_msgs/LaserScan", header=header(s, "laser"), scan_time=0.1 * (i > 2), **scan))
         for i, s in enumerate(STAMPS)
@@ -318,11 +318,11 @@ def test_a_topic_of_two_types_keeps_both_there_and_back(tmp_path: Path) -> None:
 
 
 def test_a_topic_of_a_known_type_that_cannot_be_read_is_kept_and_named(tmp_path: Path) -> None:
-    rows = [("/odd", s, image(s, "nv12", bytes(24), 4, 4, 6)) for s in STAMPS]
+    rows = [("/odd", s, image(s, "yv12", bytes(24), 4, 4, 6)) for s in STAMPS]
 
     account = converted(write_ros2(tmp_path / "bag", rows), tmp_path / "o.mcap").account
 
-    assert "topic /odd stays as it is, since it cannot be read: image encoding 'nv12'" in account.notes[0]
+    assert "topic /odd stays as it is, since it cannot be read: image encoding 'yv12'" in account.notes[0]
     with Recording(tmp_path / "o.mcap") as recording:
         assert recording.streams["/odd"].count == 6
 

@@ -12,7 +12,7 @@ from made_bags import ROS1, SECOND, header, imus, ros, transform, write_ros1, wr
 from dataflow.interop.bag import BagError
 from dataflow.interop.opening import is_foreign, open_bag
 from dataflow.interop.streams import BagStreams, Played, recorded_streams
-from dataflow.messages import Imu
+from dataflow.messages import Imu, Text
 from dataflow.recording import RecordingWriter
 
 STAMPS = [1_700_000_000 * SECOND + i * SECOND // 100 for i in range(40)]
@@ -188,3 +188,23 @@ def test_every_bag_of_others_opens(data_dir: Path) -> None:
         "ros2_topics_and_services.mcap": 13,
         "tf_example": 518,
     }
+
+
+@pytest.mark.parametrize("log", [[0] * 6, [SECOND * (i // 3) for i in range(6)]])
+def test_equal_messages_of_a_log_without_times_are_not_taken_for_one(tmp_path: Path, log: list[int]) -> None:
+    """Six equal texts, recorded by a log whose times are all 0, or whole seconds."""
+    rows = [("/said", stamp, ros("std_msgs/String", data="on")) for stamp in log]
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    with BagStreams(bag, {"/said": Played("/said", Text.SCHEMA)}) as opened:
+        stamps = [found.message.stamp for found in opened.messages()]
+
+    assert stamps == [stamp + i % (6 if log[-1] == 0 else 3) for i, stamp in enumerate(log)]
+    assert opened.account.repaired == {"/said": {"moved": 6 - len(set(log))}}
+
+
+def test_a_log_without_times_is_said_by_every_command_that_opens_it(tmp_path: Path) -> None:
+    texts = [("/said", 0, ros("std_msgs/String", data="on"))] * 2
+
+    assert "all messages have the log time 0" in open_bag(write_ros2(tmp_path / "bag", texts)).notes[0]
+    assert not open_bag(write_ros2(tmp_path / "one", texts[:1])).notes

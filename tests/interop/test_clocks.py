@@ -127,3 +127,13 @@ def test_a_simulation_that_is_slow_or_fast_is_not_noted(pace: float) -> None:
     log = LOG[0] + np.arange(20) * S // 10
 
     assert not choose_clock([times(7 * S + (np.arange(20) * S // 10 * pace).astype(np.int64), log=log)]).notes
+
+
+def test_one_publisher_of_transforms_without_times_does_not_take_those_of_others() -> None:
+    mixed = np.where(np.arange(10) % 2, 0, LOG)
+
+    chosen = choose_clock([times(mixed, shares=True)])
+
+    assert chosen.kind == "header"
+    assert "5 of 10 headers carry no time" in chosen.notes[0]
+    assert choose_clock([times(mixed)]).kind == "log"

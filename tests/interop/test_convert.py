@@ -107,7 +107,7 @@ def test_message_goes_to_ros_and_comes_back_through_serialised_bytes(kind: type[
     if isinstance(message, Transforms):
         message = message.replace(frames=("world", "a/b", "a/b"))
     unknown = {n: v for n, v in message.items() if n == "translations" or (n.endswith("covariance") and v is not None)}
-    message = message.replace(**{n: np.nan_to_num(v, posinf=1.0, neginf=2.0) for n, v in unknown.items()})
+    message = message.replace(**{n: np.abs(np.nan_to_num(v, posinf=1.0, neginf=2.0)) for n, v in unknown.items()})
 
     made = OUTWARD[kind](message)
     name = made.__msgtype__

@@ -12,12 +12,26 @@ import pytest
 from typer.testing import CliRunner
 
 from dataflow.cli.main import app
+from dataflow.interop.export import frames
+from dataflow.interop.export.datasets import export_7scenes, export_kitti, export_tum
 from dataflow.interop.export.kitti_raw import export_kitti_raw
 from dataflow.interop.export.lerobot import export_lerobot
 from dataflow.interop.export.lerobot_layouts import Layout30
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
-from dataflow.messages import CameraInfo, Image, JointState, Message, Number, PointCloud, Text, Transforms, Twist
+from dataflow.messages import (
+    CameraInfo,
+    DepthImage,
+    Image,
+    JointState,
+    Message,
+    Number,
+    PointCloud,
+    Pose,
+    Text,
+    Transforms,
+    Twist,
+)
 from dataflow.recording import RecordingError, RecordingWriter
 from operators.sources.kitti_raw import KittiRaw
 
@@ -242,3 +256,63 @@ def test_what_a_kitti_raw_drive_lacks_is_said(tmp_path: Path) -> None:
         len((tmp_path / "out/2023_11_14/2023_11_14_drive_0001_sync/image_02/timestamps.txt").read_text().splitlines())
         == 4
     )
+
+
+def stereo(path: Path, missing: set[tuple[str, int]]) -> Path:
+    with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
+        for name in ("left", "right"):
+            writer.add_stream(f"robot1/{name}", Image)
+        writer.add_stream("robot1/pose", Pose)
+        for k in range(5):
+            stamp = (k + 1) * SECOND // 10
+            for name in ("left", "right"):
+                if (name, k) not in missing:
+                    image = Image(stamp=stamp, frame=name, data=np.full((4, 6), 10 * k, np.uint8))
+                    writer.write(f"robot1/{name}", image, seq=k)
+            place = [k, 0, 0] if k != 2 else [float("nan"), 0, 0]
+            pose = Pose(stamp=stamp + 1000, frame="map", position=np.array(place), orientation=[0, 0, 0, 1])
+            writer.write("robot1/pose", pose, seq=k)
+    return path
+
+
+def test_an_image_without_one_of_the_other_camera_is_left_out_and_counted(tmp_path: Path) -> None:
+    done = Exported()
+    with Material(stereo(tmp_path / "a.mcap", {("left", 1), ("right", 2), ("right", 4)})) as material:
+        export_kitti(material, tmp_path / "kitti", done)
+
+    assert len(list((tmp_path / "kitti" / "image_0").iterdir())) == 2
+    assert [cv2.imread(str(tmp_path / "kitti" / "image_1" / f"00000{k}.png"), 0)[0, 0] for k in (0, 1)] == [0, 30]
+    assert np.loadtxt(tmp_path / "kitti" / "times.txt").tolist() == pytest.approx([0.0, 0.3])
+    assert np.loadtxt(tmp_path / "kitti" / "poses.txt")[:, 3].tolist() == [0, 3]
+    lost = "an image without one of the other camera of its stamp, left out"
+    assert (done.lost["left"][lost], done.lost["right"][lost]) == (2, 1)
+
+
+def test_a_pose_that_is_none_is_left_out_of_a_trajectory_and_counted(tmp_path: Path) -> None:
+    done = Exported()
+    with Material(stereo(tmp_path / "a.mcap", set()), ["robot1/pose"]) as material:
+        export_tum(material, tmp_path / "tum", done)
+
+    assert np.loadtxt(tmp_path / "tum" / "groundtruth.txt")[:, 1].tolist() == [0, 1, 3, 4]
+    assert done.lost == {"pose": {"a pose that is not finite, left out": 1}}
+
+
+def test_frames_are_paired_without_holding_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Colour is 5 ms behind depth; images in memory are those near a frame that still waits for others."""
+    path, held = tmp_path / "a.mcap", []
+    with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
+        writer.add_stream("robot1/color", Image)
+        writer.add_stream("robot1/depth", DepthImage)
+        for k in range(60):
+            stamp = (k + 1) * SECOND // 30
+            color = Image(stamp=stamp + 5_000_000, frame="c", data=np.full((4, 6, 3), k, np.uint8))
+            writer.write("robot1/color", color, seq=k)
+            writer.write("robot1/depth", DepthImage(stamp=stamp, frame="c", data=np.ones((4, 6), np.float32)), seq=k)
+    nearest = frames._nearest
+    monkeypatch.setattr(frames, "_nearest", lambda found, stamp: (held.append(len(found)), nearest(found, stamp))[1])
+
+    with Material(path) as material:
+        export_7scenes(material, tmp_path / "scenes", Exported())
+
+    assert max(held) <= 3
+    assert [cv2.imread(str(tmp_path / "scenes" / f"frame-{k:06d}.color.png"))[0, 0, 0] for k in (0, 59)] == [0, 59]

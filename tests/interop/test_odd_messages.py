@@ -96,6 +96,11 @@ def transforms() -> Any:
     return ros("tf2_msgs/TFMessage", transforms=rows)
 
 
+def grid(width: int, cells: list[int]) -> Any:
+    info = ros("nav_msgs/MapMetaData", resolution=0.1, width=width, height=2)
+    return ros("nav_msgs/OccupancyGrid", header=header(T), info=info, data=np.array(cells, np.int8))
+
+
 def fix() -> Any:
     return ros("sensor_msgs/NavSatFix", header=header(T), latitude=42.0, longitude=274.25, altitude=5.0)
 
@@ -126,6 +131,10 @@ ODD: dict[str, tuple[Any, Callable[[Any], bool], str]] = {
         encoded("16UC1; compressedDepth png", file(".png", GREY16)),
         lambda m: m.data.tobytes() == file(".png", GREY16) and m.scale == 0.001,
         "",
+    ),
+    "depth_in_capitals": (
+        encoded("16UC1; CompressedDepth PNG", bytes(12) + file(".png", GREY16)),
+        lambda m: m.data.tobytes() == file(".png", GREY16), "",
     ),
     "short_image": (raw("mono8", 6, 3, 8, 22), lambda m: m.data[2].tolist() == [16, 17, 18, 19, 20, 21], ""),
     "wrong_step": (
@@ -160,6 +169,34 @@ ODD: dict[str, tuple[Any, Callable[[Any], bool], str]] = {
         "variance that is not finite",
     ),
     "tf": (transforms(), lambda m: m.child_frames == ("good",), "a transform to nan that is not finite"),
+    "scan_in_degrees": (
+        ros("sensor_msgs/LaserScan", header=header(T), ranges=np.ones(20, "f4"), angle_min=-1.0, angle_max=1.0,
+            angle_increment=1.0, range_max=9.0),
+        lambda m: m.angle_max == 18.0,
+        "angle_max of 1, where 20 beams by their increment end at 18",
+    ),
+    "scan_of_a_beam_more": (
+        ros("sensor_msgs/LaserScan", header=header(T), ranges=np.ones(20, "f4"), angle_min=-1.0, angle_max=1.0,
+            angle_increment=0.1, range_max=9.0),
+        lambda m: len(m.ranges) == 20,
+        "",
+    ),
+    "grid": (
+        grid(3, [0, 100, -1, 101, -128, 7]), lambda m: m.cells.tolist() == [[0, 100, -1], [-1, -1, 7]],
+        "cells that are neither -1 nor 0 to 100, such as 101",
+    ),
+    "whole_numbers": (
+        cloud([(n, 2 * k, 3, 1) for k, n in enumerate("xyz")], np.ones(4, [("x", "i2"), ("y", "i2"), ("z", "i2")])),
+        lambda m: (m.points == 1).all(),
+        "the unit of x, y, z, whole numbers",
+    ),
+    "negative_variances": (
+        with_covariance(np.zeros(3), None, -0.5 * np.eye(6)), lambda m: m.covariance is None,
+        "covariance with a negative variance",
+    ),
+    "fisheye": (camera("fisheye", 4), lambda m: m.distortion_model == "equidistant", "the name 'fisheye'"),
+    "radtan": (camera("radtan", 4), lambda m: m.distortion_model == "plumb_bob", "the name 'radtan'"),
+    "pinhole": (camera("pinhole", 0), lambda m: m.distortion_model == "none", "the name 'pinhole'"),
     "fix": (fix(), lambda m: m.longitude == 274.25 - 360, "a longitude of 180 to 360 degrees"),
 }  # fmt: skip
 """By topic: the message, what has to be so of what is read, and words of what is lost."""
@@ -200,9 +237,19 @@ def test_an_odd_message_is_read_as_far_as_it_makes_sense_and_the_rest_is_named(
         (encoded("tiff", file(".tiff", METRES.astype(np.int32))), "holds int32 of 6x8, which no"),
         (camera("equidistant", 5), "a distortion of 5 coefficients, of which equidistant has 4 at most"),
         (encoded("h264", b"\0\0\0\x1f\x65\x88" + bytes(40)), "without a start code"),
+        (grid(4, [0] * 5), "a grid of 4x2 cells needs 8, got 5"),
         (ros("visualization_msgs/Marker", header=header(T), type=1, action=2), "a marker that deletes"),
     ],
-    ids=["three values", "float colours", "colours as depth", "int32", "five coefficients", "AVCC", "deletion"],
+    ids=[
+        "three values",
+        "float colours",
+        "colours as depth",
+        "int32",
+        "five coefficients",
+        "AVCC",
+        "cells",
+        "deletion",
+    ],
 )
 def test_a_message_that_makes_no_sense_is_left_as_it_is_with_its_reason(
     tmp_path: Path, message: Any, reason: str

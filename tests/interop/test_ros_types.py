@@ -9,14 +9,17 @@ import cv2
 import numpy as np
 import pytest
 from made_bags import ROS1, ROS2, SECOND, header, made, ros, transform, xyz, xyzw
+from made_rvl import packed_rvl
 from rosbags.typesys import Stores, get_typestore
 
 from dataflow.interop.conversions import convert
 from dataflow.interop.ros import CONVERSIONS
 from dataflow.interop.ros.clouds import left_out
 from dataflow.interop.ros.outward import OUTWARD
+from dataflow.interop.typestores import RosType
 from dataflow.messages import Boxes3D, DepthImage, Image, Message, MessageError, Odometry, Path, Point, Pose
 from dataflow.recording import RecordingError
+from dataflow.recording.streams.codecs import SchemaText
 
 STAMP = 5 * SECOND
 
@@ -88,8 +91,21 @@ def test_compressed_depth_of_both_kinds_decodes_to_metres() -> None:
 
     np.testing.assert_allclose(convert(converted(plain), DepthImage).data, [[0, 1.5, 40.0]])
     np.testing.assert_allclose(convert(converted(inverse), DepthImage).data, [[0, 2.0]])
-    with pytest.raises(RecordingError, match="RVL"):
+    with pytest.raises(RecordingError, match="RVL image of 0 pixels"):
         converted(ros("sensor_msgs/CompressedImage", format="16UC1; compressedDepth rvl", data=np.zeros(20, np.uint8)))
+
+
+def test_depth_in_rvl_is_read_as_its_encoder_has_it() -> None:
+    """`compressed_depth_image_transport`: int format, float A, B; columns, rows; RVL."""
+    units = np.array([[0, 1500, 1501], [0, 0, 65535]], np.uint16)
+    body = struct.pack("<iff", 0, 40.0, 1.5) + struct.pack("<II", 3, 2) + packed_rvl(units)
+
+    plain = ros("sensor_msgs/CompressedImage", format="16UC1; compressedDepth rvl", data=np.frombuffer(body, np.uint8))
+    inverse = ros("sensor_msgs/CompressedImage", format="32FC1; compressedDepth rvl", data=plain.data)
+
+    np.testing.assert_array_equal(converted(plain).data, units.astype(np.float32) / np.float32(1000))
+    expected = np.where(units > 0, 40.0 / np.maximum(units - 1.5, 1), 0)
+    np.testing.assert_allclose(converted(inverse).data, expected, rtol=1e-6)
 
 
 def info(store: Any = ROS2, **fields: Any) -> Any:
@@ -354,3 +370,38 @@ def test_every_mapped_type_converts_when_all_its_fields_are_empty_or_says_why() 
                 assert isinstance(CONVERSIONS[name][1](made(store, name, {}), STAMP), Message)
             except (RecordingError, MessageError):
                 assert name.rpartition("/")[2] in refused
+
+
+TEMPERATURE = """std_msgs/Header header
+float64 temperature
+float64 variance
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+IDL = """module builtin_interfaces { module msg { struct Time { int32 sec; uint32 nanosec; }; }; };
+module std_msgs { module msg { struct Header { builtin_interfaces::msg::Time stamp; string frame_id; }; }; };
+module sensor_msgs { module msg {
+  struct Temperature { std_msgs::msg::Header header; double temperature; double variance; };
+}; };
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "encoding", "text"),
+    [
+        ("sensor_msgs/msg/Temperature", "ros2msg", TEMPERATURE.replace("\n", "\r\n")),
+        ("sensor_msgs/msg/Temperature", "ros2msg", "\ufeff" + TEMPERATURE),
+        ("sensor_msgs/msg/Temperature", "ros2msg", TEMPERATURE.replace("=" * 80, "=" * 40)),
+        ("sensor_msgs::msg::Temperature", "omgidl", IDL),
+    ],
+    ids=["lines of Windows", "byte order mark", "short rule", "IDL of Foxglove"],
+)
+def test_definitions_are_read_as_other_systems_write_them(name: str, encoding: str, text: str) -> None:
+    sent = ros("sensor_msgs/Temperature", header=header(STAMP), temperature=21.5)
+
+    kind = RosType(name, "cdr", SchemaText(name, encoding, text.encode()))
+
+    assert kind.parse(ROS2.serialize_cdr(sent, sent.__msgtype__)).temperature == 21.5
+    assert kind.name == "sensor_msgs/msg/Temperature"

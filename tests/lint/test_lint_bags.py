@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from made_bags import SECOND, Row, header, ros, transform, write_ros2
+from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from dataflow.cli.main import app
@@ -74,3 +75,21 @@ def test_two_parents_in_one_message_are_an_error(tmp_path: Path) -> None:
     found = told(tmp_path, rows)
 
     assert ("frames", "/tf", "frame 'base' has 2 parents: 'a' (/tf), 'b' (/tf)") in found
+
+
+def test_a_message_that_is_not_json_is_a_finding(tmp_path: Path) -> None:
+    file = tmp_path / "poses.mcap"
+    with file.open("wb") as opened:
+        writer = Writer(opened)
+        writer.start()
+        channel = writer.register_channel("/pose", "json", writer.register_schema("foxglove.PoseInFrame", "", b""))
+        place = {"position": {"x": 1, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+        for k in range(5):
+            sent = {"timestamp": {"sec": k + 1, "nsec": 0}, "frame_id": "map", "pose": place}
+            writer.add_message(channel, k * SECOND, b"{" if k == 3 else json.dumps(sent).encode(), 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+    told = CliRunner().invoke(app, ["lint", str(file), "--json"])
+
+    [found] = [f for f in json.loads(told.stdout)["findings"] if f["check"] == "unreadable"]
+    assert found["text"].startswith("1 messages cannot be read, the first: not JSON")

@@ -215,7 +215,7 @@ def test_keys_are_taken_by_whom_they_were_made_for_alone(keys: Path, tmp_path: P
         require_machine(keys / "robot", "arm")
     with pytest.raises(KeysError, match=r"holds the keys of tools, which join no run"):
         require_machine(keys / "tools", "robot")
-    with pytest.raises(KeysError, match=r"serve nobody: .* --serves ADDRESS"):
+    with pytest.raises(KeysError, match=r"cannot serve: .* --serves ADDRESS"):
         require_serving(keys / "robot")
 
 

@@ -326,9 +326,15 @@ def test_a_foreign_raw_image_is_an_image_or_a_depth_image_by_its_encoding(tmp_pa
         writer = Writer(file)
         writer.start()
         schema = writer.register_schema("foxglove.RawImage", "protobuf", file_descriptor_set(RawImage))
-        kinds = (("/rgb", "rgb8", 5), ("/depth", "32FC1", 3), ("/bayer", "bayer_rggb8", 15), ("/odd", "nv12", 15))
-        for topic, encoding, width in kinds:
-            proto = RawImage(width=width, height=2, encoding=encoding, step=16, data=padded.tobytes())
+        sizes = {
+            "/rgb": ("rgb8", 5, 2),
+            "/depth": ("32FC1", 3, 2),
+            "/bayer": ("bayer_rggb8", 8, 4),
+            "/odd": ("yv12", 15, 2),
+        }
+        for topic, (encoding, width, height) in sizes.items():
+            step = 32 // height
+            proto = RawImage(width=width, height=height, encoding=encoding, step=step, data=padded.tobytes())
             channel = writer.register_channel(topic, "protobuf", schema)
             writer.add_message(channel, log_time=7, publish_time=7, data=proto.SerializeToString())
         writer.finish()

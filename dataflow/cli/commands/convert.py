@@ -30,6 +30,8 @@ from dataflow.cli.support.arguments import (
     existing_recording,
     named_once,
     output_file,
+    refuse_of_recording,
+    window,
 )
 from dataflow.cli.support.output import (
     DIFFERENT,
@@ -163,14 +165,15 @@ def convert(
             from dataflow.view import Save
 
             with _complete(output) as place:
-                drawn = draw_recording(recording, Save(place), streams, without, start, end, clock)
-            account, done = _left_by_rrd(recording)
+                drawn = draw_recording(recording, Save(place), streams, without, start, end, clock, strict=strict)
+            done = _left_by_rrd(recording)
             if json:
-                print_json(drawn_as_json(drawn[0], output) | {"left_out": done.left_out, "source": account.as_json()})
+                told = {"left_out": done.left_out, "source": drawn.account.as_json()}
+                print_json(drawn_as_json(drawn.sink, output) | told)
+                _fail_if_short(drawn.account)
             else:
-                report(*drawn, output)
                 _print_left_out(done)
-            _fail_if_short(account)
+                report(drawn, output)
             return
         from dataflow.interop.playing import Wishes
 
@@ -205,7 +208,7 @@ def convert(
     _fail_if_short(account)
 
 
-def _left_by_rrd(recording: Path) -> tuple[Account, Exported]:
+def _left_by_rrd(recording: Path) -> Exported:
     from dataflow.interop.export.extras import tell_left_out
     from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
@@ -213,7 +216,7 @@ def _left_by_rrd(recording: Path) -> tuple[Account, Exported]:
     done = Exported()
     with Material(recording) as material:
         tell_left_out(material, "rrd", done)
-        return material.account, done
+        return done
 
 
 def _print_left_out(done: Exported) -> None:
@@ -289,22 +292,28 @@ def _opened(
         names = [*whole.streams, *(t.name for t in whole.untouched)]
         namespace, metadata = "", {}
         if not whole.foreign:
+            refuse_of_recording(path, clock, strict=wishes.strict)
             from dataflow.recording import Recording
 
             with Recording(path) as opened:
                 metadata = opened.metadata
                 namespace = metadata.get(RECORDING, {}).get("namespace", "")
         chosen = chosen_streams(words, names, namespace, without) if words or without else None
-        firsts = [i.first for i in whole.streams.values() if i.first is not None and not i.static]
-        firsts += [t.first for t in whole.untouched if t.first is not None]
         part = None if whole.foreign else cut_of(metadata)
-        first = min(firsts, default=0) if part is None or part.start is None else part.start
+        begin, finish = window(_span(whole, None if part is None else part.start), start, end, path)
         if whole.clock:
             say(f"[dim]stamps: {escape(whole.clock)}[/]")
-    begin = None if start is None else first + round(start * 1e9)
-    finish = None if end is None else first + round(end * 1e9)
     with Material(path, chosen, clock, begin, finish, wishes) as material:
         yield material
+
+
+def _span(whole: Material, begin: int | None) -> tuple[int, int] | None:
+    """The first and the last stamp (ns) of all but static streams; `begin`: where a part begins."""
+    spans = [(i.first, i.last, 0) for i in whole.streams.values() if not i.static]
+    spans += [(t.first, t.last, whole.shift) for t in whole.untouched]
+    times = [(first + shift, last + shift) for first, last, shift in spans if first is not None and last is not None]
+    first = min((first for first, _ in times), default=0) if begin is None else begin
+    return (first, max(last for _, last in times)) if times else None
 
 
 def _export(

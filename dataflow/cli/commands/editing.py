@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -18,13 +19,17 @@ from dataflow.cli.support.material import (
     Word,
     asked_span,
     copying,
+    fail_if_lost,
     opened_material,
-    print_edited,
     print_unknown,
     refuse_itself,
+    tell_edited,
 )
-from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, seconds, size, table
+from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, say, seconds, size, table
 from dataflow.cli.support.quantities import parsed_duration, parsed_size
+
+if TYPE_CHECKING:
+    from dataflow.editing.report import Edited
 
 
 def cut(
@@ -57,6 +62,7 @@ def cut(
     Exit codes:
 
       0    written
+      1    written, without messages that damage keeps from being read (of another program's file)
       2    could not cut: a wrong option, a file that cannot be read
 
     Examples:
@@ -75,10 +81,7 @@ def cut(
         done = write_part(
             origin, Part(*part, bare=bare), output, compression=compression, overwrite=overwrite, watch=watch
         )
-    if json:
-        print_json(done.as_json())
-    else:
-        print_edited(done)
+    tell_edited(done, json=json)
 
 
 def filter_(
@@ -103,6 +106,7 @@ def filter_(
     Exit codes:
 
       0    written
+      1    written, without messages that damage keeps from being read (of another program's file)
       2    could not filter: no stream matches, a file that cannot be read
 
     Examples:
@@ -120,10 +124,7 @@ def filter_(
         names = sorted(origin.counts())
         kept = chosen_streams(streams, names, origin.namespace, without)
         done = write_part(origin, Part(streams=kept), output, compression=compression, overwrite=overwrite, watch=watch)
-    if json:
-        print_json(done.as_json())
-    else:
-        print_edited(done)
+    tell_edited(done, json=json)
 
 
 def split(
@@ -151,6 +152,7 @@ def split(
     Exit codes:
 
       0    written
+      1    written, without messages that damage keeps from being read (of another program's file)
       2    could not split: a wrong option, a file that cannot be read
 
     Examples:
@@ -173,7 +175,12 @@ def split(
         )
     if json:
         print_json([one.as_json() for one in done])
-        return
+    else:
+        _print_parts(done, target)
+    fail_if_lost(done)
+
+
+def _print_parts(done: Sequence[Edited], target: Path) -> None:
     made = table("part", "begins", "lasts", "messages", "size", right=("begins", "lasts", "messages", "size"))
     first = next((one.span[0] for one in done if one.span is not None), 0)
     for one in done:
@@ -181,5 +188,7 @@ def split(
         row = (f"{(low - first) * 1e-9:.2f} s", seconds((high - low) * 1e-9), count(one.messages), size(one.bytes))
         made.add_row(Text(Path(one.path).name), *row)
     out.print(made)
+    for note in (note for one in done if one.lost for note in one.notes):
+        say(f"[yellow]{escape(note)}[/]")
     print_unknown({name for one in done for name in one.unknown})
     out.print(f"wrote {plural(len(done), 'part')} to {escape(str(target))}", soft_wrap=True)

@@ -99,12 +99,13 @@ def _play(
     end: float | None,
     stamps: Choice,
 ) -> None:
-    from dataflow.cli.support.drawing import opened_streams
+    from dataflow.cli.support.drawing import account_of, opened_streams, say_account
     from dataflow.foxglove import player
     from dataflow.foxglove.server import FoxgloveServer
     from dataflow.recording.layout import RECORDING
 
     with opened_streams(path, stamps) as opened:
+        known = account_of(opened).lines()
         readable = [name for name, info in opened.streams.items() if info.message_type is not None]
         namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
         chosen = chosen_streams(words, readable, namespace)
@@ -134,6 +135,7 @@ def _play(
                 player.play(opened, chosen, clock, show, arrived=arrived, ended=ended)
             except KeyboardInterrupt:
                 say("ended")
+        say_account(opened, known)
     out.print(f"shown: {plural(server.shown, 'message')}")
 
 

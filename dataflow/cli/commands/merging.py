@@ -17,8 +17,8 @@ from dataflow.cli.support.material import (
     Quiet,
     copying,
     opened_material,
-    print_edited,
     refuse_itself,
+    tell_edited,
 )
 from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, say, shown, size, table
 
@@ -52,6 +52,7 @@ def merge(
     Exit codes:
 
       0    written
+      1    written, without messages that damage keeps from being read (of another program's file)
       2    could not merge: streams of one name, a file that cannot be read
 
     Examples:
@@ -76,10 +77,7 @@ def merge(
         watch = stack.enter_context(copying("merging", quiet or json))
         done = merge_all(origins, output, prefixes=prefixes, compression=compression, overwrite=overwrite, watch=watch)
         done.notes += [f"{path} {NOTHING_IN_IT}" for path in empty]
-    if json:
-        print_json(done.as_json())
-    else:
-        print_edited(done)
+    tell_edited(done, json=json)
 
 
 def _prefixes(words: Sequence[str], recordings: Sequence[Path]) -> list[str]:
@@ -137,7 +135,7 @@ def recover(
         if is_ros_bag(recording):
             from dataflow.editing.recover_bag import recover_bag
 
-            done = recover_bag(recording, output)
+            done = recover_bag(recording, output, compression=compression)
         else:
             done = save(recording, output, compression=compression, overwrite=overwrite, watch=watch)
         shown([NO_END, *done.damage])

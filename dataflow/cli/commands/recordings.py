@@ -63,9 +63,9 @@ def info(
 
     with friendly_errors():
         if is_foreign(existing_recording(recording)):
-            if digests or metadata:
-                raise fail("--digests and --metadata tell of recordings; of a bag there are neither")
-            describe_bag(recording, json=json)
+            if digests:
+                raise fail("--digests tells of recordings; messages of a bag have none")
+            describe_bag(recording, metadata=metadata, json=json)
             return
     with friendly_errors(), Recording(recording) as opened:
         described = describe(opened)

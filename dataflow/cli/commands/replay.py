@@ -26,6 +26,7 @@ from dataflow.cli.support.arguments import (
     find_modules_in,
     graph_file,
     output_file,
+    refuse_of_recording,
     span,
     window,
 )
@@ -178,6 +179,7 @@ def replay(
             words = (recording, given, maps or (), clock, start, end, outputs, options)
             replay_bag(*words, strict=strict, began=began, json=json, quiet=quiet, verbose=verbose)
             return
+        refuse_of_recording(recording, clock, strict=strict)
         with Recording(recording) as opened:
             loaded = _recorded_graph(opened, network=network) if given is None else given
             if complete is not None:

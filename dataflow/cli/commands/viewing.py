@@ -25,7 +25,7 @@ from dataflow.cli.support.arguments import (
     existing_recording,
     output_file,
 )
-from dataflow.cli.support.drawing import Announcer, draw_recording, open_sink, report, showing, until_interrupted
+from dataflow.cli.support.drawing import Announcer, Drawn, draw_recording, open_sink, report, showing, until_interrupted
 from dataflow.cli.support.output import fail, friendly_errors, say
 
 if TYPE_CHECKING:
@@ -92,10 +92,10 @@ def view(
                 raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
             path = existing_recording(recording)
             target = _target(to, overwrite)
-            report(*draw_recording(path, target, streams, without, start, end, clock, every))
+            report(draw_recording(path, target, streams, without, start, end, clock, every))
         else:
-            if start is not None or end is not None:
-                raise fail("--start and --end are about a recording; name one")
+            if start is not None or end is not None or without or clock != "auto":
+                raise fail("--start, --end, --without and --clock are about a recording; name one")
             _view_running(_target(to, overwrite), streams, graph, wait, every, until_end=until_end)
 
 
@@ -193,7 +193,9 @@ def _draw_running(
             say("the graph has ended; still serving until Ctrl-C")
             until_interrupted()
         complete = sink.close(timeout=60.0)
-    report(sink, complete)
+    from dataflow.interop.account import Account
+
+    report(Drawn(sink, complete, Account()))
 
 
 def _types(running: Graph, chosen: list[str], logs: str | None) -> dict[str, type[Message]]:

@@ -14,7 +14,20 @@ from rich.text import Text
 
 from dataflow.cli.support.arguments import span, window
 from dataflow.cli.support.execution import Outputs, execute
-from dataflow.cli.support.output import DIFFERENT, count, err, out, plural, print_json, say, seconds, shown, size, table
+from dataflow.cli.support.output import (
+    DIFFERENT,
+    count,
+    err,
+    fail,
+    out,
+    plural,
+    print_json,
+    say,
+    seconds,
+    shown,
+    size,
+    table,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,6 +35,7 @@ if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.interop.playing import Matching
     from dataflow.interop.streams import BagStreams
+    from dataflow.recording.mcap.index import McapFile
 
 
 def replay_bag(
@@ -72,20 +86,21 @@ def replay_bag(
             if kept and not quiet:
                 names = ", ".join(sorted(kept))
                 say(f"[dim]kept as they are: {plural(sum(kept.values()), 'message')} of {escape(names)}[/]")
-        if start is None and end is None:
-            _say_what_was_not_read(opened, {name: held for name, (held, _) in report.streams.items()})
+        _say_what_was_not_read(opened, {name: held for name, (held, _) in report.streams.items()}, begin, finish)
         if opened.account.short:
             raise typer.Exit(DIFFERENT)
 
 
-def _say_what_was_not_read(opened: BagStreams, delivered: Mapping[str, int]) -> None:
-    """Of topics that came with fewer messages than the bag holds of them: how many, and why."""
+def _say_what_was_not_read(
+    opened: BagStreams, delivered: Mapping[str, int], begin: int | None, end: int | None
+) -> None:
+    """Of topics that came with fewer messages than the bag holds of them in the span: how many, and why."""
     missing = {
         played.topic
         for stream, played in opened.played.items()
-        if not played.static and delivered.get(stream, 0) < opened.streams[stream].count
+        if not played.static and delivered.get(stream, 0) < sum(1 for _ in opened.stamps(stream, begin, end))
     }
-    opened.look_for_unread(missing)
+    opened.look_for_unread(missing, begin, end)
     for topic, unread in opened.account.unread.items():
         say(
             f"[yellow]{escape(topic)}: {plural(unread.count, 'message')} that cannot be read passed over, the first: "
@@ -119,8 +134,9 @@ def _counting(quiet: bool) -> Iterator[Callable[[int], None] | None]:
         yield lambda seen: progress.update(task, description=f"reading times · {count(seen)} messages")
 
 
-def describe_bag(path: Path, *, json: bool) -> None:
-    """Prints the topics of a bag: types, counts, rates, and what each can be played as."""
+def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
+    """Prints the topics of a bag: types, counts, rates, and what each can be played as; of MCAP files what they hold
+    besides, with `metadata` all of it."""
     from dataflow.interop.bag import shortfalls
     from dataflow.interop.opening import open_bag
     from dataflow.interop.playing import readings_of
@@ -131,12 +147,18 @@ def describe_bag(path: Path, *, json: bool) -> None:
     try:
         rows = summaries(bag, readings_of(bag))
         kind, notes = bag.kind, (*bag.notes, *shortfalls(bag))
+        files: Sequence[McapFile] = getattr(bag, "files", ())
+        records = [(name, values) for file in files for name, values in file.metadata]
+        attached = sum(file.attached for file in files)
     finally:
         bag.close()
     shown(notes)
     whole = total(rows)
+    if metadata and not records:
+        raise fail(f"--metadata: {path} ({kind}) holds no metadata records")
     if json:
         facts = {"path": str(path), "format": kind, "notes": list(notes), "bytes": _bytes(path)}
+        facts |= {"attachments": attached, "metadata": [{"name": name, "values": values} for name, values in records]}
         print_json(facts | {"topics": [row.as_json() for row in rows]} | whole.as_json())
         return
     grid = table("", "")
@@ -149,6 +171,8 @@ def describe_bag(path: Path, *, json: bool) -> None:
         *((("from", format_stamp(whole.first)), ("to", format_stamp(whole.last))) if whole.messages else ()),
         ("duration", seconds(whole.duration * 1e-9)),
         ("messages", count(whole.messages)),
+        *((("attachments", count(attached)),) if attached else ()),
+        *((("metadata", f"{', '.join(name for name, _ in records)} (--metadata prints it)"),) if records else ()),
     ):
         grid.add_row(Text(name, style="dim"), Text(value))
     out.print(grid)
@@ -159,6 +183,11 @@ def describe_bag(path: Path, *, json: bool) -> None:
         notes_of = ", ".join(row.notes)
         made.add_row(*map(Text, (row.topic, row.type, count(row.count), rate, " or ".join(row.read_as), notes_of)))
     out.print(made)
+    for name, values in records if metadata else ():
+        told = table(name, "")
+        for key, value in values.items():
+            told.add_row(Text(key), Text(value))
+        out.print(told)
 
 
 def _bytes(path: Path) -> int:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +13,25 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.support.arguments import chosen_streams, span, window
+from dataflow.cli.support.arguments import chosen_streams, refuse_of_recording, span, window
 from dataflow.cli.support.output import DIFFERENT, err, fail, out, plural, say, size
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
+    from dataflow.interop.account import Account
     from dataflow.interop.clocks import Choice
     from dataflow.interop.streams import BagStreams
     from dataflow.recording import Recording
     from dataflow.view import Target, ViewerSink
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """The viewer, closed; whether it took everything; and what there is to say of a bag."""
+
+    sink: ViewerSink
+    complete: bool
+    account: Account
 
 
 def draw_recording(
@@ -33,14 +43,17 @@ def draw_recording(
     end: float | None,
     clock: Choice,
     every: float | None = None,
-) -> tuple[ViewerSink, bool]:
-    """Draws a recording or a bag; returns the viewer, closed, and whether it took everything."""
+    *,
+    strict: bool = False,
+) -> Drawn:
+    """Draws a recording or a bag. `strict`: what cannot be read of a bag is an error, else it is counted."""
     from rich.progress import BarColumn, Progress, TextColumn
 
     from dataflow.recording.layout import RECORDING
     from dataflow.view import Serve, from_recording
 
-    with opened_streams(path, clock) as opened:
+    with opened_streams(path, clock, strict=strict) as opened:
+        known = account_of(opened).lines()
         readable = [name for name, info in opened.streams.items() if info.message_type is not None]
         if not readable:
             raise fail(f"{path} holds no stream that can be drawn; see: dataflow info {path}")
@@ -77,24 +90,49 @@ def draw_recording(
                 say(f"all {plural(handed, 'message')} sent; serving until Ctrl-C")
                 until_interrupted()
             complete = sink.close(timeout=60.0)
-    return sink, complete
+        say_account(opened, known)
+        return Drawn(sink, complete, account_of(opened))
 
 
-def opened_streams(path: Path, clock: Choice) -> Recording | BagStreams:
+def opened_streams(path: Path, clock: Choice, *, strict: bool = False) -> Recording | BagStreams:
     """Opens a recording, or a bag with every topic that a message type fits; prints which clock its stamps are of."""
     from dataflow.interop.opening import is_foreign, open_bag
     from dataflow.recording import Recording
 
     if not is_foreign(path):
+        refuse_of_recording(path, clock, strict=strict)
         return Recording(path)
-    from dataflow.interop.playing import readable
+    from dataflow.interop.playing import Wishes, readable
 
-    with closing(open_bag(path)) as bag:
-        streams = readable(bag, path, clock)
+    with closing(open_bag(path, strict=strict)) as bag:
+        streams = readable(bag, path, clock, wishes=Wishes(strict=strict))
     say(f"[dim]stamps: {escape(streams.clock.kind)}: {escape(streams.clock.why)}[/]")
-    for line in streams.account.lines():
-        say(f"[yellow]{escape(line)}[/]")
+    say_account(streams)
     return streams
+
+
+def say_account(opened: Recording | BagStreams, but: Collection[str] = ()) -> None:
+    """Says what was found of a bag, except the lines that are known; some comes to light when messages are read."""
+    from dataflow.recording import Recording
+
+    if isinstance(opened, Recording):
+        return
+    found = account_of(opened).lines()
+    for line in found:
+        if line not in but:
+            say(f"[yellow]{escape(line)}[/]")
+
+
+def account_of(opened: Recording | BagStreams) -> Account:
+    from dataflow.interop.account import Account
+    from dataflow.recording import Recording
+    from dataflow.recording.mcap.index import NO_END
+
+    if isinstance(opened, Recording):
+        name = opened.path.name
+        return Account([*([f"{name} {NO_END}"] if opened.torn else []), *(f"{name}: {what}" for what in opened.damage)])
+    opened.recount()
+    return opened.account
 
 
 def _graph_of(opened: Recording | BagStreams) -> Graph | None:
@@ -150,11 +188,11 @@ class Announcer:
         return announced
 
 
-def report(sink: ViewerSink, complete: bool, file: Path | None = None) -> None:
+def report(done: Drawn, file: Path | None = None) -> None:
     """Says how much was drawn, and where it is: in `file`, if it was moved there."""
     from dataflow.view import Save
 
-    drawn = sink.statistics()
+    sink, drawn = done.sink, done.sink.statistics()
     parts = [plural(drawn.drawn, "message")]
     if drawn.dropped:
         parts.append(f"{drawn.dropped:,} skipped because the viewer was too slow")
@@ -167,7 +205,7 @@ def report(sink: ViewerSink, complete: bool, file: Path | None = None) -> None:
         out.print(f"wrote {escape(str(path))} ({', '.join(parts)}, {size(path.stat().st_size)})", soft_wrap=True)
     else:
         out.print(f"shown: {', '.join(parts)}")
-    if not complete or drawn.failed:
+    if not done.complete or drawn.failed or done.account.short:
         raise typer.Exit(DIFFERENT)
 
 

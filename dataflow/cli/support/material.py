@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -13,7 +13,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from dataflow.cli.support.arguments import FLAG, existing
-from dataflow.cli.support.output import count, err, fail, out, plural, say, seconds, size, table
+from dataflow.cli.support.output import (
+    DIFFERENT,
+    count,
+    err,
+    fail,
+    out,
+    plural,
+    print_json,
+    say,
+    seconds,
+    size,
+    table,
+)
 from dataflow.cli.support.quantities import parsed_duration, parsed_moment
 
 if TYPE_CHECKING:
@@ -36,7 +48,8 @@ Word = str | None
 
 @contextmanager
 def opened_material(path: Path) -> Iterator[Origin]:
-    """An MCAP file; other bags are answered with what makes one of them."""
+    """An MCAP file, another program's as far as it can be read; other bags are answered with what makes one of them."""
+    from dataflow.interop.opening import is_foreign
     from dataflow.recording.mcap.ending import MAGIC
     from dataflow.recording.streams.copying import Origin
 
@@ -47,7 +60,7 @@ def opened_material(path: Path) -> Iterator[Origin]:
         head = file.read(len(MAGIC))
     if head != MAGIC and path.suffix in (".bag", ".db3"):
         raise fail(f"{path} is no MCAP file; make one of it: {converting(path)}")
-    with Origin(path) as origin:
+    with Origin(path, lenient=head == MAGIC and is_foreign(path)) as origin:
         yield origin
 
 
@@ -102,7 +115,22 @@ def copying(what: str, hidden: bool) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
-def print_edited(done: Edited) -> None:
+def tell_edited(done: Edited, *, json: bool) -> None:
+    """Prints what was written; the exit code is 1 where something of it is lost."""
+    if json:
+        print_json(done.as_json())
+    else:
+        _print_edited(done)
+    fail_if_lost([done])
+
+
+def fail_if_lost(done: Iterable[Edited]) -> None:
+    """The exit code is 1 where a file that was written lacks messages."""
+    if any(one.lost for one in done):
+        raise typer.Exit(DIFFERENT)
+
+
+def _print_edited(done: Edited) -> None:
     made = table("stream", "messages", right=("messages",))
     for name, number in done.streams.items():
         made.add_row(Text(name), count(number))

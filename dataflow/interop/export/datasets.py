@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,10 @@ from dataflow.interop.export.frames import (
     DEPTHS,
     IMAGES,
     POSES,
+    as_kind,
     messages_as,
-    nearest,
     optional,
+    together,
     write_depth,
     write_png,
     write_rows,
@@ -28,6 +29,7 @@ from dataflow.messages import (
     DepthImage,
     Image,
     Imu,
+    Message,
     Pose,
     Transforms,
 )
@@ -69,34 +71,32 @@ def export_tum(material: Material, folder: Path, done: Exported) -> None:
 
 def export_7scenes(material: Material, folder: Path, done: Exported) -> None:
     """Writes frame-NNNNNN.color.png, .depth.png (millimetres) and .pose.txt, and camera-intrinsics.txt."""
-    images = {m.stamp: m for m in messages_as(material, material.only("7-Scenes", *IMAGES), Image, done)}
-    poses = {m.stamp: m for m in messages_as(material, optional(material, *POSES), Pose, done)}
+    images, depths = (material.only("7-Scenes", *kinds) for kinds in (IMAGES, DEPTHS))
+    poses = optional(material, *POSES)
+    others: dict[str, type[Message]] = {images: Image} if poses is None else {images: Image, poses: Pose}
+    used: dict[str, set[int]] = {stream: set() for stream in others}
     count = 0
-    taken: set[int] = set()
-    placed: set[int] = set()
-    depths = material.only("7-Scenes", *DEPTHS)
-    for depth in messages_as(material, depths, DepthImage, done):
-        image = nearest(images, depth.stamp)
-        if image is None:
+    for recorded, found in together(material, depths, others, done):
+        depth = as_kind(material, recorded, DepthImage, done)
+        if found[images] is None:
             done.lose(material.names[depths], "depth without an image within 20 ms, left out")
             continue
-        taken.add(image.stamp)
         stem = f"frame-{count:06d}"
-        write_png(folder / f"{stem}.color.png", image)
+        write_png(folder / f"{stem}.color.png", found[images])
         write_depth(folder / f"{stem}.depth.png", depth, SCENES_UNITS, material.names[depths], done)
-        pose = nearest(poses, depth.stamp)
+        pose = None if poses is None else found[poses]
         if pose is not None:
-            assert isinstance(pose, Pose)
-            placed.add(pose.stamp)
             rows = transform_matrix(pose.position, pose.orientation)
             write_text(folder / f"{stem}.pose.txt", _matrix_text(rows), None)
+        for stream, message in found.items():
+            used[stream] |= set() if message is None else {message.stamp}
         count += 1
     if not count:
         raise RecordingError(f"{material.path}: no image lies within 20 ms of a depth image")
-    for what, messages, used in (("image", images, taken), ("pose", poses, placed)):
-        if left := len(messages) - len(used):
-            stream = material.only("7-Scenes", *IMAGES) if what == "image" else optional(material, *POSES)
-            done.lose(material.names[stream or ""], f"{what} of which no frame was made, left out", left)
+    for stream, stamps in used.items():
+        if left := done.written.get(material.names[stream], 0) - len(stamps):
+            what = "image" if stream == images else "pose"
+            done.lose(material.names[stream], f"{what} of which no frame was made, left out", left)
     done.files.append(str(folder))
     _intrinsics(material, folder, done)
 
@@ -134,21 +134,15 @@ def export_euroc(material: Material, folder: Path, done: Exported) -> None:
 def export_kitti(material: Material, folder: Path, done: Exported) -> None:
     """Writes image_0/ (and image_1/ for a second camera), times.txt, calib.txt and poses.txt, as KITTI odometry.
 
-    The first camera's frames count; a frame without its partner ends the command. Times begin at 0.
+    The first camera's frames count, which have one of the second camera of their stamp. Times begin at 0.
     """
     cameras = material.of_type(*IMAGES)[:2]
     if not cameras:
         raise RecordingError(f"{material.path}: KITTI odometry takes images; there are none")
-    stamps: list[list[int]] = []
-    for k, stream in enumerate(cameras):
-        stamps.append([])
-        for message in messages_as(material, stream, Image, done):
-            write_png(folder / f"image_{k}" / f"{len(stamps[k]):06d}.png", message)
-            stamps[k].append(message.stamp)
-    if len(cameras) == 2 and stamps[0] != stamps[1]:
-        raise RecordingError(f"{material.path}: the two cameras' images do not have the same stamps")
-    first = stamps[0][0] if stamps[0] else 0
-    write_text(folder / "times.txt", "".join(f"{(s - first) * 1e-9:e}\n" for s in stamps[0]), done)
+    stamps = _write_pairs(material, cameras, folder, done)
+    if not stamps:
+        raise RecordingError(f"{material.path}: no image of the one camera has the stamp of one of the other")
+    write_text(folder / "times.txt", "".join(f"{(s - stamps[0]) * 1e-9:e}\n" for s in stamps), done)
     infos = [m for name in material.of_type(CameraInfo) for m in material.messages([name])][: len(cameras)]
     lines = []
     for k, found in enumerate(infos):
@@ -158,14 +152,45 @@ def export_kitti(material: Material, folder: Path, done: Exported) -> None:
         lines.append(f"P{k}: " + " ".join(f"{v:.12e}" for v in P.ravel()))
     if lines:
         write_text(folder / "calib.txt", "\n".join(lines) + "\n", done)
-    truth = {m.stamp: m for m in messages_as(material, optional(material, *POSES), Pose, done)}
-    if truth:
-        poses = [nearest(truth, stamp) for stamp in stamps[0]]
-        if any(pose is None for pose in poses):
-            done.left_out["poses.txt"] = "some images have no pose within 20 ms"
-        else:
-            rows = [transform_matrix(p.position, p.orientation)[:3].ravel() for p in poses if isinstance(p, Pose)]
-            write_text(folder / "poses.txt", "".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows), done)
+    poses = optional(material, *POSES)
+    if poses is not None:
+        _write_poses(material, cameras[0], poses, set(stamps), folder, done)
+
+
+def _write_pairs(material: Material, cameras: Sequence[str], folder: Path, done: Exported) -> list[int]:
+    """Writes the images of one camera, or those of two that have one stamp; the stamps."""
+    stamps: list[int] = []
+    waiting: dict[str, Any] = {}
+    for recorded in material.messages(cameras):
+        if waiting and next(iter(waiting.values())).stamp != recorded.message.stamp:
+            _lose_unpaired(material, waiting, done)
+        waiting[recorded.stream] = as_kind(material, recorded, Image, done)
+        if len(waiting) == len(cameras):
+            for k, stream in enumerate(cameras):
+                write_png(folder / f"image_{k}" / f"{len(stamps):06d}.png", waiting[stream])
+            stamps.append(recorded.message.stamp)
+            waiting.clear()
+    _lose_unpaired(material, waiting, done)
+    return stamps
+
+
+def _lose_unpaired(material: Material, waiting: dict[str, Any], done: Exported) -> None:
+    for stream in waiting:
+        done.lose(material.names[stream], "an image without one of the other camera of its stamp, left out")
+    waiting.clear()
+
+
+def _write_poses(
+    material: Material, camera: str, poses: str, stamps: Container[int], folder: Path, done: Exported
+) -> None:
+    """Writes the pose of each image, the nearest within 20 ms; none where some image has none."""
+    paired = together(material, camera, {poses: Pose}, done)
+    found = [near[poses] for image, near in paired if image.message.stamp in stamps]
+    if any(pose is None for pose in found):
+        done.left_out["poses.txt"] = "some images have no pose within 20 ms"
+        return
+    rows = [transform_matrix(pose.position, pose.orientation)[:3].ravel() for pose in found if pose is not None]
+    write_text(folder / "poses.txt", "".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows), done)
 
 
 def tell_untaken(material: Material, what: str, done: Exported) -> None:

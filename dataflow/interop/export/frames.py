@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from dataflow.messages import (
     Odometry,
     Pose,
 )
+from dataflow.recording import Recorded
 from dataflow.recording.errors import RecordingError
 
 PAIR_WITHIN = 20_000_000
@@ -38,19 +41,52 @@ def optional(material: Material, *types: type[Message]) -> str | None:
 def messages_as(material: Material, stream: str | None, kind: type[Message], done: Exported) -> Iterator[Any]:
     """The messages of a stream as one type; images of 16 bits stay such, since PNG holds them."""
     for recorded in material.messages([stream]) if stream is not None else ():
-        name = material.names[recorded.stream]
-        done.count(name)
-        message = recorded.message
-        if (lost := NARROWING.get((type(message), kind))) is not None and not isinstance(message, Image16):
-            done.lose(name, lost)
-        yield message if kind is Image and isinstance(message, Image16) else convert(message, kind)
+        message = as_kind(material, recorded, kind, done)
+        if message is not None:
+            yield message
 
 
-def nearest(messages: dict[int, Any], stamp: int) -> Any | None:
-    if stamp in messages:
-        return messages[stamp]
-    near: int | None = min(messages, key=lambda s: abs(s - stamp), default=None)
-    return messages[near] if near is not None and abs(near - stamp) <= PAIR_WITHIN else None
+def as_kind(material: Material, recorded: Recorded, kind: type[Message], done: Exported) -> Any:
+    """A message as another type, counted; None for a pose that is none, which is left out."""
+    name, message = material.names[recorded.stream], recorded.message
+    done.count(name)
+    if (lost := NARROWING.get((type(message), kind))) is not None and not isinstance(message, Image16):
+        done.lose(name, lost)
+    made = message if kind is Image and isinstance(message, Image16) else convert(message, kind)
+    if isinstance(made, Pose) and not np.isfinite(made.position).all():
+        done.lose(name, "a pose that is not finite, left out")
+        return None
+    return made
+
+
+def together(
+    material: Material, anchor: str, others: Mapping[str, type[Message]], done: Exported
+) -> Iterator[tuple[Recorded, dict[str, Any]]]:
+    """Each message of a stream with the nearest one of every other, as its type, if there is one within `PAIR_WITHIN`;
+    of two as near the earlier. What is farther from all that are to come is not held.
+    """
+    waiting: deque[Recorded] = deque()
+    held: dict[str, deque[Any]] = {stream: deque() for stream in others}
+    for recorded in chain(material.messages([anchor, *others]), [None]):
+        now = None if recorded is None else recorded.message.stamp
+        while waiting and (now is None or waiting[0].message.stamp + PAIR_WITHIN < now):
+            first = waiting.popleft()
+            yield first, {stream: _nearest(messages, first.message.stamp) for stream, messages in held.items()}
+        if recorded is None or now is None:
+            return
+        if recorded.stream == anchor:
+            waiting.append(recorded)
+        elif (message := as_kind(material, recorded, others[recorded.stream], done)) is not None:
+            held[recorded.stream].append(message)
+        oldest = waiting[0].message.stamp if waiting else now
+        for messages in held.values():
+            while messages and messages[0].stamp < oldest - PAIR_WITHIN:
+                messages.popleft()
+
+
+def _nearest(messages: Iterable[Any], stamp: int) -> Any | None:
+    found = min(messages, key=lambda message: abs(message.stamp - stamp), default=None)
+    return found if found is not None and abs(found.stamp - stamp) <= PAIR_WITHIN else None
 
 
 def write_png(path: Path, message: Image | Image16) -> None:

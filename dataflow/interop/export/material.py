@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from dataflow.interop.account import Account
-from dataflow.interop.bag import Bag, BagError, Stored, Topic
+from dataflow.interop.bag import Bag, BagError, Stored, Topic, shortfalls
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign, open_bag
 from dataflow.interop.playing import PLAIN, Wishes, readable
@@ -52,7 +52,7 @@ class Material:
     ) -> None:
         self.path, self.foreign = Path(path), is_foreign(Path(path))
         self._source: Recording | BagStreams | None = None
-        self.bag: Bag = open_bag(self.path)
+        self.bag: Bag = open_bag(self.path, strict=wishes.strict)
         self.start, self.end = start, end
         try:
             if self.foreign:
@@ -99,10 +99,17 @@ class Material:
     def facts(self) -> dict[str, str]:
         """Metadata of a recording that was made of a bag; complete when all messages have been read."""
         assert isinstance(self._source, BagStreams)
+        self._count_lost()
         told = {name: text for name, text in self._source.facts().items() if name != "topics"}
         account = self.account.as_json()
         kept = {name: json.dumps(account[name], ensure_ascii=False) for name in ("unread", "lost") if account[name]}
         return told | kept
+
+    def _count_lost(self) -> None:
+        """Takes into the account what damage has kept from being read."""
+        if isinstance(self._source, BagStreams):
+            self.bag.lost.join(self._source.lost)
+            self.account.short[:] = shortfalls(self.bag)
 
     @property
     def clock(self) -> str:
@@ -147,9 +154,10 @@ class Material:
 
     def close(self) -> None:
         """Closes the files. Idempotent."""
-        self.bag.close()
         if self._source is not None:
+            self._count_lost()
             self._source.close()
+        self.bag.close()
 
     def __enter__(self) -> Self:
         return self

@@ -41,6 +41,8 @@ def point_cloud(message: Any, stamp: int, period: float = TYPICAL_PERIOD) -> Poi
         raise RecordingError(
             f"a cloud whose field {many[0]} has {points[many[0]].shape[1]} values a point, 1 is wanted"
         )
+    if whole := [axis for axis in "xyz" if points[axis].dtype.kind in "iu"]:
+        lose(message, f"the unit of {', '.join(whole)}, whole numbers, which are read as metres")
     times = _found(names, _TIMES)
     offsets, odd = None, ""
     if times is not None and points[times].ndim == 1:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.interop.conversions import decoded, rgb
+from dataflow.interop.conversions import decoded, inverse_depth, rgb
+from dataflow.interop.ros.rvl import unpacked_rvl
 from dataflow.interop.ros.values import first, known, optional
 from dataflow.interop.seen import lose
 from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, CompressedVideo, DepthImage, Image, Image16
@@ -22,27 +23,35 @@ from dataflow.recording.streams.pixels import (
     is_16_bit,
     is_depth,
     row_bytes,
+    stored_height,
     stored_rows,
 )
 
 _DEPTH_HEADER = struct.Struct("<iff")
 """The header that compressed_depth_image_transport puts before the PNG: format, quantisation parameters A and B."""
+_RVL_SIZE = struct.Struct("<II")
+"""Columns and rows, which it puts before RVL data."""
 _DEPTH_UNIT = 0.001
 
 
 Raw = Image | Image16 | DepthImage
 _CONVERTED = {
-    "rgba8": "the alpha channel",
-    "bgra8": "the alpha channel",
+    **dict.fromkeys(("rgba8", "bgra8", "8UC4", "rgba16", "bgra16", "16UC4"), "the alpha channel"),
     **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), "YUV 4:2:2 (it is RGB here, each value rounded)"),
-    **dict.fromkeys(("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"), "the Bayer mosaic (interpolated)"),
+    **dict.fromkeys(("nv12", "nv21"), "YUV 4:2:0 (it is RGB here, each value rounded)"),
+    "nv24": "YUV (it is RGB here, each value rounded)",
+    **{
+        f"bayer_{pattern}{bits}": "the Bayer mosaic (interpolated)"
+        for pattern in ("rggb", "bggr", "gbrg", "grbg")
+        for bits in (8, 16)
+    },
 }
 """By encoding, what an `Image` does not hold of it."""
 
 
 def image(message: Any, stamp: int) -> Raw:
     """sensor_msgs/Image: depth for a depth encoding, and all 16 bits of greys and colours that have them."""
-    step, height = int(message.step), int(message.height)
+    step, height = int(message.step), stored_height(message.encoding, int(message.height))
     used = row_bytes(message.encoding, message.width)
     if 0 < step < used and len(message.data) == used * height:
         lose(message, f"a step of {step:,}, where rows have {used:,} bytes")
@@ -56,17 +65,19 @@ def image(message: Any, stamp: int) -> Raw:
         big_endian=bool(message.is_bigendian),
     )
     frame = message.header.frame_id
-    rest = len(message.data) - message.height * (step or rows[0].nbytes)
+    rest = len(message.data) - height * (step or rows[0].nbytes)
     if rest > 0:
         lose(message, f"{rest:,} bytes behind the last of {message.height} rows (is step right?)")
     if is_depth(message.encoding):
-        if message.encoding == "64FC1" and (rows.astype(np.float32) != rows)[np.isfinite(rows)].any():
+        with np.errstate(over="ignore"):
+            narrowed = message.encoding == "64FC1" and (rows.astype(np.float32) != rows)[np.isfinite(rows)].any()
+        if narrowed:
             lose(message, "depth beyond 32 bits")
         return DepthImage(stamp=stamp, frame=frame, data=as_depth(message.encoding, rows))
-    if is_16_bit(message.encoding):
-        return Image16(stamp=stamp, frame=frame, data=as_image16(message.encoding, rows))
     if message.encoding in _CONVERTED:
         lose(message, _CONVERTED[message.encoding])
+    if is_16_bit(message.encoding):
+        return Image16(stamp=stamp, frame=frame, data=as_image16(message.encoding, rows))
     return Image(stamp=stamp, frame=frame, data=as_image(message.encoding, rows))
 
 
@@ -85,7 +96,7 @@ def compressed(format_: str, data: Any, frame: str, stamp: int) -> CompressedIma
 
     A 16-bit grey PNG whose format does not name its pixels (`png`) is depth in millimetres, as devices send it.
     """
-    if "compressedDepth" in format_:
+    if "compresseddepth" in format_.lower():
         return _compressed_depth(format_, data, frame, stamp)
     if not len(data):
         raise RecordingError(f"an image of format {format_!r} without a byte")
@@ -125,20 +136,34 @@ def ffmpeg_packet(message: Any, stamp: int) -> CompressedVideo:
     return CompressedVideo(stamp=stamp, frame=message.header.frame_id, format=video_format(message.encoding), data=data)
 
 
-def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> CompressedDepth:
+def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> CompressedDepth | DepthImage:
+    """A PNG or RVL of compressed_depth_image_transport: of 16 bits as they are, or of inverse depth in whole steps."""
     if data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE and format_.startswith("16UC1"):
         return CompressedDepth(stamp=stamp, frame=frame, scale=_DEPTH_UNIT, data=data)  # its header was left out
-    head = data[: _DEPTH_HEADER.size].tobytes()
-    png = data[_DEPTH_HEADER.size :]
-    if len(head) < _DEPTH_HEADER.size or not png[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE:
+    head, body = data[: _DEPTH_HEADER.size].tobytes(), data[_DEPTH_HEADER.size :]
+    rvl = "rvl" in format_.lower()
+    if len(body) < _RVL_SIZE.size or not (rvl or body[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE):
         raise RecordingError(
             f"a compressed depth image of format {format_!r} must hold a PNG after its header of "
-            f"{_DEPTH_HEADER.size} bytes; others (RVL) are not read"
+            f"{_DEPTH_HEADER.size} bytes, or RVL where its format says so"
         )
     _, scale, offset = _DEPTH_HEADER.unpack(head)
-    if format_.startswith("32FC1") or (not format_.startswith("16UC1") and scale > 0):
-        return CompressedDepth(stamp=stamp, frame=frame, quantizer="inverse", scale=scale, offset=offset, data=png)
-    return CompressedDepth(stamp=stamp, frame=frame, scale=_DEPTH_UNIT, data=png)
+    inverse = format_.startswith("32FC1") or (not format_.startswith("16UC1") and scale > 0)
+    if rvl:
+        columns, rows = _RVL_SIZE.unpack(body[: _RVL_SIZE.size].tobytes())
+        units = unpacked_rvl(body[_RVL_SIZE.size :], columns * rows).reshape(rows, columns)
+        metres = inverse_depth(units, scale, offset) if inverse else as_depth("16UC1", units)
+        return DepthImage(stamp=stamp, frame=frame, data=metres)
+    if inverse:
+        return CompressedDepth(stamp=stamp, frame=frame, quantizer="inverse", scale=scale, offset=offset, data=body)
+    return CompressedDepth(stamp=stamp, frame=frame, scale=_DEPTH_UNIT, data=body)
+
+
+_MODELS = {
+    **dict.fromkeys(("fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye"), "equidistant"),
+    **dict.fromkeys(("radtan", "radial_tangential", "radial-tangential", "pinhole", "perspective"), "plumb_bob"),
+}
+"""Other names of the distortion models that CameraInfo has."""
 
 
 def camera_info(message: Any, stamp: int) -> CameraInfo:
@@ -147,7 +172,11 @@ def camera_info(message: Any, stamp: int) -> CameraInfo:
     of zeros), and for coefficients that its lens model does not have."""
     K, D = first(message, "k", "K"), first(message, "d", "D")
     R, P = first(message, "r", "R"), first(message, "p", "P")
-    model = str(message.distortion_model)
+    named = str(message.distortion_model)
+    model = _MODELS.get(named.lower(), named)
+    if model != named:
+        model = model if len(D) else "none"
+        lose(message, f"the name {named!r} of the distortion model (it is {model!r} here)")
     if model == "plumb_bob" and len(D) in COEFFICIENTS["rational_polynomial"]:
         lose(message, f"the model plumb_bob, which has no {len(D)} coefficients (rational_polynomial has)")
         model = "rational_polynomial"

@@ -16,6 +16,8 @@ _FIX = {-1: "no_fix", 0: "fix", 1: "sbas", 2: "gbas"}
 _LEVELS = {1: "debug", 2: "info", 4: "warning", 8: "error", 16: "fatal"}
 """Of rosgraph_msgs/Log; rcl_interfaces/Log has ten times as much."""
 _ABSENT = -1.0
+_SLACK, _ROUNDED = 2.5, 1e-3
+"""Increments, and radians, within which the last angle of a scan follows from its increment."""
 
 
 def imu(message: Any, stamp: int) -> messages.Imu:
@@ -56,12 +58,17 @@ def laser_scan(message: Any, stamp: int) -> messages.LaserScan:
     if intensities is not None and len(intensities) != count:
         lose(message, f"intensities, {len(intensities):,} for {count:,} ranges")
         intensities = None
-    step = float(message.time_increment)
+    step, turn = float(message.time_increment), float(message.angle_increment)
+    last = float(message.angle_min) + turn * max(count - 1, 0)
+    if abs(last - float(message.angle_max)) > max(_SLACK * abs(turn), _ROUNDED):  # some count a beam more, or less
+        lose(
+            message, f"angle_max of {message.angle_max:.4g}, where {count:,} beams by their increment end at {last:.4g}"
+        )
     return messages.LaserScan(
         stamp=stamp,
         frame=message.header.frame_id,
         angle_min=float(message.angle_min),
-        angle_max=float(message.angle_min) + float(message.angle_increment) * max(count - 1, 0),
+        angle_max=last,
         range_min=float(message.range_min),
         range_max=float(message.range_max),
         ranges=np.asarray(message.ranges, np.float32),
@@ -118,13 +125,21 @@ def joint_state(message: Any, stamp: int) -> messages.JointState:
 
 
 def occupancy_grid(message: Any, stamp: int) -> messages.OccupancyGrid:
-    """nav_msgs/OccupancyGrid."""
-    info = message.info
+    """nav_msgs/OccupancyGrid; cells that are no probability are unknown."""
+    info, cells = message.info, np.array(message.data, np.int8)
+    if len(cells) != info.height * info.width:
+        raise RecordingError(
+            f"a grid of {info.width}x{info.height} cells needs {info.height * info.width:,}, got {len(cells):,}"
+        )
+    odd = (cells < -1) | (cells > 100)
+    if odd.any():
+        lose(message, f"cells that are neither -1 nor 0 to 100, such as {cells[odd][0]}: they are unknown here")
+        cells[odd] = -1
     return messages.OccupancyGrid(
         stamp=stamp,
         frame=message.header.frame_id,
         resolution=float(info.resolution),
-        cells=np.asarray(message.data, np.int8).reshape(info.height, info.width),
+        cells=cells.reshape(info.height, info.width),
         position=vector(info.origin.position),
         orientation=orientation(info.origin.orientation),
     )

@@ -37,13 +37,16 @@ def unit(quaternion: F64) -> F64:
 
 
 def covariance(message: Any, name: str, size: int) -> F64 | None:
-    """(size, size) of a field; None where it is not known: all zeros, -1 first (REP 145), or not finite, which is
+    """(size, size) of a field; None where it is not known: all zeros, -1 first (REP 145), or what cannot be, which is
     lost."""
     data = np.asarray(getattr(message, name), np.float64)
     if not data.any() or data[0] == -1:
         return None
     if not np.isfinite(data).all():
         lose(message, f"{name} that is not finite")
+        return None
+    if (np.diagonal(data.reshape(size, size)) < 0).any():
+        lose(message, f"{name} with a negative variance")
         return None
     return data.reshape(size, size)
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import zstandard
 
+from dataflow.recording.errors import DamagedError
 from dataflow.recording.limits import MAX_CHUNK_BYTES, MAX_RATIO, UNINDEXED_BYTES
 from dataflow.recording.mcap.cache import ChunkCache
 from dataflow.recording.mcap.rawfile import RECORD, RawFile
@@ -53,6 +54,8 @@ class Chunks:
         self._lengths: MutableSequence[int] | Sizes = array("q")
         self._sizes: MutableSequence[int] | Sizes = array("q")
         self._torn = -1
+        self._broken: dict[int, str] = {}
+        """By number, why a chunk cannot be read: it is not tried again for each of its messages."""
         self._file = file
         self.cache = ChunkCache()
         self._packed_bytes = self._unpacked_bytes = 0
@@ -99,8 +102,14 @@ class Chunks:
         key = (self, number)
         data = self.cache.get(key)
         if data is None:
+            if (why := self._broken.get(number)) is not None:
+                raise self._file.damaged(why)
             self.cache.make_room(key, self.ref(number).uncompressed_size)
-            data = self._decompress(number)
+            try:
+                data = self._decompress(number)
+            except DamagedError as error:
+                self._broken[number] = error.what
+                raise
             self.cache.add(key, data)
         return data
 

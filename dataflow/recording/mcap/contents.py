@@ -69,7 +69,8 @@ class _Growing:
 class Contents:
     """Findings so far.
 
-    `damage`: notes of what was damaged and got round; `loose_bytes`: data of messages outside chunks, by channel.
+    `damage`: notes of what was damaged and got round; `left_out`: chunks that cannot be read; `loose_bytes`: data of
+    messages outside chunks, by channel.
     """
 
     def __init__(self, file: RawFile, chunks: Chunks | None = None) -> None:
@@ -80,6 +81,7 @@ class Contents:
         self.attachments: list[Place] = []
         self.chunks = chunks or Chunks(file)
         self.damage: list[str] = []
+        self.left_out = 0
         self.loose_bytes: dict[int, int] = {}
         self._growing: dict[int, _Growing] = {}
         self._declared: dict[tuple[int, int], bytes] = {}

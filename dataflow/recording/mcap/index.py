@@ -52,7 +52,8 @@ class McapFile:
     """Random access to the messages of an MCAP file.
 
     `torn`: the file has no proper end; it holds what was written up to its last whole chunk. `damage`: what is damaged
-    and was got round, or left out. Raises `RecordingError` for a file that is no MCAP or is damaged otherwise.
+    and was got round, or left out; `left_out`: chunks whose messages are not even counted; `unread_from`: the byte from
+    which on it cannot be read. Raises `RecordingError` for a file that is no MCAP or is damaged otherwise.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class McapFile:
         self.torn = False
         self.lost_bytes = 0
         self.damage: list[str] = []
+        self.unread_from: int | None = None
         self._sealed = False
         self.path = path
         self._file = RawFile(path, watch)
@@ -78,6 +80,7 @@ class McapFile:
             raise
         self.schemas, self.channels = contents.schemas, contents.channels
         self.metadata = contents.metadata
+        self.left_out = contents.left_out
         self._attachments = contents.attachments
         self._chunks = contents.chunks
         self._chunks.cache = cache or self._chunks.cache
@@ -116,6 +119,11 @@ class McapFile:
                 chunk, offset, f"a message of channel {found} at {time}, not of channel {channel} at {log_time}"
             )
         return RawMessage(channel, sequence, log_time, data[start + _MESSAGE.size : end], published)
+
+    @property
+    def attached(self) -> int:
+        """Number of attachments that the file names."""
+        return len(self._attachments)
 
     @cached_property
     def attachments(self) -> Sequence[Place]:
@@ -242,6 +250,7 @@ class McapFile:
         if self.torn:
             self.lost_bytes = self._file.size - found.end
         elif not found.whole:
+            self.unread_from = found.end
             self.damage.append(f"it cannot be read beyond byte {found.end} of {self._file.size}")
         return found.contents
 

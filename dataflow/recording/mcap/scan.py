@@ -134,6 +134,7 @@ class Scan:
             if not self._lenient:
                 raise
             contents.damage.append(f"{error.what}; it is left out")
+            contents.left_out += 1
 
 
 def scan(file: RawFile, *, sealed: bool, trusting: bool, lenient: bool = False) -> Scan:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from mcap.records import Channel
 
 from dataflow.messages import Odometry, Transforms
-from dataflow.recording.errors import RecordingError
+from dataflow.recording.errors import DamagedError, RecordingError
 from dataflow.recording.layout import RECORDING, Kind, firings_topic, frames_topic
 from dataflow.recording.mcap.container import ContainerWriter
 from dataflow.recording.mcap.contents import Entries
@@ -39,7 +39,8 @@ class Origin:
     """An MCAP file as material: a context manager.
 
     `lenient`: what cannot be read is left out, with a note in `file.damage`. `own`: this program's recording;
-    `namespace`: its namespace; `metadata`: of one name and key the latest counts.
+    `namespace`: its namespace; `metadata`: of one name and key the latest counts. `lost`: of another program's file, by
+    topic how many messages `places` had to leave out, and in `reasons` why the first.
     """
 
     def __init__(self, path: Path, *, lenient: bool = False) -> None:
@@ -49,6 +50,8 @@ class Origin:
         for name, mapping in self.file.metadata:
             self.metadata.setdefault(name, {}).update(mapping)
         self.own = RECORDING in self.metadata
+        self.lost: dict[str, int] = {}
+        self.reasons: dict[str, str] = {}
         self.namespace = self.metadata.get(RECORDING, {}).get("namespace", "")
         self.channels: Mapping[int, Channel] = self.file.channels
 
@@ -97,6 +100,12 @@ class Origin:
     def records(self) -> list[tuple[str, dict[str, str]]]:
         """The metadata records: another program's as they stand, ours with the latest of each name and key."""
         return list(self.metadata.items()) if self.own else self.file.metadata
+
+    def pass_over(self, channel: int, reason: str) -> None:
+        """Counts a message that cannot be read."""
+        topic = self.channels[channel].topic
+        self.lost[topic] = self.lost.get(topic, 0) + 1
+        self.reasons.setdefault(topic, reason)
 
     def close(self) -> None:
         """Closes the file. Idempotent."""
@@ -226,12 +235,22 @@ def renamed(metadata: Mapping[str, str], topic: str | None) -> dict[str, str]:
 
 
 def places(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[RawMessage]:
-    """The kept messages of some channels as they lie in the file, each chunk read once."""
+    """The kept messages of some channels as they lie in the file, each chunk read once.
+
+    Of another program's file, those that damage keeps from being read are left out, and counted there.
+    """
     chosen: list[tuple[int, Entries]] = []
     for channel, mask in kept.items():
         chosen.append((channel, origin.entries(channel).where(mask)))
     for place in in_file_order(chosen):
-        yield origin.file.read(*place)
+        try:
+            raw = origin.file.read(*place)
+        except DamagedError as error:
+            if origin.own:
+                raise
+            origin.pass_over(place[0], error.what)
+            continue
+        yield raw
 
 
 def framing(path: Path, kept: Mapping[str, Mapping[int, npt.NDArray[np.int64]]]) -> Iterator[Recorded]:

@@ -81,12 +81,17 @@ def test_a_folder_that_cannot_be_read_is_refused(tmp_path: Path, name: str, cont
         ImageFolder(path=str(tmp_path)).setup()
 
 
-def test_an_image_of_another_size_ends_the_source(tmp_path: Path) -> None:
-    fill(tmp_path, "1.png")
-    (tmp_path / "2.png").write_bytes(encoded(1, width=8))
+def test_an_image_of_another_size_and_one_that_is_none_are_passed_over(tmp_path: Path) -> None:
+    fill(tmp_path, "2.png", "5.png")
+    (tmp_path / "1.png").write_bytes(b"none")
+    (tmp_path / "3.png").write_bytes(encoded(1, width=8))
+    source = ImageFolder(path=str(tmp_path), rate=1e9)
 
-    with pytest.raises(Exception, match=r"2.png has 8x4 pixels instead of 6x4"):
-        play(ImageFolder(path=str(tmp_path)))
+    assert [m.stamp for m in play(source)["image"]] == [2, 5]
+    assert source.summary()["passed_over"] == 2
+    (tmp_path / "1.png").unlink()
+    with pytest.raises(Exception, match=r"3.png has 8x4 pixels instead of 6x4"):
+        play(ImageFolder(path=str(tmp_path), strict=True))
     with pytest.raises(SourceError, match="no folder"):
         ImageFolder(path=str(tmp_path / "none")).setup()
 

@@ -53,8 +53,8 @@ def written(folder: Path, pair: tuple[str, str] = ("image_0", "image_1")) -> Pat
     return folder
 
 
-def read(folder: Path) -> int:
-    source = KittiOdometry(path=str(folder))
+def read(folder: Path, **params: object) -> int:
+    source = KittiOdometry(path=str(folder), **params)
     source.setup()
     return sum(1 for _ in source.stream())
 
@@ -121,7 +121,6 @@ def test_a_calibration_without_names_is_read_by_its_lines(tmp_path: Path) -> Non
         ("poses.txt", "1 0 0", "pose of line 1 must be 12 numbers"),
         ("poses.txt", "nan " * 12, "pose of line 1 must be 12 numbers"),
         ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0", "has 1 poses, and there are more images"),
-        ("image_1/000001.png", None, "no file"),
     ],
 )
 def test_a_folder_that_is_broken_is_named(tmp_path: Path, file: str, text: str | None, words: str) -> None:
@@ -138,10 +137,25 @@ def test_an_image_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     folder = written(tmp_path)
     (folder / "image_1" / "000001.png").write_bytes(b"no image")
     with pytest.raises(SourceError, match=r"cannot decode .*image_1.000001\.png"):
-        read(folder)
+        read(folder, strict=True)
     cv2.imwrite(str(folder / "image_1" / "000001.png"), np.zeros((8, 8), np.uint8))
     with pytest.raises(SourceError, match="has 8x8 pixels, the first image 48x32"):
-        read(folder)
+        read(folder, strict=True)
+    (folder / "image_1" / "000001.png").unlink()
+    with pytest.raises(SourceError, match=r"no file .*image_1.000001\.png"):
+        read(folder, strict=True)
+
+
+def test_a_pair_that_cannot_be_read_is_passed_over_and_the_others_keep_their_stamps(tmp_path: Path) -> None:
+    folder = written(tmp_path)
+    (folder / "image_1" / "000001.png").write_bytes(b"no image")
+    (folder / "image_0" / "000000.png").write_bytes(b"no image")
+    source = KittiOdometry(path=str(folder))
+
+    played = play(source)
+
+    assert [m.stamp for m in played["left"]] == [m.stamp for m in played["ground_truth"]] == [200_000_000]
+    assert source.summary() == {"passed_over": 2}
 
 
 def test_a_folder_without_images_and_a_span_without_any_are_named(tmp_path: Path) -> None:

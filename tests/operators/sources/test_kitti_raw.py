@@ -87,13 +87,29 @@ def test_a_folder_that_cannot_be_used_is_refused_by_name(tmp_path: Path, break_i
     folder = simple(tmp_path)
     break_it(folder)
     with pytest.raises(SourceError, match=message):
-        KittiRaw(path=str(folder)).setup()
+        KittiRaw(path=str(folder), strict=True).setup()
+
+
+def test_a_frame_that_lacks_a_file_is_passed_over_and_the_others_keep_their_times(tmp_path: Path) -> None:
+    """As in 2011_09_26_drive_0009, of which four scans are missing and all times are there."""
+    folder = simple(tmp_path)
+    (folder / "velodyne_points").mkdir(exist_ok=True)
+    times = [f"2011-09-26 13:02:25.{k}94560375\n" for k in range(3)]
+    (folder / "velodyne_points" / "timestamps.txt").write_text("".join(times))
+    (folder / "velodyne" / "0000000001.bin").unlink()
+    (folder / "image_02" / "0000000000.png").write_bytes(b"x")
+    source = KittiRaw(path=str(folder))
+
+    played = play(source)
+
+    assert [m.stamp % 1_000_000_000 for m in played["points"]] == [294_560_375]
+    assert source.summary() == {"passed_over": 2}
 
 
 def test_a_scan_that_was_cut_off_is_named(tmp_path: Path) -> None:
     folder = simple(tmp_path)
     (folder / "velodyne" / "0000000001.bin").write_bytes(b"x" * 17)
-    source = KittiRaw(path=str(folder))
+    source = KittiRaw(path=str(folder), strict=True)
     source.setup()
     with pytest.raises(SourceError, match=r"0000000001\.bin has 17 bytes; 16 a point expected"):
         list(source.stream())

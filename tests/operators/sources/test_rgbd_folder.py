@@ -162,7 +162,55 @@ def test_equal_folders_give_equal_digests(tmp_path: Path) -> None:
 def test_a_spoiled_file_is_named_with_its_frame(tmp_path: Path, spoil, message: str) -> None:  # type: ignore[no-untyped-def]
     spoil(write_7scenes(tmp_path))
     with pytest.raises(SourceError, match=message):
+        read(tmp_path, strict=True)
+
+
+@pytest.mark.parametrize("name", ["color.png", "depth.png", "pose.txt"])
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("gone", [True, False])
+def test_a_frame_that_cannot_be_read_is_passed_over_and_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, number: int, gone: bool
+) -> None:
+    whole = read(write_7scenes(tmp_path))[1]
+    file = tmp_path / f"frame-{number:06d}.{name}"
+    file.unlink() if gone else file.write_bytes(b"1 2")
+    caplog.clear()
+
+    source, frames = read(tmp_path)
+    source.static_outputs()
+
+    if name == "pose.txt":
+        assert [set(frame) for frame in frames] == [
+            {"image", "depth"} | ({"ground_truth"} if k != number else set()) for k in range(3)
+        ]
+    else:
+        left = [frame for k, frame in enumerate(whole) if k != number]
+        assert [f["image"].digest() for f in frames] == [f["image"].digest() for f in left]
+    truthless = gone and name == "pose.txt"  # which is usual
+    assert source.summary() == {"passed_over": 0 if truthless else 1}
+    assert (f"frame-{number:06d}" in caplog.text) is not truthless
+
+
+def test_a_folder_of_which_no_frame_can_be_read_is_refused(tmp_path: Path) -> None:
+    write_7scenes(tmp_path)
+    for file in tmp_path.glob("*.depth.png"):
+        cv2.imwrite(str(file), np.zeros((6, 8), np.uint8))
+
+    with pytest.raises(SourceError, match=r"frame 000000: .* one 16-bit channel"):
         read(tmp_path)
+
+
+def test_tum_lists_of_other_systems(tmp_path: Path) -> None:
+    """A byte order mark, lines of Windows, names with spaces, a line twice, and lines out of order."""
+    write_tum(tmp_path)
+    whole = [frame["image"].digest() for frame in read(tmp_path)[1]]
+    lines = [line for line in (tmp_path / "rgb.txt").read_text().splitlines() if not line.startswith("#")]
+    stamp, name = lines[0].split()
+    (tmp_path / name).rename(tmp_path / "rgb" / "the first.png")
+    lines[0] = f"{stamp} rgb/the first.png"
+    (tmp_path / "rgb.txt").write_bytes(b"\xef\xbb\xbf" + "\r\n".join(["# names", *lines[::-1], lines[0]]).encode())
+
+    assert [frame["image"].digest() for frame in read(tmp_path)[1]] == whole
 
 
 def test_spoiled_tum_lists_are_named_with_their_line(tmp_path: Path) -> None:
@@ -172,7 +220,7 @@ def test_spoiled_tum_lists_are_named_with_their_line(tmp_path: Path) -> None:
         read(tmp_path)
     (tmp_path / "depth.txt").write_text("10.0 depth/9.png\n")
     with pytest.raises(SourceError, match=r"no file .*depth/9\.png"):
-        read(tmp_path)
+        read(tmp_path, strict=True)
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,24 @@ def test_a_file_of_av1_is_refused_by_its_codec(tmp_path: Path) -> None:
         VideoFile(input=str(file)).setup()
 
 
+def test_a_file_of_which_frames_are_missing_is_named(clip: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data = bytearray(clip.read_bytes())
+    second = data.index(b"00dc", data.index(b"00dc") + 4)
+    data[second : second + 300] = bytes(300)
+    clip.write_bytes(data)
+
+    found = images(VideoFile(input=str(clip)))
+
+    assert 0 < len(found) < 5
+    assert f"states 5 frames, and {len(found)} can be decoded" in caplog.text
+
+
+def test_a_whole_file_is_not(clip: Path, caplog: pytest.LogCaptureFixture) -> None:
+    images(VideoFile(input=str(clip)))
+
+    assert "can be decoded" not in caplog.text
+
+
 def test_part_of_a_file_at_another_rate(clip: Path) -> None:
     found = images(VideoFile(input=str(clip), rate=10, start=1, stop=3))
 
