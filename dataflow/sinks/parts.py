@@ -330,11 +330,11 @@ class PartsSink:
     def _count(self, part: Part) -> None:
         saved = Counter({stream: part.sink.writer.saved(stream) for stream in self._streams})
         self._saved += saved - part.repeated
-        held = self._statics.items()
-        self._copied |= {(name, i, k) for name, (_, i, k) in held if part.repeated[name] and saved[name]}
         part.messages, part.bytes = (saved - part.repeated).total(), part.sink.writer.saved_bytes
         if part.start is None or self._holds_any(part):
             self._closed.append(part)
+            held = self._statics.items()
+            self._copied |= {(name, i, k) for name, (_, i, k) in held if part.repeated[name] and saved[name]}
         else:  # the disk refused before it held anything
             part.path.unlink(missing_ok=True)
 

@@ -357,6 +357,24 @@ def test_a_static_message_of_which_only_a_copy_is_stored_is_not_lost(
     assert "test/left/constant" not in facts["lost"]["streams"]
 
 
+def test_a_static_message_of_which_the_only_copy_is_deleted_is_lost(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
+) -> None:
+    """The part that began with it held nothing else, and so was deleted at the end."""
+    sink = Given(recorded, graph, tmp_path / "run.mcap", GO_ON).sink
+    with Recording(recorded) as recording:
+        static = next(m for m in recording.messages() if m.stream == "test/left/constant")
+    disk.full = True
+    sink.message(static.stream, static.message, static.seq, static.incarnation)
+    sink.flush()
+    disk.full = False
+    sink.flush()
+    facts = sink.close("complete")
+
+    assert facts["parts"] == [str(tmp_path / "run.mcap")]
+    assert facts["lost"]["streams"] == {"test/left/constant": 1}
+
+
 def test_a_disk_that_stays_full_leaves_a_readable_recording(
     recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
 ) -> None:
