@@ -123,8 +123,7 @@ def drift(poses: Array, truth: list[Array]) -> tuple[float, float, float]:
     return ate, 100 * float(np.linalg.norm(end[:3])), math.degrees(np.linalg.norm(end[3:]))
 
 
-def table_of_drive(runners: dict[str, Callable[[Drive], Outcome]], rounds: int) -> None:
-    drive = kitti()
+def table_of_drive(runners: dict[str, Callable[[Drive], Outcome]], rounds: int, drive: Drive) -> None:
     reference = direct(drive)
     print("| odometry | end from direct GICP, cm | degrees | CPU ms a scan: median | worst | poses |")
     print("| --- " * 6 + "|")
@@ -182,6 +181,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--peers", type=Path, help="virtual environment with the peers")
     parser.add_argument("--only", choices=["kitti", "worlds"])
+    parser.add_argument("--every", type=int, nargs="+", default=[1], help="of the drive's scans every n-th is taken")
+    parser.add_argument("--first", type=int, default=0, help="the first of the drive's scans that is taken")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), help="KIND:SEED")
     parser.add_argument("--seconds", type=int, default=30, help="of each drive, of 60 or 70 s at 0.8 m/s")
@@ -192,7 +193,11 @@ def main() -> None:
     if arguments.peers:
         runners |= {name: peer(name, arguments.peers) for name in arguments.names}
     if arguments.only != "worlds":
-        table_of_drive(runners, arguments.rounds)
+        whole = kitti()
+        for step in arguments.every:
+            print(f"Every {step}. scan:")
+            clouds = whole.clouds[arguments.first :: step]
+            table_of_drive(runners, arguments.rounds, Drive(clouds, [], whole.sensor | {"rate": 10.0 / step}))
     if arguments.only != "kitti":
         worlds = [(name, int(seed)) for name, _, seed in (given.partition(":") for given in arguments.worlds)]
         table_of_worlds(runners, worlds, arguments.seconds, arguments.cache)

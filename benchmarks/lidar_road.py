@@ -1,12 +1,13 @@
 """LiDAR odometry at low rates on made roads: ours and kiss-icp, where a car moves metres between scans.
 
-python benchmarks/lidar_road.py [--peers ENVIRONMENT] [--roads 1 2 3] [--every 1 2 3 5 7 10]
+python benchmarks/lidar_road.py [--peers ENVIRONMENT] [--roads 1 2 3] [--every 1 2 3 5 7 10] [--speed 20] [--still]
 
 A road is a street of boxes by its seed (facades, gaps between them, parked cars, poles) with curves; the car brakes and
 goes up to 20 m/s. The LiDAR has 32 rings of 720 points at 10 Hz and moves during its sweep; of its scans every second,
 third ... is taken. Figures are of steps between scans that are taken, against the truth: a step is wrong that is more
 than 0.5 m or 1 degree off. *Of these told* are wrong steps of a scan whose state is not `tracking`; *not tracking* are
-the scans of such a state. ENVIRONMENT is a virtual environment with kiss-icp.
+the scans of such a state. `--speed` is the car's all along; with `--still` it stands during each sweep, so nothing has
+to be deskewed (kiss-icp deskews by the motion between scans). ENVIRONMENT is a virtual environment with the peers.
 """
 
 from __future__ import annotations
@@ -34,14 +35,15 @@ RINGS, COLUMNS, PERIOD = 32, 720, 0.1
 WRONG = (0.5, 1.0)  # metres, degrees
 
 
-def ground_track(seed: int, seconds: float) -> Array:
+def ground_track(seed: int, seconds: float, steady: float | None = None) -> Array:
     """Returns (x, y, heading, speed) of the car every 10 ms: it speeds up, brakes, and turns where it is slow."""
     rng = np.random.default_rng(seed)
     x = y = heading = 0.0
-    speed, goal, turn, rows = 8.0, 15.0, 0.0, []
+    speed, goal, turn, rows = steady or 8.0, 15.0, 0.0, []
     for k in range(int(seconds * 100) + 20):
         if k % 250 == 0:
-            goal = float(rng.uniform(6, 20))
+            drawn = float(rng.uniform(6, 20))
+            goal = steady or drawn
             turn = float(rng.choice([0, 1, -1])) * float(rng.uniform(0.1, 0.5))
         speed += float(np.clip(goal - speed, -0.04, 0.025))  # 4 and 2.5 m/s^2
         rate = turn * min(1.0, 7.0 / speed) * np.sin(np.pi * (k % 250) / 250)
@@ -76,12 +78,14 @@ def boxes_beside(track: Array, seed: int) -> Array:
     return np.array(boxes)
 
 
-def scan(track: Array, boxes: Array, stamp: float, rng: np.random.Generator) -> tuple[NDArray[np.float32], Array]:
+def scan(
+    track: Array, boxes: Array, stamp: float, rng: np.random.Generator, still: bool
+) -> tuple[NDArray[np.float32], Array]:
     """Returns the points (N, 3) of a sweep that ends at a time, s, in the frames of their moments, and offsets (N,)."""
     offsets = np.repeat(np.linspace(-PERIOD, 0, COLUMNS, endpoint=False), RINGS)
     azimuth = np.repeat(np.linspace(-np.pi, np.pi, COLUMNS, endpoint=False), RINGS)
     elevation = np.tile(np.radians(np.linspace(-25, 10, RINGS)), COLUMNS)
-    at = (stamp + offsets) * 100 + 10
+    at = (stamp + (0.0 * offsets if still else offsets)) * 100 + 10
     x, y, heading = (
         np.interp(at, np.arange(len(track)), np.unwrap(track[:, i]) if i == 2 else track[:, i]) for i in range(3)
     )
@@ -106,15 +110,15 @@ def scan(track: Array, boxes: Array, stamp: float, rng: np.random.Generator) -> 
     return (local * distance[:, None]).astype(np.float32), offsets[seen]
 
 
-def road(seed: int, seconds: float) -> Drive:
-    """Returns the scans of a drive, with the true pose of each."""
-    track = ground_track(seed, seconds)
+def road(seed: int, seconds: float, steady: float | None = None, still: bool = False) -> Drive:
+    """Returns the scans of a drive, with the true pose of each; without times where the car stands during a sweep."""
+    track = ground_track(seed, seconds, steady)
     boxes, rng = boxes_beside(track, seed), np.random.default_rng(seed + 2000)
     clouds, truth = [], []
     for k in range(1, int(seconds / PERIOD)):
-        points, offsets = scan(track, boxes, k * PERIOD, rng)
-        stamp = round(k * PERIOD * 1e9)
-        clouds.append(PointCloud(stamp=stamp, frame="lidar", points=points, time_offsets=offsets.astype(np.float32)))
+        points, offsets = scan(track, boxes, k * PERIOD, rng, still)
+        stamp, times = round(k * PERIOD * 1e9), None if still else offsets.astype(np.float32)
+        clouds.append(PointCloud(stamp=stamp, frame="lidar", points=points, time_offsets=times))
         x, y, heading, _ = track[round(k * PERIOD * 100) + 10]
         T = se3.exp(np.array([0, 0, 0, 0, 0, heading]))
         T[:3, 3] = x, y, 1.8
@@ -170,20 +174,23 @@ def main() -> None:
     parser.add_argument("--roads", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--every", type=int, nargs="+", default=[1, 2, 3, 5, 7, 10])
     parser.add_argument("--seconds", type=float, default=20)
+    parser.add_argument("--speed", type=float, help="m/s, all along (default: 6 to 20)")
+    parser.add_argument("--still", action="store_true", help="the car stands during each sweep")
+    parser.add_argument("--names", nargs="+", default=["kiss"], help="which peers")
     options = parser.parse_args()
     print(
         "| road, odometry | every | scans | step, cm: median | worst | degrees | wrong | of these told | not tracking |"
     )
     print("| --- " * 9 + "|")
     for seed in options.roads:
-        whole = road(seed, options.seconds)
+        whole = road(seed, options.seconds, options.speed, options.still)
         for step in options.every:
             drive = every(whole, step)
             poses, states = ours(drive)
             print(row(f"{seed}, ours", step, poses, drive.truth, states), flush=True)
-            if options.peers:
-                found = peer("kiss", options.peers)(drive)
-                print(row(f"{seed}, kiss-icp", step, found.poses, drive.truth, None), flush=True)
+            for name in options.names if options.peers else []:
+                found = peer(name, options.peers)(drive)
+                print(row(f"{seed}, {name}", step, found.poses, drive.truth, None), flush=True)
 
 
 if __name__ == "__main__":

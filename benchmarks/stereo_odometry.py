@@ -225,6 +225,7 @@ def main() -> None:
     parser.add_argument(
         "--data", type=Path, default=data, help="a KITTI odometry sequence (default: the project's data)"
     )
+    parser.add_argument("--motorways", type=int, nargs="*", default=[1, 2], help="seeds, for offsets")
     cv2.setNumThreads(1)
     arguments = parser.parse_args()
     if arguments.what == "gaps":
@@ -253,7 +254,7 @@ def main() -> None:
         gaps("street", drive, STREET, ("went on", "came back"))
         return
     offsets("KITTI 06", drive, 12)
-    for seed in (1, 2):
+    for seed in arguments.motorways:
         offsets(f"motorway {seed}", Drive(*stereo_road.motorway(seed, 51), stereo_road.RIG), 0)
 
 

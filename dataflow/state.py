@@ -23,7 +23,9 @@ import itertools
 import types
 import typing
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, ClassVar
 
 import numpy as np
@@ -195,8 +197,8 @@ def take_over(target: Any, hints: Mapping[str, Any], state: Any, new_part: NewPa
     Raises `StateError` where `state` lacks one or has others.
     """
     name = type(target).__name__
-    _check_names(name, hints, state)
-    for attribute, hint in hints.items():
+    for attribute in _names_to_take(name, [*hints], state, [each for each in hints if hasattr(target, each)]):
+        hint = hints[attribute]
         current = getattr(target, attribute, None)
         setattr(target, attribute, typed(hint, state[attribute], f"{name}.{attribute}", current, new_part))
 
@@ -226,14 +228,32 @@ def _with_arguments(hint: Any, bound: Mapping[Any, Any]) -> Any:
     return hint[tuple(bound.get(each, each) for each in open_)] if open_ else hint
 
 
-def _check_names(name: str, hints: Iterable[str], state: Any) -> None:
+_OF_ANOTHER_VERSION: ContextVar[bool] = ContextVar("_OF_ANOTHER_VERSION", default=False)
+
+
+@contextmanager
+def of_another_version() -> Iterator[None]:
+    """Inside, a state of a former version of its class is taken over, where there is no better one: fields that it
+    lacks are as by default, and those that the class has no more are left out."""
+    token = _OF_ANOTHER_VERSION.set(True)
+    try:
+        yield
+    finally:
+        _OF_ANOTHER_VERSION.reset(token)
+
+
+def _names_to_take(name: str, names: Sequence[str], state: Any, with_default: Collection[str]) -> list[str]:
+    """Returns the fields that are taken from `state`. Raises `StateError` where it has others."""
     if not isinstance(state, Mapping):
         raise StateError(f"{name} is a {type(state).__name__}, expected its fields")
-    wanted, given = set(hints), set(state)
-    if wanted != given:
-        lacks = ", ".join(sorted(wanted - given)) or "nothing"
-        more = ", ".join(sorted(given - wanted)) or "nothing"
-        raise StateError(f"{name} lacks {lacks} and has {more} besides")
+    lenient = _OF_ANOTHER_VERSION.get()
+    new = [each for each in sorted(names) if each not in state and not (lenient and each in with_default)]
+    gone = [] if lenient else sorted(set(state) - set(names))
+    if new or gone:
+        what = [f"has no {', '.join(new)}, which the class has now"] if new else []
+        what += [f"has {', '.join(gone)}, which the class has no more"] if gone else []
+        raise StateError(f"the state of {name} {'; it '.join(what)}")
+    return [each for each in names if each in state]
 
 
 def _listed(value: Any, place: str, length: int | None = None) -> Any:
@@ -358,15 +378,15 @@ class _Typing:
         bound = dict(zip(getattr(kind, "__parameters__", ()), arguments, strict=False))
         hints = {name: _with_arguments(hint, bound) for name, hint in _hints(kind).items()}
         fields = dataclasses.fields(kind)
-        _check_names(f"{place} ({kind.__name__})", [each.name for each in fields], value)
+        missing = dataclasses.MISSING
+        able = [f.name for f in fields if not f.init or (f.default, f.default_factory) != (missing, missing)]
+        names = _names_to_take(f"{place} ({kind.__name__})", [each.name for each in fields], value, able)
         restored = {
-            each.name: self.typed(
-                hints[each.name], value[each.name], f"{place}.{each.name}", getattr(current, each.name, None)
-            )
-            for each in fields
+            name: self.typed(hints[name], value[name], f"{place}.{name}", getattr(current, name, None))
+            for name in names
         }
-        made = kind(**{each.name: restored[each.name] for each in fields if each.init})
+        made = kind(**{each.name: restored[each.name] for each in fields if each.init and each.name in restored})
         for each in fields:
-            if not each.init:
+            if not each.init and each.name in restored:
                 object.__setattr__(made, each.name, restored[each.name])
         return made

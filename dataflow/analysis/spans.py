@@ -1,4 +1,4 @@
-"""Firings of a recorded run as spans of OpenTelemetry, in OTLP's JSON encoding: what trace viewers read.
+"""Firings of a run as spans of OpenTelemetry, in OTLP's JSON encoding: what trace viewers read.
 
 A trace begins with a message of a source. The span of a firing is a child of that of the firing whose message it was
 given on its first input that has one; messages on other inputs are links. Identifiers are digests of operator and
@@ -33,21 +33,60 @@ class _Span(NamedTuple):
     span: str
 
 
-class Spans:
-    """Makes spans of firing records; `lines` yields requests of OTLP, one a line."""
+class Line(NamedTuple):
+    """A request of OTLP as text, and how many spans it holds."""
 
-    def __init__(self, graph: Graph) -> None:
-        self._graph = graph
+    text: str
+    spans: int
+
+
+class Spans:
+    """Makes spans of firing records: of a whole recording by `lines`, of a graph that runs by `round` and `rest`.
+
+    Spans of a whole recording have the number of the call and how many messages were dropped before it.
+    """
+
+    def __init__(self, graph: Graph, *, whole: bool = True) -> None:
+        self._graph, self._whole = graph, whole
+        self._held: dict[str, list[FiringRecord]] = {}
+        """Records of the last round."""
         self._of: dict[str, dict[_Place, _Span]] = {name: {} for name in graph.streams}
         self._calls = Counter[str]()
         self._passed: dict[str, _Place] = {}
         """Each stream's latest message that a record has come to."""
 
-    def lines(self, records: Mapping[str, Iterable[FiringRecord]]) -> Iterator[str]:
+    def lines(self, records: Mapping[str, Iterable[FiringRecord]]) -> Iterator[Line]:
         """Yields lines of spans, by the times at which calls began; a call comes behind those whose messages it was
         given, by whichever clock they have their times. `records`: each operator's, in order."""
+        return self._lines(self._in_order(records))
+
+    def round(self, records: Mapping[str, Iterable[FiringRecord]]) -> Iterator[Line]:
+        """Yields lines of the records of the round before, and of those of this one that caused them: the process of a
+        cause may have been asked earlier than that of its effect. `records`: each operator's since then, in order."""
+        return self._lines(self._due(records))
+
+    def rest(self) -> Iterator[Line]:
+        """Yields lines of the last round."""
+        held, self._held = self._held, {}
+        return self.lines(held)
+
+    def _due(self, records: Mapping[str, Iterable[FiringRecord]]) -> Iterator[FiringRecord]:
+        due = {name: len(each) for name, each in self._held.items() if each}
+        left = {name: [*self._held.get(name, ()), *records.get(name, ())] for name in {**self._held, **records}}
+        taken = Counter[str]()
+        if due:
+            for record in self._in_order(left):
+                yield record
+                taken[record.operator] += 1
+                if taken[record.operator] >= due.get(record.operator, 0):
+                    due.pop(record.operator, None)
+                if not due:
+                    break
+        self._held = {name: each[taken[name] :] for name, each in left.items()}
+
+    def _lines(self, records: Iterable[FiringRecord]) -> Iterator[Line]:
         waiting: dict[str, list[dict[str, Any]]] = {}
-        for record in self._in_order(records):
+        for record in records:
             if record.kind in CALLS:
                 mine = waiting.setdefault(record.operator, [])
                 mine.append(self._span(record))
@@ -103,6 +142,9 @@ class Spans:
         own = _Span(trace, xxhash.xxh3_64_hexdigest(name))
         self._note(record, own)
         parent = {"parentSpanId": causes[0].span} if causes else {}
+        about = {"stamp": record.stamp, "call": number, "incarnation": record.incarnation, "dropped": len(record.drops)}
+        if not self._whole:
+            del about["call"], about["dropped"]
         failed = {"status": {"code": _ERROR, "message": str(record.detail.get("error", ""))}}
         return {
             "traceId": own.trace,
@@ -113,13 +155,7 @@ class Spans:
             "startTimeUnixNano": str(record.wall_start),
             "endTimeUnixNano": str(record.wall_start + record.duration),
             "attributes": [
-                {"key": f"dataflow.{key}", "value": {"intValue": str(value)}}
-                for key, value in (
-                    ("stamp", record.stamp),
-                    ("call", number),
-                    ("incarnation", record.incarnation),
-                    ("dropped", len(record.drops)),
-                )
+                {"key": f"dataflow.{key}", "value": {"intValue": str(value)}} for key, value in about.items()
             ],
             "links": [{"traceId": each.trace, "spanId": each.span} for each in dict.fromkeys(causes[1:])],
             **(failed if record.outcome == "error" else {}),
@@ -137,11 +173,12 @@ class Spans:
                 if len(kept) > KEPT:
                     del kept[next(iter(kept))]
 
-    def _line(self, operator: str, spans: list[dict[str, Any]]) -> str:
+    def _line(self, operator: str, spans: list[dict[str, Any]]) -> Line:
         about = {"service.name": operator, "service.namespace": self._graph.namespace}
         resource = {"attributes": [{"key": key, "value": {"stringValue": value}} for key, value in about.items()]}
         scope = {"scope": {"name": "robot-dataflow"}, "spans": spans}
-        return json.dumps({"resourceSpans": [{"resource": resource, "scopeSpans": [scope]}]}, separators=(",", ":"))
+        request = {"resourceSpans": [{"resource": resource, "scopeSpans": [scope]}]}
+        return Line(json.dumps(request, separators=(",", ":")), len(spans))
 
 
 def _places(ref: InputRef) -> Iterator[tuple[str, _Place]]:

@@ -120,7 +120,6 @@ class Blame:
         node = self.graph.nodes[maker]
         if node.source or node.external:
             raise BlameError(f"{stream} is what {maker} gave, {'a source' if node.source else 'which is external'}")
-        self.made = 0
         line = self._line(maker)
         port = list(node.outputs.values()).index(stream)
         for number in range(len(line.records) - 1, -1, -1):

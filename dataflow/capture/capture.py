@@ -23,13 +23,18 @@ from dataflow.records.cuts import is_known, parameters_at
 from dataflow.records.firing import CALLS, WITHHELD, FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import seeding_of
+from dataflow.state import StateError
 from dataflow.sync.entries import entries_of
 from dataflow.text import visible
 
 SECONDS = 60.0
 """Time to reduce the calls from one beginning; there are at most three."""
 SMALL = 100
-"""Of so many calls, one is few: the first beginning from which no more are needed is taken."""
+"""Of so many calls, one is few: of the beginnings that are right, the first from which no more are needed is taken."""
+LARGE = 1_000_000
+"""Bytes of a test that lies beside others under version control."""
+SLOW = 60.0
+"""Seconds that its calls take: what is larger or slower begins with a state that may be wrong, if that is smaller."""
 MOST_CALLS = 20_000
 """Calls whose inputs are held in memory to be reduced."""
 MOST_BYTES = 2**29
@@ -85,6 +90,15 @@ class Beginning(NamedTuple):
     first: int
     place: tuple[int, int]
     text: str
+    doubtful: bool = False
+    """The state may be wrong already: the mended operator, too, may be wrong behind it."""
+
+
+class Best(NamedTuple):
+    """The fewest calls that were found so far, and what they begin with."""
+
+    captured: Captured
+    begins: str
 
 
 def _sort(error: BaseException) -> tuple[type, str, int]:
@@ -102,17 +116,16 @@ def capture(
     """
     fired = _aimed(debugger, number, predicate)
     wrong = Wrong(fired, predicate)
-    expected, recorded_error = None, ""
-    if wrong.digests is not None:
-        recorded_error = fired.recorded_error or ""
-        expected = _recorded(fired)
+    expected = None if wrong.digests is None else _recorded(fired)
+    recorded_error = "" if wrong.error is not None else fired.recorded_error or ""
     setting = _setting(recording, debugger)
     ordered = FiringLog.read(recording).ordered(debugger.node)
     records = [r for r in ordered if r.kind not in CALLS and r.outcome != "error"]
-    best: tuple[Captured, str] | None = None
-    few = max(1, len(debugger.calls) // SMALL)
+    best: Best | None = None
     too_large = False
     for begin in _beginnings(records, debugger, fired, wrong):
+        if best is not None and _suffices(best, begin, len(debugger.calls)):
+            break
         changes = changes_between(records, debugger, begin.place, fired.number)
         if (shots := _shots(debugger, begin.first, fired, changes)) is None:
             too_large = True
@@ -120,10 +133,8 @@ def capture(
         parameters = parameters_at(r for r in records if (r.incarnation, r.index) <= begin.place)
         found = Captured(setting, *parameters, begin.state, tuple(shots), expected, recorded_error, predicate)
         reduced = _reduced(found, wrong, time.monotonic() + seconds)
-        if reduced is not None and (best is None or len(reduced.shots) < len(best[0].shots)):
-            best = reduced, begin.text
-        if best is not None and len(best[0].shots) <= few:
-            break
+        if reduced is not None and (best is None or len(reduced.shots) < len(best.captured.shots)):
+            best = Best(reduced, begin.text)
     if best is None and too_large:
         raise DebugError(
             f"call {fired.number} of {debugger.node.name}: the inputs up to it are more than {MOST_BYTES:,} bytes: "
@@ -134,15 +145,14 @@ def capture(
             f"call {fired.number} of {debugger.node.name} is not wrong when it is made apart from its recording: what "
             f"it depends on is neither among its inputs nor in its state (dataflow verify {recording.path} --why)"
         )
-    captured, begins = best
     try:
-        check_repeats(captured)
+        check_repeats(best.captured)
     except NotRepeated as error:
         raise DebugError(
             f"call {fired.number} of {debugger.node.name} does not repeat: {error}. A test of it would pass and fail "
             f"by chance: dataflow verify {recording.path} --why finds the cause"
         ) from None
-    return Found(captured, fired.number, len(debugger.calls), len(captured.shots), begins, wrong.text)
+    return Found(best.captured, fired.number, len(debugger.calls), len(best.captured.shots), best.begins, wrong.text)
 
 
 def _aimed(debugger: Debugger, number: int | None, predicate: str) -> Fired:
@@ -192,6 +202,7 @@ def _setting(recording: Recording, debugger: Debugger) -> Setting:
         seeding_of(recording),
         debugger.graph.threads,
         dict(node.outputs),
+        node.env,
     )
 
 
@@ -218,7 +229,19 @@ def _beginnings(records: Sequence[FiringRecord], debugger: Debugger, fired: Fire
         yield Beginning(None, first, (incarnation, max(begun, default=-1)), "a new operator")
     if fired.before is not None:
         text = "the state that it has here before the call, which may be wrong already"
-        yield Beginning(fired.before, number, here, text)
+        yield Beginning(fired.before, number, here, text, doubtful=True)
+
+
+def _suffices(best: Best, begin: Beginning, calls: int) -> bool:
+    """Returns whether it is needless to begin there, too. A state that may be wrong is begun with only where the calls
+    from a right one are too many for a test."""
+    if not begin.doubtful:
+        return len(best.captured.shots) <= max(1, calls // SMALL)
+    if len(best.captured.to_bytes()) > LARGE:
+        return False
+    began = time.monotonic()
+    best.captured.play()
+    return time.monotonic() - began < SLOW
 
 
 def changes_between(
@@ -284,7 +307,10 @@ def _reduced(whole: Captured, wrong: Wrong, deadline: float) -> Captured | None:
     """
     if not whole.shots:
         return None
-    outcome = whole.play()
+    try:
+        outcome = whole.play()
+    except StateError:  # of another version of the class
+        return None
     here = [shot.here for shot in whole.shots[:-1][-BEFORE:]]
     if not wrong.shows(outcome) or (wrong.digests is not None and list(outcome.before) != here):
         return None

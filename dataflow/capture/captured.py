@@ -5,6 +5,7 @@ The file is msgpack, compressed by zlib. It needs neither the recording nor its 
 
 from __future__ import annotations
 
+import subprocess
 import zlib
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -14,20 +15,24 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from dataflow.environments import environment_of, is_environment
 from dataflow.execution.calls import Calls, value_of
 from dataflow.execution.effects.journal import RecordedJournal
-from dataflow.execution.failure import RAISED, readable
+from dataflow.execution.failure import RAISED, OperatorFailure, readable
 from dataflow.execution.restarts import close_quietly
 from dataflow.execution.snapshots import pack_state, unpack_state
-from dataflow.execution.threads import limited_threads
+from dataflow.execution.threads import environment, limited_threads
 from dataflow.graph.model import Live, Node
 from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import differences
-from dataflow.state import plain, typed
+from dataflow.state import StateError, of_another_version, plain, typed
 from dataflow.sync import NEVER, Entry, Firing, InputValue
 from dataflow.sync.entries import entries_of
 
 FORMAT = 2
+_CHECK = "import pathlib, sys; from dataflow.capture.captured import check; check(pathlib.Path(sys.argv[1]))"
+LONGEST = 600.0
+"""Seconds that the calls may take in another process."""
 BEFORE = 2
 """Calls before the wrong one of which the outputs are compared, too."""
 
@@ -56,7 +61,7 @@ class Shot(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class Setting:
     """The operator: its name and class (`module:Class`), parameters, seed of the graph, version of the seeding,
-    threads of libraries, output ports."""
+    threads of libraries, output ports, environment (`env:`)."""
 
     name: str
     use: str
@@ -65,6 +70,7 @@ class Setting:
     seeding: int
     threads: int
     outputs: Mapping[str, str]
+    env: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +108,8 @@ class Captured:
     one, and the parameters that had been changed by then: before the last `setup()`, and `since`.
 
     Expected of it are the messages in `expected`, by port, or the error `recorded_error`, or, where there is a
-    `predicate`, that this expression is false; where neither is given, that it raises nothing.
+    `predicate`, that this expression is false, and an error none but `recorded_error`; where none of these is given,
+    that it raises nothing.
     """
 
     setting: Setting
@@ -115,7 +122,8 @@ class Captured:
     predicate: str = ""
 
     def play(self) -> Outcome:
-        """Makes the calls with a new operator. Raises `OperatorFailure` where it cannot be set up."""
+        """Makes the calls with a new operator. Raises `OperatorFailure` where it cannot be set up; `StateError` for a
+        state of another version of its class whose new fields have no default."""
         setting = self.setting
         node = Node(
             name=setting.name,
@@ -124,6 +132,7 @@ class Captured:
             inputs={},
             outputs=dict(setting.outputs),
             live=Live("block", 64, {}),
+            env=setting.env,
         )
         journal = RecordedJournal()
         with limited_threads(setting.threads):
@@ -135,16 +144,30 @@ class Captured:
                 for name, value in self.since.items():
                     calls.parameter(name, value, (0, NEVER))
                 if self.state is not None:
-                    calls.restore(self.state, (0, self.shots[0].firing.stamp - 1))
+                    self._take_over(calls, self.state)
                 return _made(calls, journal, self.shots)
             finally:
                 close_quietly(calls.operator)
 
+    def _take_over(self, calls: Calls, state: bytes) -> None:
+        try:
+            with of_another_version():
+                calls.restore(state, (0, self.shots[0].firing.stamp - 1))
+        except OperatorFailure as failure:
+            if "StateError" not in failure.summary:
+                raise
+            raise StateError(
+                f"{self.setting.name}: the captured state does not fit the class as it is now: {failure.summary}; "
+                "give new fields a default, or capture the call again"
+            ) from failure
+
     def check(self) -> None:
         """Makes the calls; raises `AssertionError`, or the operator's own error, where the last one is wrong."""
         outcome = self.play()
+        if outcome.error is not None and outcome.broken:
+            raise outcome.error
         if self.predicate:
-            assert not Predicate(self.predicate).is_true(outcome.names()), f"{self.setting.name}: {self.predicate}"
+            self._check_predicate(outcome)
         elif self.recorded_error:
             error = "nothing" if outcome.error is None else readable(outcome.error)
             assert error == self.recorded_error, f"{self.setting.name}: raised {error}, expected {self.recorded_error}"
@@ -153,6 +176,16 @@ class Captured:
         elif self.expected is not None:
             found = "; ".join(_differences(self.expected, outcome.outputs))
             assert not found, f"{self.setting.name}: {found}"
+
+    def _check_predicate(self, outcome: Outcome) -> None:
+        name, predicate = self.setting.name, Predicate(self.predicate)
+        if outcome.error is not None and readable(outcome.error) != self.recorded_error:
+            raise outcome.error
+        assert not predicate.is_true(outcome.names()), f"{name}: {self.predicate}"
+        assert predicate.problem is None, (
+            f"{name}: {self.predicate} raises {readable(predicate.problem)}: whether the call is right is not known; "
+            "capture it by an expression that is false of a right call"
+        )
 
     def to_bytes(self) -> bytes:
         """Returns the file's content. Raises ValueError for a message that does not come back from it alike."""
@@ -230,9 +263,22 @@ class Predicate:
 
 
 def check(path: Path) -> None:
-    """Makes a captured call again, from its file. Raises `AssertionError`, or what the operator raises, where it is
-    wrong still."""
-    Captured.from_bytes(path.read_bytes()).check()
+    """Makes a captured call again, from its file, in the environment of its operator. Where that is not this process,
+    what the operator raises there becomes the text of an `AssertionError`.
+
+    Raises `AssertionError`, or what the operator raises, where it is wrong still, and `EnvError`.
+    """
+    captured = Captured.from_bytes(path.read_bytes())
+    env, threads = captured.setting.env, captured.setting.threads
+    if env is None or is_environment(env):
+        captured.check()
+        return
+    there = environment_of(env)
+    command = [there.python, "-P", "-c", _CHECK, str(path.resolve())]
+    variables = there.variables(environment(threads))
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=LONGEST, check=False)
+    if done.returncode:
+        raise AssertionError(f"in the environment {env}: {done.stderr.strip() or f'exit code {done.returncode}'}")
 
 
 def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[Shot]) -> Outcome:

@@ -1,9 +1,9 @@
 """The ladder of re-runs that finds the causes of a difference, in at most `MOST` of them.
 
 An operator that does not repeat: with all sources of chance fixed it repeats, and with a cause left free it does not
-make the same. One that repeats, and not what was recorded: with a cause changed it makes something else. Sources are
-tried in groups: a group without effect is cleared by one re-run, one with an effect is halved. So several causes are
-found, each by its effect.
+make the same. One that repeats, and not what was recorded: with a cause changed it makes something else, also where two
+runs agree by chance, such as by a clock that is rounded to 10 ms. Sources are tried in groups: a group without effect
+is cleared by one re-run, one with an effect is halved. So several causes are found, each by its effect.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 from dataflow.causes.rerun import Rerun, Setting
 from dataflow.causes.sources import (
-    ADDRESSES,
     CHANCE,
     COMPILED,
     FILE,
@@ -22,9 +21,9 @@ from dataflow.causes.sources import (
     HEAP,
     LOCALE,
     MODULE,
+    MOVED,
     THREADS,
     VARIABLE,
-    WALL,
     WORKING,
     kind_of,
 )
@@ -33,8 +32,8 @@ from dataflow.supervision.core.report import RunFailed
 MOST = 8
 """Re-runs of one operator."""
 
-_MOVED = frozenset({HEAP, COMPILED})
-"""Sources that are changed where others are left free: they might give the same by chance."""
+_MOVED = frozenset({HEAP, COMPILED, *MOVED})
+"""Sources that are changed rather than left free: they might give the same by chance."""
 
 Fire = Callable[[Setting], Rerun]
 
@@ -96,10 +95,11 @@ class Ladder:
             return Rerun((f"failed: {failure}",))
 
     def _find_freed(self, found: Findings) -> None:
-        seen = {source for source, _, _ in found.first.sites} | ({THREADS} if found.first.threads else set())
         fixed = frozenset(CHANCE).difference(self._left_out)
         base = self._fire(Setting(fixed))
-        unseen = [s for s in (HEAP, ADDRESSES, COMPILED) if s in fixed and s not in seen]
+        seen = {source for source, _, _ in found.first.sites} | ({THREADS} if found.first.threads else set())
+        seen |= base.given  # also to compiled code, past the log: `sorted(things, key=id)`
+        unseen = [s for s in (HEAP, COMPILED) if s in fixed and s not in seen]
         trapped = [s for s in CHANCE if s in fixed & seen]
 
         def effect(group: Sequence[str]) -> Rerun | None:
@@ -120,14 +120,20 @@ class Ladder:
 
     def _find_varied(self, found: Findings, base: Rerun) -> None:
         seen = dict.fromkeys(source for source, _, _ in found.first.sites)
-        trapped = [s for s in seen if kind_of(s) in (WALL, VARIABLE, FILE, FOLDER, WORKING, LOCALE)]
+        outside = [s for s in seen if kind_of(s) in (VARIABLE, FILE, FOLDER, WORKING, LOCALE)]
+        chance = [THREADS, *(s for s in CHANCE if s in MOVED)]
+        moved = self._tried(Setting(varied=frozenset(chance)))
+        asked = [s for s in chance if s in seen or s in moved.given]
+        known = {tuple(asked): moved}  # those that are not asked for have no effect
 
         def effect(group: Sequence[str]) -> Rerun | None:
-            made = self._tried(Setting(varied=frozenset(group)))
+            made = known.get(tuple(group)) or self._tried(Setting(varied=frozenset(group)))
             found.left = found.left or made.left
             return None if made.same(base) else made
 
-        self._search(found, [[HASHES, HEAP, MODULE], *([s] for s in trapped)], effect, lambda source, made: True)
+        found.cleared += [s for s in CHANCE if s in seen and s not in chance and s != HEAP]  # free in both
+        groups = [asked, [HASHES, HEAP, MODULE], *([s] for s in outside)]
+        self._search(found, groups, effect, lambda source, made: True)
 
     def _search(
         self,
@@ -139,7 +145,7 @@ class Ladder:
         left = [_Group(group) for group in groups if group]
         while left and not found.hopeless:
             room = self._most - self._fired
-            if len(left) > room > 0:  # several at once, where there is not room for each
+            if len(left) > room > 0 and not any(group.rest for group in left[room - 1 :]):  # several at once
                 left[room - 1 :] = [_Group([source for group in left[room - 1 :] for source in group.sources])]
             sources, known = left[0].sources, left[0].known(found.cleared)
             try:

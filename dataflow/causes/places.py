@@ -56,7 +56,21 @@ class Places:
 
     def passes(self, frame: FrameType) -> bool:
         """Returns whether a caller is the engine or the standard library, whose waits need the real clocks."""
-        return self.of(frame.f_code) in ("engine", "standard")
+        return self.owner(frame) in ("engine", "standard")
+
+    def asked_by(self, frame: FrameType | None) -> str:
+        """Returns whose code asks for something, itself or by the standard library; "engine" where there is none."""
+        while frame is not None:
+            if (owner := self.owner(frame)) != "standard":
+                return owner
+            frame = frame.f_back
+        return "engine"
+
+    def owner(self, frame: FrameType) -> str:
+        """Returns whose code a frame runs; what `exec` made, such as the `__init__` of a dataclass, is its caller's."""
+        while frame.f_code.co_filename.startswith("<string") and frame.f_back is not None:
+            frame = frame.f_back
+        return self.of(frame.f_code)
 
 
 def _folders(package: str) -> list[str]:

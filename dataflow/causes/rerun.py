@@ -75,7 +75,7 @@ class Rerun:
     """The outcome of a re-run: for each call what came out, as digests; `cut` where its time was up before the end.
 
     `sites` are the lines that read a source, with the number of calls; `threads`, how many ran besides the engine's;
-    `left`: names of modules and classes that the operator changed.
+    `left`: names of modules and classes that the operator changed; `given`: fixed sources that its code was given.
     """
 
     made: tuple[str, ...]
@@ -83,6 +83,7 @@ class Rerun:
     sites: tuple[tuple[str, Site, int], ...] = ()
     threads: int = 0
     left: tuple[str, ...] = ()
+    given: frozenset[str] = frozenset()
 
     def same(self, other: Rerun) -> bool:
         """Returns whether both made the same, as far as both went."""
@@ -94,7 +95,8 @@ class Rerun:
     @staticmethod
     def from_wire(values: Mapping[str, Any]) -> Rerun:
         sites = tuple((source, Site(**site), count) for source, site, count in values["sites"])
-        return Rerun(tuple(values["made"]), values["cut"], sites, values["threads"], tuple(values["left"]))
+        left, given = tuple(values["left"]), frozenset(values["given"])
+        return Rerun(tuple(values["made"]), values["cut"], sites, values["threads"], left, given)
 
 
 def run_again(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
@@ -126,6 +128,7 @@ def run_again(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         "sites": sites,
         "threads": traps.threads(),
         "left": sorted(left),
+        "given": sorted(interventions.given),
     }
 
 
@@ -146,7 +149,7 @@ def _repeat(
             guard=MemoryGuard(keeping=True),
             watcher=board,
         )
-        interventions.number_hashes()
+        interventions.number_objects()
         runner = work.runners[name]
         runner.judge = follower = Follower(runner.judge)
         if lines is not None:

@@ -12,7 +12,7 @@ NUMPY = "numpy's generator"
 UUID = "uuid"
 ENTROPY = "entropy of the system"
 IDENTITY = "id()"
-ADDRESSES = "order by address"
+ADDRESSES = "addresses of objects"
 HASHES = "order by hash"
 PROCESS = "number of the process"
 THREADS = "threads"
@@ -43,7 +43,10 @@ SOURCES = {
     UUID: Source("a random identifier", "self.rng.bytes(16), or a count kept in the state"),
     ENTROPY: Source("random bytes of the system", "self.rng"),
     IDENTITY: Source("the address of an object", "a count kept in the state"),
-    ADDRESSES: Source("the order of objects in memory", "a list or dict; sorted() by a value for a set of objects"),
+    ADDRESSES: Source(
+        "where objects lie in memory: the order of a set, hash(), repr()",
+        "a list or dict, sorted() by a value, a __repr__",
+    ),
     HASHES: Source("the order of a set, or hash() of a text", "sorted(), a dict, or xxhash"),
     PROCESS: Source("the number of its process", "a parameter"),
     THREADS: Source("the order in which threads finish", "one thread, or results taken in the order of the tasks"),
@@ -59,6 +62,8 @@ SOURCES = {
 
 CHANCE = (WALL, MONOTONIC, RANDOM, NUMPY, UUID, ENTROPY, IDENTITY, PROCESS, THREADS, HEAP, ADDRESSES, COMPILED)
 """Sources that may differ between two runs of the same code on the same machine."""
+MOVED = (WALL, MONOTONIC, RANDOM, NUMPY, ENTROPY, IDENTITY, ADDRESSES)
+"""Of these, sources that may give results by which two runs agree: what they give can be changed so that it shows."""
 
 
 def kind_of(source: str) -> str:

@@ -153,7 +153,7 @@ class Traps:
             self._note(source, call, frame.f_back)
 
     def _note_built_in(self, source: str, name: str, frame: FrameType, arg: Any) -> None:
-        direct = self._places.of(frame.f_code) == "own"
+        direct = self._places.owner(frame) == "own"
         if source is RANDOM:
             if name == "Random.seed":
                 if frame.f_locals.get("a", 0) is not None:
@@ -165,8 +165,10 @@ class Traps:
                 return  # noted as numpy's, or as an identifier
         elif source in (IDENTITY, HEAP) and not direct:
             return
-        if self._places.passes(frame) and source in (WALL, MONOTONIC, PROCESS):
+        if self._places.passes(frame) and source in (MONOTONIC, PROCESS):
             return  # waits of the standard library
+        if source is WALL and self._places.asked_by(frame) == "engine":
+            return
         module = "" if getattr(arg, "__module__", None) is None else f"{arg.__module__}."
         self._note(source, module.replace("posix", "os").replace("builtins.", "") + name, frame)
         if name in _ZONED:

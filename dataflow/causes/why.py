@@ -12,7 +12,7 @@ from typing import Any
 
 from dataflow.causes.ladder import MOST, Findings, Ladder
 from dataflow.causes.rerun import Rerun, Setting, fake_time, run_again
-from dataflow.causes.sources import COMPILED, FILE, FOLDER, INPUT, MODULE, SOURCES, kind_of, name_of
+from dataflow.causes.sources import CHANCE, COMPILED, FILE, FOLDER, INPUT, MODULE, SOURCES, kind_of, name_of
 from dataflow.causes.traps import Site
 from dataflow.graph.model import Graph
 from dataflow.graph.reach import with_makers
@@ -73,10 +73,11 @@ class Cause:
 class Why:
     """The answer about one operator. `refused`: the reason for which nothing was tried; `repeats`: whether its re-runs
     agree; `settled`: whether they do with all sources of chance fixed (None where that was not tried or needed).
-    `cleared` sources were tried without effect, of each group in `open` one has an effect, `left_out` could not be
-    tried, with the reason. `older`: files and folders that have an effect, and were not changed since the recording.
-    `changed` are facts that the recording holds and that differ now; `code_known`: it holds digests of the operator's
-    code. `seconds` in all."""
+    `cleared` sources were tried without effect; `reads` are those of chance among them, with the lines. Of each group
+    in `open` one has an effect, `left_out` could not be tried, with the reason. `changed` are facts that the recording
+    holds and that differ now; `also`: sources that have an effect, and need not differ from those of the recording:
+    files and folders that are older than it, and all others where the operator itself was changed. `code_known`: it
+    holds digests of the operator's code. `seconds` in all."""
 
     operator: str
     refused: str = ""
@@ -84,17 +85,18 @@ class Why:
     settled: bool | None = None
     causes: tuple[Cause, ...] = ()
     cleared: tuple[str, ...] = ()
+    reads: tuple[Cause, ...] = ()
     open: tuple[tuple[str, ...], ...] = ()
     left_out: Mapping[str, str] | None = None
-    older: tuple[str, ...] = ()
     changed: tuple[str, ...] = ()
+    also: tuple[Cause, ...] = ()
     code_known: bool = False
     reruns: int = 0
     seconds: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
-        plain = asdict(replace(self, causes=(), left_out=dict(self.left_out or {})))
-        return plain | {"causes": [cause.as_json() for cause in self.causes]}
+        plain = asdict(replace(self, causes=(), also=(), reads=(), left_out=dict(self.left_out or {})))
+        return plain | {name: [each.as_json() for each in getattr(self, name)] for name in ("causes", "also", "reads")}
 
 
 def why(
@@ -120,13 +122,14 @@ def why(
     assert verification is not None
     alone = _Alone(path, graph, verification, seconds=seconds, stall_timeout=stall_timeout, workers=workers)
     changed, known = report.altered(operator), verification.code_known
+    revised = bool(report.revised(operator))
     try:
         wrote = alone.lines() if verification.wrote else None
         if verification.first is None:
             made = Why(operator, causes=(_cause(INPUT, wrote),), reruns=1)
         else:
             ladder = Ladder(alone.fire, tuple(alone.left_out), MOST - (wrote is not None))
-            made = _answer(operator, ladder.climb(report.repeats(operator)), alone, wrote, verification)
+            made = _answer(ladder.climb(report.repeats(operator)), alone, wrote, verification, revised)
     except RunFailed as failure:
         if failure.interrupted:
             raise
@@ -150,22 +153,34 @@ def refusal(report: VerifyReport, operator: str, found: Verification | None) -> 
     return f"it repeats: {report.verdict(found)}"
 
 
-def _answer(operator: str, findings: Findings, alone: _Alone, wrote: Rerun | None, verification: Verification) -> Why:
-    causes = [_cause(source, findings.first, findings.left) for source in findings.causes]
-    outside = [cause for cause in causes if cause.kind in (FILE, FOLDER)]
-    older = [cause for cause in outside if not alone.is_newer(name_of(cause.source), verification)]
-    causes = [cause for cause in causes if cause not in older]
+def _answer(findings: Findings, alone: _Alone, wrote: Rerun | None, found: Verification, revised: bool) -> Why:
+    """Returns the answer from an operator's findings; `revised`: it is not itself as it was recorded."""
+    effective = [_cause(source, findings.first, findings.left) for source in findings.causes]
+    causes = [cause for cause in effective if _explains(cause, findings, alone, found, revised)]
     first = [] if wrote is None else [_cause(INPUT, wrote)]
+    reads = [_cause(source, findings.first) for source in findings.cleared if source in CHANCE]
     return Why(
-        operator,
+        found.operator,
         repeats=findings.repeats,
         settled=findings.settled,
         causes=(*first, *causes),
         cleared=tuple(findings.cleared),
+        reads=tuple(read for read in reads if read.sites),
         open=tuple(findings.open),
-        older=tuple(cause.what for cause in older),
+        also=tuple(cause for cause in effective if cause not in causes),
         reruns=findings.reruns + len(first),
     )
+
+
+def _explains(cause: Cause, findings: Findings, alone: _Alone, found: Verification, revised: bool) -> bool:
+    """Returns whether a source on which results depend explains why they are not the recorded ones: it makes them
+    differ from run to run, it is newer than the recording, or all that the recording holds of the operator is as it
+    was."""
+    if not findings.repeats:
+        return True
+    if cause.kind in (FILE, FOLDER):
+        return alone.is_newer(name_of(cause.source), found)
+    return not revised
 
 
 def _cause(source: str, rerun: Rerun | None, left: tuple[str, ...] = ()) -> Cause:
@@ -237,10 +252,14 @@ class _Alone:
         return self.fire(Setting(lines=True))
 
     def is_newer(self, file: str, found: Verification) -> bool:
-        """Returns whether a file or folder was changed after the operator's last call, or is not the recorded one."""
+        """Returns whether a file or folder was changed or put here after the operator's last call, or is not the
+        recorded one. Copies keep the time of the last change, and not that at which they were put here."""
         if file in found.files_changed:
             return True
-        return os.path.exists(file) and os.stat(file).st_mtime > self.recorded
+        if not os.path.exists(file):
+            return False
+        status = os.stat(file)
+        return max(status.st_mtime, status.st_ctime) > self.recorded
 
 
 def reasons(path: Path, report: VerifyReport, operators: Sequence[str], graph: Graph | None = None) -> list[Why]:

@@ -152,6 +152,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("following.top:top", FOLLOW, elsewhere=True),
     Command("following.health:health", FOLLOW, elsewhere=True),
     Command("following.health:metrics", FOLLOW, elsewhere=True),
+    Command("following.spans:spans", FOLLOW, elsewhere=True),
     Command("following.logs:logs", FOLLOW),
     Command("following.pub:pub", FOLLOW, elsewhere=True),
     Command("following.reload:reload", FOLLOW, elsewhere=True),
@@ -169,7 +170,13 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow new operator NearestObstacle
           dataflow new graph obstacle_watch
         """,
-        (Command("new:operator"), Command("new:graph"), Command("new:project"), Command("new:service")),
+        (
+            Command("new:operator"),
+            Command("new:graph"),
+            Command("new:project"),
+            Command("new:service"),
+            Command("new:agent"),
+        ),
     ),
     Family(
         "keys",

@@ -30,6 +30,7 @@ FAMILIES: Mapping[str, tuple[str, str]] = {
     "dataflow_call_seconds_total": ("counter", "Wall time of the operator's calls."),
     "dataflow_restarts_total": ("counter", "Restarts of the operator."),
     "dataflow_event_time_seconds": ("gauge", "The stamp up to which the operator is done."),
+    "dataflow_silence_seconds": ("gauge", "How long the operator has not fired."),
     "dataflow_behind_clock_seconds": ("gauge", "How far a source that could wait is behind the clock."),
     "dataflow_disk_free_bytes": ("gauge", "Free space where the folder lies."),
 }
@@ -71,6 +72,8 @@ class Metrics:
                 self.add("dataflow_event_time_seconds", done * 1e-9, **labels)
         for (taken, what), number in status.waits.get(name, {}).items():
             self.add("dataflow_waits_total", number, **labels, input=taken, what=what)
+        if name in status.silences and name not in status.ended:
+            self.add("dataflow_silence_seconds", status.silences[name], **labels)
         if name in status.behind:
             self.add("dataflow_behind_clock_seconds", max(status.behind[name]), **labels)
 

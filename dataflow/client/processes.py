@@ -40,7 +40,8 @@ class ProcessStatus:
     `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
     (input, "timeout" or "late"). `behind`: per source the seconds by which its last message was behind the clock when
     it was read, and when it was sent. `firings`: batches of firing records, where they were asked for. `found`: what
-    operators found wrong with what they were given.
+    operators found wrong with what they were given. `silences`: the seconds since operators last fired. `after`:
+    firings behind a cursor (`RecentFirings.after`).
     """
 
     process: str
@@ -51,6 +52,8 @@ class ProcessStatus:
     behind: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     firings: Sequence[bytes] = ()
     found: Mapping[str, str] = field(default_factory=dict)
+    silences: Mapping[str, float] = field(default_factory=dict)
+    after: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +98,12 @@ class Processes:
             time.sleep(AGAIN_AFTER / 5)
         return True
 
-    def statuses(self, timeout: float, *, firings: bool = False) -> list[ProcessStatus]:
-        """Of the processes that answer, also while their operators are at work. `firings`: with the last ones."""
-        asked = msgpack.packb({"firings": True}) if firings else b""
+    def statuses(
+        self, timeout: float, *, firings: bool = False, after: Mapping[str, Any] | None = None
+    ) -> list[ProcessStatus]:
+        """Of the processes that answer, also while their operators are at work. `firings`: with the last ones; `after`:
+        with those behind the cursors of earlier answers, by process."""
+        asked = msgpack.packb({"firings": firings} | ({} if after is None else {"after": after}))
         answers = self._bus.ask(runtime_key(self._namespace, "status", "**"), asked, timeout=timeout)
         return sorted(map(_status, answers), key=lambda status: status.process)
 
@@ -178,6 +184,8 @@ def _status(answer: bytes) -> ProcessStatus:
         {name: (read, sent) for name, (read, sent) in said["behind"].items()},
         said.get("firings", ()),
         said["found"],
+        said.get("silences", {}),
+        said.get("after", {}),
     )
 
 

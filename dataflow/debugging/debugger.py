@@ -21,7 +21,7 @@ from dataflow.debugging.ring import MOST_BYTES as MOST_HELD
 from dataflow.debugging.ring import Held, Ring
 from dataflow.debugging.sources import Sources
 from dataflow.execution.calls import value_of
-from dataflow.execution.failure import readable
+from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.ports import Emitter
 from dataflow.execution.recorded import RecordedRunner
 from dataflow.execution.threads import limit_threads
@@ -44,6 +44,8 @@ REACH = 3 * 10**9
 """Span (ns) before a call in which a state is looked for at first."""
 NEAR = 16
 """Calls to a state further on, beyond which an operator is set up anew and begins there."""
+RESTORE = "restore()"
+"""Where an operator fails that is given a state of another version of its class."""
 MOST_BYTES = 2**28
 """Of the states that are kept; beyond it every other one is let go."""
 
@@ -90,9 +92,13 @@ class Debugger:
         headings = log.headings(node)
         self.calls: Sequence[Call] = [Call(*heading) for heading in headings if heading.kind in CALLS]
         made = accumulate(heading.kind in CALLS for heading in headings)
-        self._recorded = [n for n, heading in zip(made, headings, strict=True) if heading.kind == "snapshot"]
+        self._snapshots = [n for n, heading in zip(made, headings, strict=True) if heading.kind == "snapshot"]
+        self._recorded: Sequence[int] = self._snapshots
         """The numbers of the calls in front of which a state is recorded, in order."""
         self._feeding = plan_feeding(recording, self.graph, [node.name])
+        self._fit = True
+        """False once a state did not fit the class as it is now, which has other fields: then calls are made from the
+        beginning."""
         self._kept: dict[int, FiringRecord] = {}
         """States before calls, by the call's number, as `cut` records."""
         self._sources = Sources(node.operator)
@@ -183,7 +189,8 @@ class Debugger:
         probe = runner.calls = Probe(runner)
         probe.target, probe.through = way[-1].call, through
         try:
-            runner.setup()
+            if not self._sets_up(runner):
+                return None
             entries = {(e.stream, e.incarnation, e.seq): e for held in way for e in held.entries()}
             for _, entry in sorted(entries.items()):
                 runner.push(entry.stream, entry)
@@ -199,6 +206,21 @@ class Debugger:
         held = self._held(number, runner, same=runner.result.differing - runner.result.states == counts[-1])
         self._take(held, probe)
         return held
+
+    def _sets_up(self, runner: RecordedRunner) -> bool:
+        """Sets an operator up with a state that is kept; returns whether that fits its class."""
+        try:
+            runner.setup()
+        except OperatorFailure as failure:
+            if failure.when != RESTORE:
+                raise
+            self._misfits()
+        return self._fit
+
+    def _misfits(self) -> None:
+        self._fit = False
+        self._kept.clear()
+        self._recorded = []
 
     def _reach(self, number: int, through: Through | None = None) -> int:
         """Goes on to a call; returns the number of the one that was made last."""
@@ -335,6 +357,7 @@ class Debugger:
             at = None if self.at is None else self.at.number
             self._kept = {n: r for n, r in self._kept.items() if n == at}
             self._ring.leave_only(at)
+            self._fit, self._recorded = True, self._snapshots
             self._leave()
         return changed
 
@@ -345,14 +368,23 @@ class Debugger:
     # ------------------------------------------------------------------------------------------------- inside
 
     def _begin(self, number: int, end: int | None = None) -> None:
-        """Sets the operator up for a call that lies behind the nearest state in front of it. `end`: the stamp (ns) up
-        to which records are read."""
+        """Sets the operator up for a call that lies behind the nearest state in front of it, or at the beginning where
+        that state does not fit. `end`: the stamp (ns) up to which records are read."""
+        try:
+            self._begin_near(number, end)
+        except OperatorFailure as failure:
+            if failure.when != RESTORE or not self._fit:
+                raise
+            self._misfits()
+            self._begin_near(number, None)
+
+    def _begin_near(self, number: int, end: int | None) -> None:
         self._leave()
         call = self.calls[number]
         stateless = self.node.operator.stateless
         kept = self._nearest_kept(number)
         begin: int | None = call.stamp if stateless else call.stamp - 1
-        if any(c.stamp >= call.stamp for c in self.calls[:number]):
+        if not self._fit or any(c.stamp >= call.stamp for c in self.calls[:number]):
             begin = None  # stamps went back: they do not show where it is
         cut = self._kept[kept] if kept >= max(0, self._nearest(number)) and not stateless else None
         if cut is not None:

@@ -6,7 +6,18 @@ from dataflow.environments.environment import (
     environment_of,
     imported_packages,
     installed,
+    is_environment,
+    packages_in,
     require_environment,
 )
 
-__all__ = ["EnvError", "Environment", "environment_of", "imported_packages", "installed", "require_environment"]
+__all__ = [
+    "EnvError",
+    "Environment",
+    "environment_of",
+    "imported_packages",
+    "installed",
+    "is_environment",
+    "packages_in",
+    "require_environment",
+]

@@ -113,12 +113,26 @@ def _state(folder: Path) -> tuple[tuple[int, int, int], ...]:
 
 def require_environment(operator: str, env: str | None) -> None:
     """Raises `EnvError` where this process is not in the environment that an operator needs."""
-    here = os.environ.get(_MARK, "").partition(os.pathsep)[0]
-    if env is not None and str(_folder(env)) != here:
+    if env is not None and not is_environment(env):
+        here = os.environ.get(_MARK, "").partition(os.pathsep)[0]
         raise EnvError(
             f"operator {operator!r} needs the environment {env!r}, and this process is in "
-            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay`, `verify` and `debug` start processes in it"
+            f"{here or 'that of dataflow itself'}: `dataflow run`, `replay`, `verify`, `debug`, "
+            "`capture` and `blame` start processes in it"
         )
+
+
+def packages_in(environment: Environment) -> dict[str, str]:
+    """Returns the versions of all packages in an environment, by name."""
+    from importlib.metadata import distributions
+
+    found = [(each.metadata["Name"], each.version) for each in distributions(path=list(environment.path))]
+    return dict(sorted(found, reverse=True))
+
+
+def is_environment(env: str) -> bool:
+    """Returns whether this process is in the environment that `env:` names."""
+    return str(_folder(env)) == os.environ.get(_MARK, "").partition(os.pathsep)[0]
 
 
 def imported_packages() -> dict[str, str]:
@@ -127,9 +141,11 @@ def imported_packages() -> dict[str, str]:
     from importlib.metadata import distributions
 
     _, *path = os.environ.get(_MARK, "").split(os.pathsep)
+    if not path:
+        return {}
     loaded = {name.partition(".")[0] for name in sys.modules}
     found: dict[str, str] = {}
-    for each in distributions(path=path) if path else ():
+    for each in distributions(path=path):
         if each.metadata["Name"] not in found and loaded & _modules(each):
             found[each.metadata["Name"]] = each.version
     return dict(sorted(found.items()))

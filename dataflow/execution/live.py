@@ -19,6 +19,7 @@ from dataflow.execution.calls import Calls
 from dataflow.execution.earlier import EarlierCounts
 from dataflow.execution.event_time import EventTime
 from dataflow.execution.failure import RAISED, OperatorFailure
+from dataflow.execution.interrupted import interrupted_after
 from dataflow.execution.log import FiringLog, unlisted
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
@@ -37,6 +38,8 @@ MOST_TRIED = 256
 ticks one by one, while new ones come due: its process would never look at anything else."""
 
 KEPT_STATE = "kept"
+SET_UP_WITHIN = 30.0
+"""Seconds for which an operator of new code may be set up: meanwhile its process does nothing else."""
 
 
 class LiveRunner(OperatorRunner):
@@ -59,7 +62,7 @@ class LiveRunner(OperatorRunner):
         operator: Operator | None = None,
         snapshots: StateSpacing | None = None,
         clock: Clock | None = None,
-        event_clock: EventClock = time.time_ns,
+        event_clock: EventClock | None = None,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
         faults: Faults | None = None,
     ) -> None:
@@ -74,7 +77,7 @@ class LiveRunner(OperatorRunner):
         self._log = DropLog()  # of what did not reach an aligner
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
         clock = clock or time.monotonic
-        self._time = EventTime(event_clock)
+        self._time = EventTime(event_clock or time.time_ns)
         self.patience = Patience(node.live.wait, clock, self._time.until)
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
@@ -311,9 +314,10 @@ class LiveRunner(OperatorRunner):
                 calls.parameter(name, value, (incarnation, NEVER))
             started = time.time_ns()
             try:
-                calls.setup()
-                if state is not None:
-                    calls.restore(state, (incarnation, stamp))
+                with interrupted_after(SET_UP_WITHIN):
+                    calls.setup()
+                    if state is not None:
+                        calls.restore(state, (incarnation, stamp))
                 return started, calls, kept
             except OperatorFailure as failure:
                 close_quietly(calls.operator)
@@ -335,7 +339,7 @@ class LiveRunner(OperatorRunner):
         name = self._input_of(stream)
         self.queue.clear()
         drops, more = self.take_drops()
-        self._begin_alignment(stream)
+        self._begin_alignment()
         self._jumped[_producer(stream)] = entry.incarnation
         self._seen = {other: (incarnation, NEVER) for other, (incarnation, _) in self._seen.items()}
         self._time.begin_at(entry.stamp)
@@ -351,16 +355,15 @@ class LiveRunner(OperatorRunner):
             raise failure from error
         self.records.add("reset", NEVER + 1, started, drops=tuple(drops), detail=detail)
 
-    def _begin_alignment(self, jumped: str) -> None:
+    def _begin_alignment(self) -> None:
         old = self.aligner
         self._earlier.take(old, self.spec)
         self.aligner = make_aligner(old.spec)
         self._told = True
         for static in self._statics.values():
             self.aligner.push(static.stream, static)
-        for stream, end in old.ends.items():
-            if stream != jumped and stream not in self._static:
-                self.aligner.end(stream, None, end.reason)
+        for stream, end in old.ends.items():  # of one that begins again, its message opens it
+            self.aligner.end(stream, None, end.reason)
 
     def _begin_incarnation(self, *, stamps_go_back: bool = False) -> None:
         incarnation = self.records.incarnation + 1

@@ -29,6 +29,7 @@ from dataflow.records.cuts import code_in, is_known, parameters_at, taken_by
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import Digests
 from dataflow.records.repetition import Repetition
+from dataflow.state import of_another_version
 from dataflow.sync import FOREVER, NEVER, Entry, Firing, FiringInputs, MessageRef, RecordedAligner, Uses
 
 
@@ -237,7 +238,7 @@ class RecordedRunner(Runner):
             self._change(taken.at_setup, record.incarnation)
         self._change(taken.since, record.incarnation)
         if taken.state is not None:
-            self.calls.restore(taken.state, (record.incarnation, record.stamp))
+            self._take_over(taken.state, record)
             self.result.began = "snapshot"
 
     def _attempt(self, record: FiringRecord) -> None:
@@ -262,7 +263,12 @@ class RecordedRunner(Runner):
             self._calls_left, self._next = 0, None
             self.aligner = RecordedAligner(self._align_spec, Uses())
             return
-        self.calls.restore(state, (record.incarnation, record.stamp))
+        self._take_over(state, record)
+
+    def _take_over(self, state: bytes, record: FiringRecord) -> None:
+        """Takes over a state from before which nothing can be repeated, of another version of the class, too."""
+        with of_another_version():
+            self.calls.restore(state, (record.incarnation, record.stamp))
 
     def _is_lost(self, missing: MessageRef | None) -> bool:
         """Returns whether a message that the next firing needs can no longer come."""

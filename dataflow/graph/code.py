@@ -37,6 +37,8 @@ _DIGEST = re.compile("[0-9a-f]{64}")
 _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^#\n]*)|import[ \t]+([^#\n]*))", re.M)
 _FOR_TYPES = re.compile(r"^if (?:\w+\.)?TYPE_CHECKING:.*\n(?:[ \t]+.*\n|[ \t]*\n)*", re.M)
 """Imports that a type checker makes, and no program."""
+_WORD = re.compile(r"""["'](?!/)([^"'\n]{1,255})["']""")
+"""What may name a file in a module's text."""
 _texts: WeakKeyDictionary[ModuleType, bytes] = WeakKeyDictionary()
 """The source of modules as they were loaded, from the first look at them on."""
 
@@ -64,6 +66,35 @@ def code_now(operator: type[Operator], also: Iterable[str] = ()) -> Code:
     `also`: modules that are looked at as well, where there are any of that name.
     """
     return Code(operator, _own_texts(operator.__module__, *also))
+
+
+def files_of(home: str) -> dict[str, Path]:
+    """Returns the files of the code of a module, without importing it, by their paths below the folder in which modules
+    are found: all modules of the package that it is in, own modules that it imports from elsewhere, and files beside
+    the latter that their texts name, such as a program that is started."""
+    top = home.partition(".")[0]
+    spec = importlib.util.find_spec(top)
+    places = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
+    found = {f"{top}/{file.relative_to(place).as_posix()}": file for place in places for file in place.rglob("*.py")}
+    if not places and spec is not None and spec.origin is not None:
+        found[f"{top}.py"] = Path(spec.origin)
+    for name, text in _own_texts(home).items():
+        origin = getattr(sys.modules.get(name) or _spec_of(name), "__file__" if name in sys.modules else "origin", None)
+        if origin is None or (places and name.partition(".")[0] == top):
+            continue
+        file = Path(origin)
+        above = file.parents[name.count(".") + (file.name == "__init__.py")]
+        named = {file, *(file.parent / word for word in _WORD.findall(text.decode(errors="replace")))}
+        found |= {os.path.relpath(each, above): each for each in named if _is_file(each)}
+    return found
+
+
+def _is_file(path: Path) -> bool:
+    """Returns whether a file is there; what no file can be called, as any long text, is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def digest_of(text: bytes) -> str:

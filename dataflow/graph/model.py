@@ -11,7 +11,7 @@ import json
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from dataflow.environments import require_environment
@@ -20,6 +20,7 @@ from dataflow.graph.sections import (
     Network,
     Record,
     View,
+    as_values,
     record_from_json,
     record_to_json,
     view_from_json,
@@ -254,7 +255,9 @@ class Graph:
 
     def bundle(self) -> str:
         """JSON that `load_bundle` turns into this very graph again, without its files."""
-        return json.dumps({"format": "dataflow-graph/1", **asdict(self.sources_bundle)}, indent=1, ensure_ascii=False)
+        return json.dumps(
+            {"format": "dataflow-graph/1", **as_values(self.sources_bundle)}, indent=1, ensure_ascii=False
+        )
 
     def to_json(self) -> dict[str, Any]:
         """The resolved graph as JSON values; `Graph.from_json` rebuilds it without importing operators."""
@@ -263,15 +266,15 @@ class Graph:
             "namespace": self.namespace,
             "seed": self.seed,
             "threads": self.threads,
-            "nodes": [asdict(node) for node in self.nodes.values()],
-            "streams": [asdict(stream) for stream in self.streams.values()],
+            "nodes": [as_values(node) for node in self.nodes.values()],
+            "streams": [as_values(stream) for stream in self.streams.values()],
             "aliases": dict(self.aliases),
             "types": [declaration.to_json() for declaration in self.types.values()],
             "left_out": dict(self.left_out),
             "record": record_to_json(self.record),
             "view": view_to_json(self.view),
-            "network": asdict(self.network),
-            "bundle": asdict(self.sources_bundle),
+            "network": as_values(self.network),
+            "bundle": as_values(self.sources_bundle),
         }
 
     @classmethod

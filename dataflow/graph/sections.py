@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from types import NoneType
 from typing import Any, Literal
 
 
@@ -101,10 +103,28 @@ class Network:
         return not (self.listen or self.connect or self.scouting)
 
 
+def as_values(thing: Any) -> Any:
+    """Returns what `dataclasses.asdict` does of dataclasses, mappings, sequences and plain values, several times as
+    quickly: plain values are not copied."""
+    kind = type(thing)
+    if kind in _PLAIN:
+        return thing
+    if kind is dict:
+        return {key: as_values(value) for key, value in thing.items()}
+    if kind is tuple or kind is list:
+        return kind([as_values(value) for value in thing])
+    if (fields := getattr(kind, "__dataclass_fields__", None)) is not None:
+        return {name: as_values(getattr(thing, name)) for name in fields}
+    return copy.deepcopy(thing)
+
+
+_PLAIN = frozenset((str, int, float, bool, NoneType))
+
+
 def record_to_json(record: Record) -> dict[str, Any]:
     """Leaves out what the graph does not say and older recordings did not hold."""
     later = ("flight", "on_failure")
-    return {name: value for name, value in asdict(record).items() if name not in later or value is not None}
+    return {name: value for name, value in as_values(record).items() if name not in later or value is not None}
 
 
 def record_from_json(data: Mapping[str, Any]) -> Record:
@@ -116,7 +136,7 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
 
 def view_to_json(view: View) -> dict[str, Any]:
     """Leaves out `every` where the graph does not say it, so that recorded graphs stay as they were."""
-    return {name: value for name, value in asdict(view).items() if name != "every" or value is not None}
+    return {name: value for name, value in as_values(view).items() if name != "every" or value is not None}
 
 
 def view_from_json(data: Mapping[str, Any]) -> View:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import importlib.util
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from dataflow.graph.code import files_of as files_of_code
+from dataflow.graph.model import current_path
 
 MOST_SENT = 4 << 30
 """Bytes of files that are sent to a machine, at most."""
@@ -28,24 +30,10 @@ class FilesError(ValueError):
 
 
 def code_of(uses: Iterable[str]) -> Digests:
-    """Returns the digests of the source files of this package and of the packages that operators (`use:`) are in."""
-    packages = sorted({"dataflow", *(use.partition(":")[0].partition(".")[0] for use in uses)})
-    return {name: digest_of(path) for package in packages for name, path in _sources(package)}
-
-
-def _sources(package: str) -> Iterator[tuple[str, Path]]:
-    try:
-        spec = importlib.util.find_spec(package)
-    except (ImportError, ValueError):
-        return
-    if spec is None:
-        return
-    for folder in spec.submodule_search_locations or ():
-        root = Path(folder)
-        for path in sorted(root.rglob("*.py")):
-            yield f"{package}/{path.relative_to(root).as_posix()}", path
-    if not spec.submodule_search_locations and spec.origin is not None and spec.origin.endswith(".py"):
-        yield f"{package}.py", Path(spec.origin)
+    """Returns the digests of the files of this package's code and of that of operators (`use:`), by path."""
+    homes = sorted({"dataflow", *(current_path(use).partition(":")[0] for use in uses)})
+    code = {name: path for home in homes for name, path in files_of_code(home).items()}
+    return {name: digest_of(path) for name, path in code.items()}
 
 
 def python() -> str:

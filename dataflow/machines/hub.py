@@ -28,6 +28,8 @@ REPORT_EVERY = 1.0
 LEAVE_WITHIN = 2.0
 LEASE = 6_000
 """Milliseconds after which a link on which nothing comes is given up, and connected anew."""
+BLOCKED = 3.0
+"""Seconds for which a frame waits for a link that takes nothing; a router's tables, and a new link, wait as long."""
 POOL_BYTES = 256 << 20
 
 
@@ -63,7 +65,7 @@ def machine_key(machine: str, *chunks: str) -> str:
 def router(listen: Sequence[str], connect: Sequence[str], more: Mapping[str, Any]) -> Bus:
     """Opens a session that routes between those that connect to it. Raises `BusError`, `NetworkError`."""
     common = {"mode": "router", "transport/link/tx/lease": LEASE, "transport/link/tx/keep_alive": 6}
-    return Bus(NetworkConfig(tuple(listen), tuple(connect), exposed=True, zenoh={**common, **more}))
+    return Bus(NetworkConfig(tuple(listen), tuple(connect), exposed=True, blocked=BLOCKED, zenoh={**common, **more}))
 
 
 class Claims:

@@ -8,7 +8,9 @@ it.
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import os
+import re
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -30,8 +32,9 @@ CONNECT_WITHIN = 3000
 DAYS = 3650
 _AUTHORITY, _CERTIFICATE, _KEY = "authority.pem", "certificate.pem", "key.pem"
 _AUTHORITY_KEY = "authority.key"
-_NAME = "name"
-"""The file with the name of a machine that serves."""
+_MACHINE, _NAME = "machine", "name"
+"""The file with the name of the machine, and that of one that serves."""
+_HOST = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(\.[A-Za-z0-9-]{1,63})*\.?")
 _CURVE = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
 
 
@@ -59,6 +62,8 @@ def issue(authority: Path, folder: Path, name: str, *, serves: Iterable[str] = (
     if (folder / _KEY).exists():
         raise KeysError(f"{folder} has keys already; name another folder")
     served = list(serves)
+    if wrong := [each for each in served if not (_is_ip(each) or _HOST.fullmatch(each))]:
+        raise KeysError(f"--serves {wrong[0]!r}: expected an address or host name, without a port")
     usage = "serverAuth,clientAuth" if served else "clientAuth"
     extensions = [f"extendedKeyUsage={usage}", "basicConstraints=CA:FALSE"]
     if served:
@@ -72,6 +77,7 @@ def issue(authority: Path, folder: Path, name: str, *, serves: Iterable[str] = (
         out = ("-extfile", str(wanted), "-out", str(made / _CERTIFICATE), "-days", str(DAYS))
         _openssl("x509", "-req", "-in", str(request), *by, *out)
         (made / _AUTHORITY).write_bytes((authority / _AUTHORITY).read_bytes())
+        (made / _MACHINE).write_text(name)
         if served:
             (made / _NAME).write_text(name)
 
@@ -88,7 +94,11 @@ def _made_for(folder: Path) -> Iterator[Path]:
 
 
 def _is_ip(address: str) -> bool:
-    return ":" in address or address.replace(".", "").isdigit()
+    try:
+        ipaddress.ip_address(address)
+    except ValueError:
+        return False
+    return True
 
 
 def _openssl(*words: str) -> None:
@@ -139,6 +149,25 @@ def settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
 def own_name(keys: Path) -> str | None:
     """Returns the name in the certificate of a machine that serves; None for keys of before this was noted."""
     return (keys / _NAME).read_text() if (keys / _NAME).is_file() else None
+
+
+def require_machine(keys: Path, name: str) -> None:
+    """Raises `KeysError` where keys are those of another machine than `name`, or of tools."""
+    path = keys / _MACHINE  # which keys of before do not have
+    if path.is_file() and (found := path.read_text()) != name:
+        whose = "tools, which join no run" if found == TOOLS else f"machine {found!r}"
+        raise KeysError(
+            f"{keys} holds the keys of {whose}, not those of {name!r}: `dataflow keys add {name}` makes them"
+        )
+
+
+def require_serving(keys: Path) -> None:
+    """Raises `KeysError` for keys of a machine that others cannot reach."""
+    if (keys / _MACHINE).is_file() and not (keys / _NAME).is_file():
+        raise KeysError(
+            f"{keys} holds keys that cannot serve: those of the machine that runs the graph are made with "
+            "`dataflow keys add NAME --serves ADDRESS`"
+        )
 
 
 def access(machines: Iterable[str], namespace: str, own: str | None = None) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,7 @@ def build(
     emitter: Emitter,
     *,
     live: LiveSources | None = None,
-    event_clock: Callable[[], int] = time.time_ns,
+    event_clock: Callable[[], int] | None = None,
     on_failure: Outlived = _cannot_restart,
 ) -> None:
     """Makes the operators that `config` names, and the recording that is replayed, if any.
@@ -83,7 +82,7 @@ def _make_runner(
     graph: Graph,
     config: ProcessConfig,
     emitter: Emitter,
-    event_clock: Callable[[], int],
+    event_clock: Callable[[], int] | None,
     on_failure: Outlived,
 ) -> OperatorRunner:
     """Makes the runner of an operator that has inputs."""

@@ -49,6 +49,7 @@ class Progress:
         """By how much sources were last reported to be behind the clock (s): when read, and when sent."""
         self.found: dict[str, str] = {}
         """The findings of operators when their counts were last reported."""
+        self._fired_at: dict[str, float] = {}
         self._dropped: dict[str, list[list[Any]]] = {}
         self._counted: dict[str, tuple[int, int]] = {}
         self._count_due = -COUNT_EVERY
@@ -83,6 +84,7 @@ class Progress:
                     self._counted[runner.node.name] = reached
                     changed.append(runner)
         counts = counts_of(self._driver, changed)
+        self._fired_at |= {n: now for n, row in counts.items() if row[0] != self.counted.get(n, (0,))[0]}
         self.counted |= counts
         dropped = _drops_of(self._driver, changed)
         drops = {name: found for name, found in dropped.items() if found != self._dropped.get(name)}
@@ -101,6 +103,11 @@ class Progress:
         if text and not self.found.get(operator):
             logging.getLogger(__name__).warning(text, extra={"operator": operator})
         self.found[operator] = text
+
+    def silences(self) -> dict[str, float]:
+        """Returns the seconds since operators last fired, as far as was reported; on any thread."""
+        now = self._clock()
+        return {name: now - fired for name, fired in self._fired_at.copy().items()}
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""

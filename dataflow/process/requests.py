@@ -162,7 +162,8 @@ class Requests:
     def _answer_status(self, query: Any) -> None:
         """Answers with what was reported last; on Zenoh's thread, so an operator at work holds up nothing.
 
-        A request `{"firings": true}` is answered with the firing records of the last seconds too.
+        A request `{"firings": true}` is answered with the firing records of the last seconds too, `{"after": {process:
+        cursor}}` with those behind the cursor of this process (`RecentFirings.after`).
         """
         with query:
             status: dict[str, Any] = {
@@ -170,12 +171,16 @@ class Requests:
                 "counts": self._progress.counted,
                 "waits": self._progress.waited,
                 "behind": self._progress.behind,
+                "silences": self._progress.silences(),
                 "found": {name: text for name, text in self._progress.found.items() if text},
                 "restarts": self._restarts(),
                 "ended": [maker.node.name for maker in self._driver.all if maker.ended],
             }
-            if _asks_for_firings(query):
+            asked = _asked(query)
+            if asked.get("firings"):
                 status["firings"] = self._recent.batches()
+            if isinstance(cursors := asked.get("after"), dict):
+                status["after"] = self._recent.after(cursors.get(self._config.label, {}))
             query.reply(query.key_expr, msgpack.packb(status))
 
     def _answer_trigger(self, query: Any) -> None:
@@ -196,14 +201,13 @@ class Requests:
         return {name: self._config.resumed(name).restarts + times for name, times in here.items()}
 
 
-def _asks_for_firings(query: Any) -> bool:
+def _asked(query: Any) -> dict[str, Any]:
     payload = b"" if query.payload is None else query.payload.to_bytes()
-    if not payload:
-        return False
     try:
-        return bool(msgpack.unpackb(payload, raw=False)["firings"])
-    except (ValueError, TypeError, KeyError, msgpack.UnpackException):  # who asks wrongly is told the rest
-        return False
+        asked = msgpack.unpackb(payload, raw=False) if payload else {}
+    except (ValueError, msgpack.UnpackException):  # who asks wrongly is told the rest
+        return {}
+    return asked if isinstance(asked, dict) else {}
 
 
 def _to_inbox(inbox: Inbox, name: str, kind: str = "param") -> Callable[[Any], None]:

@@ -89,10 +89,15 @@ class Child:
             for frame in frames:
                 parts.append(_SIZE.pack(sum(len(part) for part in frame)))
                 parts.extend(frame)
+            self._refuse_unasked(what)
             self._write(parts, what, deadline)
-            outcome, count = _REPLY.unpack(self._read(_REPLY.size, what, deadline))
+            head = self._read(_REPLY.size, what, deadline)
+            outcome, count = _REPLY.unpack(head)
             if outcome not in tuple(Outcome) or count > _MOST_FRAMES:
-                raise ProgramError(f"{self._name}: {what}: no reply: outcome {outcome}, {count} frames")
+                printed = bytes(head) + self._at_once()
+                raise ProgramError(
+                    f"{self._name}: {what}: no reply on standard output, which is for replies alone: {printed[:60]!r}"
+                )
             found = [self._frame(what, deadline) for _ in range(count)]
         except BaseException:
             self.end(0.0)
@@ -114,6 +119,17 @@ class Child:
         except subprocess.TimeoutExpired:
             self._process.kill()
             return self._process.wait(_LEAVING)
+
+    def _refuse_unasked(self, what: str) -> None:
+        """Raises `ProgramError` where something waits before a call is made: it would be taken for its reply."""
+        if found := self._at_once():
+            raise ProgramError(f"{self._name}: before {what} it wrote to its standard output unasked: {found[:60]!r}")
+
+    def _at_once(self) -> bytes:
+        try:
+            return os.read(self._from, _AT_ONCE)
+        except BlockingIOError:
+            return b""
 
     def _write(self, parts: list[Bytes], what: str, deadline: float) -> None:
         left = [memoryview(part).cast("B") for part in parts if len(part)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
@@ -67,6 +68,7 @@ EVENT_SCHEMA: Final = json.dumps(
 ).encode()
 
 
+@functools.cache
 def library() -> str:
     """Returns the name of this program in the header of its files."""
     try:

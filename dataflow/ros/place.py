@@ -9,11 +9,15 @@ from dataflow.ros.definitions import Distro
 from dataflow.ros.node import ROUTER, Ros2Node
 from dataflow.ros.wire import absolute
 
+TOPIC = r"^~?/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$"
+"""Names that ROS takes."""
+TYPE = r"^(|[A-Za-z]\w*/msg/[A-Za-z]\w*)$"
+
 
 class Place:
     """Says which topic of which ROS graph is meant, and with which quality of service."""
 
-    topic: str = Param(min_length=1, doc="name of the topic; without a leading slash, it lies in the namespace")
+    topic: str = Param(pattern=TOPIC, doc="name of the topic; without a leading slash, it lies in the namespace")
     distro: Distro = Param("jazzy", doc="distribution whose definition of the type counts, where that is given")
     domain: int = Param(0, ge=0, doc="ROS_DOMAIN_ID")
     namespace: str = Param("/", doc="namespace of the node")

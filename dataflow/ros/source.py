@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 
 from dataflow.interop.clocks import BACK
-from dataflow.interop.conversions import convert
+from dataflow.interop.conversions import convert, offers
+from dataflow.interop.ros import CONVERSIONS as MAPPED
 from dataflow.interop.topics import TopicReader
 from dataflow.interop.transform_sets import joined, other_parents
 from dataflow.messages import Message, MessageError, Number, Transforms
@@ -20,7 +21,7 @@ from dataflow.ros.definitions import CLOCK, Distro, clock_time, distros_of, read
 from dataflow.ros.losses import remember
 from dataflow.ros.mailbox import Arrival, Mailbox, TokenChange
 from dataflow.ros.message import RosMessage
-from dataflow.ros.place import Place
+from dataflow.ros.place import TYPE, Place
 from dataflow.ros.reorder import Reorder
 from dataflow.ros.wire import End, Qos, WireError, gid_of
 
@@ -39,7 +40,9 @@ class Subscriber(Place, Source, abstract=True):
 
     real_time = True
 
-    type: str = Param("", doc="its ROS type, such as sensor_msgs/msg/Imu; none takes that of its first publisher")
+    type: str = Param(
+        "", pattern=TYPE, doc="its ROS type, such as sensor_msgs/msg/Imu; none takes that of its first publisher"
+    )
     within: Duration = Param("10s", ge=0, doc="time to wait for a publisher, or for a latched message, at the start")
     reorder: Duration | None = Param(
         None, ge=0, doc="time that messages wait for earlier ones of other publishers; none takes 20 ms of transforms"
@@ -101,9 +104,15 @@ class Subscriber(Place, Source, abstract=True):
         if self._wanted is RosMessage:
             return None
         try:
-            return reader_for(self._name, type_, distro)
+            reader = reader_for(self._name, type_, distro)
         except RecordingError as error:
             raise SourceError(f"{self._name}: {error}") from error
+        if self._wanted not in offers(becomes := MAPPED[type_][0]):
+            raise SourceError(
+                f"{self._name}: a {type_} becomes a message {becomes.__name__}, not {self._wanted.__name__}: "
+                f"use dataflow.ros:{becomes.__name__}"
+            )
+        return reader
 
     def _take_clock(self, data: bytes, attachment: bytes) -> None:
         try:

@@ -104,19 +104,30 @@ def service_files(
 
     Raises `NameFault` for a name that systemd does not take.
     """
+    words = {**_unit_words(name, command, folder, user), "out": _systemd_word(str(out)), "days": str(days)}
+    install = f"sudo cp {name}.service /etc/systemd/system/ && sudo cp {name}.conf /etc/tmpfiles.d/"
+    return {
+        Path(f"{name}.service"): templates.SERVICE.substitute(words, install=install, what=f"graph {name}"),
+        Path(f"{name}.conf"): templates.SERVICE_FILES.substitute(words),
+    }
+
+
+def agent_files(name: str, command: Sequence[str], *, folder: Path, user: str) -> Mapping[Path, str]:
+    """A unit of systemd that lets the machine `name` join runs by `command`. Raises `NameFault` as `service_files`."""
+    unit = f"dataflow-{name}"
+    words = _unit_words(unit, command, folder, user)
+    install = f"sudo cp {unit}.service /etc/systemd/system/"
+    return {Path(f"{unit}.service"): templates.SERVICE.substitute(words, install=install, what=f"machine {name}")}
+
+
+def _unit_words(name: str, command: Sequence[str], folder: Path, user: str) -> dict[str, str]:
     if not re.fullmatch(r"[A-Za-z0-9_.-]+", name):
         raise NameFault(f"{name!r} cannot be the name of a service: write letters, digits, '_', '-' and '.'")
-    words = {
+    return {
         "name": name,
         "user": user,
         "folder": str(folder).replace("%", "%%"),
         "command": " ".join(map(_systemd_word, command)),
-        "out": _systemd_word(str(out)),
-        "days": str(days),
-    }
-    return {
-        Path(f"{name}.service"): templates.SERVICE.substitute(words),
-        Path(f"{name}.conf"): templates.SERVICE_FILES.substitute(words),
     }
 
 

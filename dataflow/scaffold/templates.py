@@ -407,10 +407,10 @@ __pycache__/
 
 SERVICE = Template("""\
 # $name, started with the machine. To install it:
-#   sudo cp $name.service /etc/systemd/system/ && sudo cp $name.conf /etc/tmpfiles.d/
+#   $install
 #   sudo systemctl daemon-reload && sudo systemctl enable --now $name
 [Unit]
-Description=dataflow graph $name
+Description=dataflow $what
 After=network.target
 StartLimitIntervalSec=0
 

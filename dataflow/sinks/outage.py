@@ -54,8 +54,8 @@ class Lost:
 class Outage:
     """Says when a recorder whose disk has refused may try again."""
 
-    def __init__(self, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        self._folder, self._clock = folder, clock
+    def __init__(self, folder: Path, clock: Callable[[], float] | None = None) -> None:
+        self._folder, self._clock = folder, clock or time.monotonic
         self._pause = FIRST_PAUSE
         self._due = 0.0
 

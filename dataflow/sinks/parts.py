@@ -88,6 +88,8 @@ class PartsSink:
         self._full: Part | None = None
         """The part before the current one, until what belongs into it has come."""
         self._after_gap = False
+        self._lives: dict[str, int] = {}
+        """The newest incarnation of each stream and operator."""
         self._outage = Outage(path.parent)
         self.lost = Lost()
         if options["overwrite"] and self._splits and life == 1:
@@ -102,14 +104,12 @@ class PartsSink:
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
         """Stores a message; begins the next part when it is time to."""
         self._given[stream] += 1
+        self._live(stream, incarnation)
         self._groups.begin(stream, message, incarnation)
         if stream in self._static:
             self._statics[stream] = message, seq, incarnation
-        elif message.stamp > self._clock:
-            self._clock = message.stamp
-            self._begun = self._begun or self._clock
-            if self._current is not None and self._splits and self._is_full(self._current):
-                self._split(self._clock)
+        else:
+            self._advance(message.stamp)
         part = self._current if self._full is None else self._part_at(message.stamp)
         if part is not None:
             try:
@@ -120,6 +120,9 @@ class PartsSink:
 
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Stores firing records; those of calls before the current part in the one before, while it is open."""
+        self._live(operator, records[0].incarnation)
+        if self._static.issuperset(self._streams):  # no message shows how far the run is
+            self._advance(records[-1].stamp)
         start = None if self._current is None else self._current.start
         k = 0 if start is None else next((k for k, r in enumerate(records) if r.stamp >= start), len(records))
         if self._full is None and not self._after_gap:
@@ -191,6 +194,22 @@ class PartsSink:
         """Bytes of all parts that there are."""
         closed = sum(part.bytes for part in self._closed) + sum(self._earlier.values())
         return closed + sum(part.sink.writer.saved_bytes for part in self._open_parts())
+
+    def _advance(self, stamp: int) -> None:
+        """Takes note of how far event time is; begins the next part when it is time to."""
+        if stamp > self._clock:
+            self._clock = stamp
+            self._begun = self._begun or self._clock
+            if self._current is not None and self._splits and self._is_full(self._current):
+                self._split(self._clock)
+
+    def _live(self, name: str, incarnation: int) -> None:
+        """Notes the incarnation of a stream or an operator. Behind a jump of the clock, stamps are new again that lie
+        in the part before: everything goes into the current one from there on."""
+        if incarnation > self._lives.setdefault(name, incarnation):
+            self._lives[name] = incarnation
+            self._after_gap = False
+            self._close_full()
 
     # Parts
 
@@ -314,13 +333,14 @@ class PartsSink:
         held = self._statics.items()
         self._copied |= {(name, i, k) for name, (_, i, k) in held if part.repeated[name] and saved[name]}
         part.messages, part.bytes = (saved - part.repeated).total(), part.sink.writer.saved_bytes
-        if part.messages or part.start is None:
+        if part.start is None or self._holds_any(part):
             self._closed.append(part)
         else:  # the disk refused before it held anything
             part.path.unlink(missing_ok=True)
 
     def _keep_to_limit(self) -> None:
-        """Deletes the oldest parts while all together take more of the disk than they may; the newest one stays."""
+        """Deletes the oldest parts while all together take more of the disk than they may; the newest one that holds
+        anything stays."""
         most = self._storage.keep
         while most is not None and self._has_older() and self.size > most:
             oldest = next(iter(self._earlier)) if self._earlier else self._closed.pop(0).path
@@ -330,7 +350,12 @@ class PartsSink:
 
     def _has_older(self) -> bool:
         older = len(self._earlier) + len(self._closed)
-        return older > (0 if any(self._open_parts()) else 1)
+        return older > (0 if any(map(self._holds_any, self._open_parts())) else 1)
+
+    def _holds_any(self, part: Part) -> bool:
+        """Tells whether anything is in a part but what is in front of each."""
+        saved = part.sink.writer.saved
+        return part.sink.saved_calls > 0 or any(saved(stream) > part.repeated[stream] for stream in self._streams)
 
     # Firing records
 

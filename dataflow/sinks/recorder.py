@@ -46,6 +46,7 @@ class RecorderSink:
         """Messages of diagnostics so far."""
         self._unflushed: dict[str, list[int]] = {}
         self._flushed: dict[str, int] = {}
+        self._calls = 0
         self._clock = 0
         self._early: list[tuple[str, bytes]] = []
         self._early_logs: list[LogLine] = []
@@ -80,6 +81,7 @@ class RecorderSink:
         `setup()` has no stamp; its record is stored at the stamp of the first message, so that viewers of the file
         show no long nothing before it."""
         self._unflushed.setdefault(operator, []).append(calls)
+        self._calls += calls
         if stamp > 0:
             self._clock = self._clock or stamp
             self._write_early()  # in the order of the calls
@@ -148,6 +150,11 @@ class RecorderSink:
         """Calls whose records are not in the file."""
         fresh = ((self._saved_batches(o) - self._flushed.get(o, 0), calls) for o, calls in self._unflushed.items())
         return sum(sum(calls[saved:]) for saved, calls in fresh)
+
+    @property
+    def saved_calls(self) -> int:
+        """Calls whose records are in the file."""
+        return self._calls - self.unsaved_calls
 
     def _saved_batches(self, operator: str) -> int:
         return self.writer.saved(firings_topic(self.graph.namespace, operator))

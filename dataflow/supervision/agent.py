@@ -52,6 +52,8 @@ END_WITHIN = 20.0
 CLOCK_EVERY = 1.0
 """Seconds between two words to sources about the offset of the clock."""
 TICK = 0.05
+LINK_AFTER = 10.0
+"""Seconds without a run after which the state of the link is shown."""
 SUPERVISOR = ""
 """Its machine, as gates call it."""
 
@@ -71,12 +73,15 @@ class Agent:
     ) -> None:
         """`patience`: the seconds for which operators go on without the supervisor being heard."""
         self.patience = patience
-        self.name, self._endpoint, self._keys, self._folder, self._notice = name, endpoint, keys, folder, notice
+        self.name, self._endpoint, self._notice = name, endpoint, notice
+        self._keys, self._folder = keys and keys.absolute(), folder.absolute()  # it changes into its folder
         self._id = secrets.token_bytes(8)
         self._offered = ""
         self._over: set[str] = set()
         self._stopped = False
         self._run = ""
+        self._connected, self._since = False, time.monotonic()
+        self._said_connected: bool | None = None
 
     def stop(self) -> None:
         """Ends it: a run that it takes part in loses its operators here."""
@@ -100,6 +105,7 @@ class Agent:
             self._notice(f"machine {self.name!r} waits for a run at {self._endpoint}")
             while not self._stopped:
                 if not self._offered:
+                    self._look_at_link(bus)
                     time.sleep(TICK)
                     continue
                 self._run, self._offered = self._offered, ""
@@ -111,6 +117,24 @@ class Agent:
                     break
             self._stopped = True
             undeclare(taken)
+
+    def _look_at_link(self, bus: Bus) -> None:
+        """Says what stands in the way where no run comes for a while."""
+        connected, now = any(bus.session.info.routers_zid()), time.monotonic()
+        if connected != self._connected:
+            self._connected, self._since = connected, now
+        if connected == self._said_connected or now - self._since < LINK_AFTER:
+            return
+        self._said_connected = connected
+        if connected:
+            self._notice(
+                f"connected to {self._endpoint}, and offered no run: does its graph name the machine {self.name!r}, "
+                "and are these the keys of that machine?"
+            )
+        else:
+            self._notice(
+                f"not connected to {self._endpoint}: no run is there yet, or its keys are of another authority"
+            )
 
     def _started(self, sample: Any) -> None:
         run = msgpack.unpackb(sample.payload.to_bytes(), raw=False)["run"]

@@ -21,11 +21,12 @@ def configurations(
     """
     first = next((label for label, process in processes.items() if process.machine is None), "")
     configs: dict[str, Config] = {}
+    graph, pairs = plan.graph.to_json(), pairs_of(plan.graph, processes)
     for label, process in processes.items():
-        common = _common(plan, process, processes)
+        rings_in = [list(keys) for (_, taker), keys in pairs.items() if taker == label]
+        common = {"label": label, "graph": graph, "live": plan.live, "rings_in": rings_in}
         if process.sink is None:
             configs[label] = _operators(plan, process, common, endpoints, label == first)
-            pairs = pairs_of(plan.graph, processes)
             configs[label][1]["rings_out"] = [
                 (plan.live and taker in processes and processes[taker].sink is None, list(keys))  # a gate takes all
                 for (maker, taker), keys in pairs.items()
@@ -34,17 +35,6 @@ def configurations(
         else:
             configs[label] = _sink(plan, process, common)
     return configs
-
-
-def _common(plan: RunPlan, process: ProcessPlan, processes: Mapping[str, ProcessPlan]) -> dict[str, Any]:
-    pairs = pairs_of(plan.graph, processes)
-    rings_in = [list(keys) for (_, consumer), keys in pairs.items() if consumer == process.label]
-    common = {
-        "label": process.label,
-        "graph": plan.graph.to_json(),
-        "live": plan.live,
-    }
-    return common | {"rings_in": rings_in}
 
 
 def _sink(plan: RunPlan, process: ProcessPlan, common: Mapping[str, Any]) -> Config:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dataflow.environments import EnvError
 from dataflow.graph.model import Graph, Placement, current_placement
 from dataflow.graph.sections import PLACE_FRAMES
 from dataflow.names import firings_key
@@ -205,22 +206,24 @@ def _sinks_of(plan: RunPlan, streams: set[str]) -> dict[str, tuple[str, tuple[st
 
 
 def _machine_of(plan: RunPlan, label: str, nodes: list[str]) -> str | None:
-    """Returns the machine of a process. Raises ValueError where the placement puts operators of two into it."""
+    """Returns the machine of a process. Raises `NetworkError` where the placement puts operators of two into it."""
     if plan.machines is None:
         return None
     found = {plan.graph.nodes[node].machine for node in nodes}
     if len(found) > 1:
+        from dataflow.transport import NetworkError
+
         named = ", ".join(sorted(machine or "this one" for machine in found))
-        raise ValueError(f"process {label!r} would be on several machines ({named}): place its operators apart")
+        raise NetworkError(f"process {label!r} would be on several machines ({named}): place its operators apart")
     return found.pop()
 
 
 def _env_of(graph: Graph, label: str, nodes: tuple[str, ...]) -> str | None:
-    """Returns the environment of a process. Raises ValueError where the placement puts operators of two into it."""
+    """Returns the environment of a process. Raises `EnvError` where the placement puts operators of two into it."""
     found = {graph.nodes[node].env for node in nodes}
     if len(found) > 1:
         named = ", ".join(sorted(env or "this one" for env in found))
-        raise ValueError(f"process {label!r} would be in several environments ({named}): place its operators apart")
+        raise EnvError(f"process {label!r} would be in several environments ({named}): place its operators apart")
     return found.pop() if found else None
 
 

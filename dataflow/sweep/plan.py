@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -14,10 +15,13 @@ from typing import Any, Literal
 
 import xxhash
 
-from dataflow.graph.model import Graph
-from dataflow.recording import Recording
+from dataflow.environments import EnvError, environment_of, packages_in
+from dataflow.graph.code import files_of
+from dataflow.graph.model import Graph, current_path
+from dataflow.graph.problems import GraphError
+from dataflow.recording import Recording, RecordingError
 from dataflow.recording.streams.facts import machine_facts
-from dataflow.reexecution.recorded_run import recorded_graph
+from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.text import visible
 from dataflow.verification.gate import recordings_in
 
@@ -162,7 +166,10 @@ def _local(path: Path, digests: Digests) -> Iterator[Source]:
 def _remote(url: str) -> Iterator[Source]:
     import fsspec  # of the extra `ray`
 
-    store, path = fsspec.core.url_to_fs(url)
+    try:
+        store, path = fsspec.core.url_to_fs(url)
+    except (ImportError, ValueError) as error:  # no such protocol, or its package is not installed
+        raise SweepError(f"{url} cannot be read: {error}") from error
     if not store.exists(path):
         raise SweepError(f"no file or folder {url}")
     files = [path] if store.isfile(path) else sorted(p for p in store.find(path) if p.endswith(SUFFIXES))
@@ -172,6 +179,11 @@ def _remote(url: str) -> Iterator[Source]:
         name = file.removeprefix(path).lstrip("/") or Path(file).name
         mark = {key: str(value) for key, value in store.info(file).items()}  # sizes, times, entity tags
         yield Source(visible(name), store.unstrip_protocol(file), _digest((store.ukey(file), mark)))
+
+
+def command_of(what: What) -> str:
+    """Returns the command that does it."""
+    return "verify" if what == "verify" else "replay"
 
 
 def tasks_of(
@@ -190,27 +202,36 @@ def tasks_of(
     - `words`: further words of the command. `folders`: those in which it finds modules.
     """
     code, made = Code(digests, folders), []
-    verb = "verify" if what == "verify" else "replay"
-    where = {"verify": ("--jobs", "1")}.get(verb, ("--one-process",))
+    verb = command_of(what)
     given = () if graph is None else ("--graph", graph)
     for settings, loaded in graphs.items():
         chosen = tuple(word for name, value in settings for word in ("--set", f"{name}={value}"))
-        line = (verb, None, *given, *chosen, *where, *words, "--json", "--quiet")
         same = None if loaded is None else code.of(loaded)
         for source in sources:
             graph_of = loaded or _recorded(source)
             digest = same or code.of(graph_of)
+            where = ("--jobs", "1") if verb == "verify" else () if _apart(graph_of) else ("--one-process",)
+            line = (verb, None, *given, *chosen, *where, *words, "--json", "--quiet")
             key = _digest((source.digest, digest, what, line[2:]))
             made.append(Task(source, what, settings, line, key, _uses(graph_of)))
     return made
 
 
 def _recorded(source: Source) -> Graph | None:
-    """Returns the graph inside a recording; None of a URL, which is not opened."""
+    """Returns the graph inside a recording; None of a URL, which is not opened, and of what no graph can be read from:
+    its run fails with the reason."""
     if "://" in source.where:
         return None
-    with Recording(Path(source.where)) as opened:
-        return recorded_graph(opened)
+    try:
+        with Recording(Path(source.where)) as opened:
+            return recorded_graph(opened)
+    except (OSError, RecordingError, GraphError, ReplayError):
+        return None
+
+
+def _apart(graph: Graph | None) -> bool:
+    """Returns whether operators need several processes, since they are in several environments."""
+    return graph is None or len({node.env for node in graph.nodes.values()}) > 1
 
 
 def _uses(graph: Graph | None) -> tuple[str, ...]:
@@ -231,28 +252,40 @@ class Code:
         self._base = [self._package("dataflow"), facts["packages"], facts["machine"]["python"], given]
 
     def of(self, graph: Graph | None) -> str:
-        """Returns the digest for a graph; for one that is not known, all shipped operators count.
+        """Returns the digest for a graph; for one that is not known, all operators count that are shipped, or lie in
+        the current folder.
 
         Raises `OSError` for a file that cannot be read.
         """
         if graph is None:
-            return _digest((self._base, self._package("operators")))
+            homes = sorted(
+                {path.stem for path in (*Path().glob("*.py"), *(each.parent for each in Path().glob("*/*.py")))}
+            )
+            return _digest(
+                (self._base, [self._package(name) for name in ("operators", *filter(str.isidentifier, homes))])
+            )
         described = graph.to_json()
         parts = [described[part] for part in ("nodes", "streams", "seed", "threads", "namespace")]
-        used = sorted({node.use.partition(":")[0].partition(".")[0] for node in graph.nodes.values()})
+        used = sorted({current_path(node.use).partition(":")[0] for node in graph.nodes.values()})
         files = sorted(set(_files_named([node.params for node in graph.nodes.values()])))
         code = [self._package(name) for name in used]
-        return _digest((self._base, parts, code, [self._digests.of(file) for file in files]))
+        envs = [self._packages_of(env) for env in sorted({node.env for node in graph.nodes.values() if node.env})]
+        return _digest((self._base, parts, code, envs, [self._digests.of(file) for file in files]))
 
-    def _package(self, name: str) -> str:
-        if name not in self._packages:
-            found = find_spec(name)
+    def _packages_of(self, env: str) -> dict[str, str]:
+        """Returns the packages in an environment; of one that cannot serve none: the run fails."""
+        with contextlib.suppress(EnvError):
+            return packages_in(environment_of(env))
+        return {}
+
+    def _package(self, home: str) -> str:
+        """Returns the digest of a module's code, and of whatever else its package holds."""
+        if home not in self._packages:
+            found = find_spec(home.partition(".")[0])
             places = [] if found is None else [Path(p) for p in found.submodule_search_locations or ()]
-            inside = sorted(file for place in places for file in place.rglob("*") if file.is_file())
-            if found is not None and not places and found.origin is not None:  # a file: it may import those beside it
-                inside = sorted(Path(found.origin).parent.glob("*.py"))
-            self._packages[name] = self._code(inside)
-        return self._packages[name]
+            inside = {file for place in places for file in place.rglob("*") if file.is_file()}
+            self._packages[home] = self._code(sorted(inside.union(files_of(home).values())))
+        return self._packages[home]
 
     def _code(self, files: Sequence[Path]) -> str:
         return _digest([f.name, self._digests.of(f)] for f in files if f.parent.name != "__pycache__")

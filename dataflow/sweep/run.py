@@ -15,7 +15,7 @@ from typing import Any
 
 from dataflow.graph import Graph, load_graph
 from dataflow.graph.search import import_path
-from dataflow.sweep.plan import Choice, Digests, SweepError, Task, What, sources_in, tasks_of
+from dataflow.sweep.plan import Choice, Digests, SweepError, Task, What, command_of, sources_in, tasks_of
 from dataflow.sweep.table import Store, summed_up, write_table
 from dataflow.sweep.warm import Worker
 from dataflow.sweep.work import Result, commands_of, perform
@@ -25,11 +25,14 @@ AHEAD = 4
 MOST_JOBS = 256
 
 
-def local(tasks: Sequence[Task], jobs: int, timeout: float) -> Generator[tuple[Task, Result]]:
-    """Yields tasks with their results as they end, `jobs` at a time. Those running end with the iteration."""
+def local(
+    tasks: Sequence[Task], jobs: int, timeout: float, begun: Sequence[Worker] = ()
+) -> Generator[tuple[Task, Result]]:
+    """Yields tasks with their results as they end, `jobs` at a time. Those running end with the iteration. `begun`: at
+    most so many workers that were started before."""
     pool = ThreadPoolExecutor(jobs, thread_name_prefix="sweep")
     left, running, stop = iter(tasks), dict[Future[Result], Task](), Event()
-    workers = [Worker(commands_of(tasks)) for _ in range(jobs)]
+    workers = [*begun, *(Worker(commands_of(tasks)) for _ in range(jobs - len(begun)))]
     idle = SimpleQueue[Worker]()
     for worker in workers:
         idle.put(worker)
@@ -151,6 +154,8 @@ class Sweep:
     tasks: list[Task] = field(init=False)
     left: list[Task] = field(init=False)
     store: Store = field(init=False)
+    _begun: list[Worker] = field(init=False, default_factory=list)
+    """Workers that were started before it was known what is to be done."""
 
     def __post_init__(self) -> None:
         if self.graph is None and any(self.choices):
@@ -159,13 +164,24 @@ class Sweep:
             raise SweepError(f"--jobs {self.jobs}: expected 1 to {MOST_JOBS}")
         if not self.recordings:
             raise SweepError("no recordings: name files, folders or URLs with --recordings")
+        self.store = Store(self.folder)
+        try:
+            self._plan()
+        except BaseException:
+            self._end_begun()
+            raise
+
+    def _plan(self) -> None:
+        digests = Digests(self.folder / "digests.json")
+        sources = sources_in(self.recordings, digests)
+        if self.ray is None and (self.again or self.store.empty()):  # planning takes as long as they take to begin
+            for _ in range(min(self._cores, len(sources) * len(self.choices))):
+                self._begun.append(Worker((command_of(self.what),)))
+                self._begun[-1].start()
         self.graphs = {
             choice: None if self.graph is None else load_graph(self.graph, settings=[f"{n}={v}" for n, v in choice])
             for choice in self.choices
         }
-        self.store = Store(self.folder)
-        digests = Digests(self.folder / "digests.json")
-        sources = sources_in(self.recordings, digests)
         named = None if self.graph is None else str(self.graph.resolve())
         folders = [folder.resolve() for folder in self.folders]
         words = [word for value in self.maps for word in ("--map", value)]
@@ -175,17 +191,24 @@ class Sweep:
         self.left = [task for task in self.tasks if self.again or not self.store.has(task.key)]
 
     @property
+    def _cores(self) -> int:
+        return self.jobs or len(os.sched_getaffinity(0))
+
+    def _end_begun(self) -> None:
+        while self._begun:
+            self._begun.pop().close()
+
+    @property
     def table(self) -> Path:
         """The Parquet file."""
         return self.folder / f"{self.name}.parquet"
 
     def run(self) -> Iterator[tuple[Task, Result]]:
         """Yields what is left to do, with its result once that is kept. Writes the table however it ends."""
-        cores = self.jobs or len(os.sched_getaffinity(0))
         where = (
-            local(self.left, cores, self.timeout)
+            local(self.left, self._cores, self.timeout, self._begun)
             if self.ray is None
-            else on_ray(self.left, self.ray, cores, self.timeout, self._asked())
+            else on_ray(self.left, self.ray, self._cores, self.timeout, self._asked())
         )
         try:
             with closing(where) as working:
@@ -193,6 +216,7 @@ class Sweep:
                     self.store.keep(result)
                     yield task, result
         finally:
+            self._end_begun()
             write_table(self.table, self.tasks, self.store)
 
     def _asked(self) -> dict[str, str]:

@@ -52,6 +52,10 @@ class Store:
         result = self.of(key)
         return result is not None and result.final
 
+    def empty(self) -> bool:
+        """Returns whether there is no result at all."""
+        return not any((self.folder / "results").iterdir())
+
     def log(self, key: str) -> Path:
         """Returns the file of a failed task's output."""
         return self.folder / "logs" / f"{key}.txt"
@@ -86,6 +90,8 @@ def write_table(file: Path, tasks: Sequence[Task], store: Store) -> int:
     import pyarrow as pa
     import pyarrow.parquet as parquet
 
+    from dataflow.sweep.columns import table
+
     text, whole, real = pa.string(), pa.int64(), pa.float64()
     settings = {f"set {name}": text for choice in dict.fromkeys(task.settings for task in tasks) for name, _ in choice}
     columns = {
@@ -105,9 +111,9 @@ def write_table(file: Path, tasks: Sequence[Task], store: Store) -> int:
             if (result := store.of(task.key)) is not None:
                 held += rows_of(task, result, store)
             if len(held) >= GROUP:
-                writer.write_table(pa.Table.from_pylist(held, schema))
+                writer.write_table(table(held, schema))
                 written, held = written + len(held), []
-        writer.write_table(pa.Table.from_pylist(held, schema))
+        writer.write_table(table(held, schema))
     part.replace(file)
     return written + len(held)
 

@@ -29,8 +29,8 @@ STANDARD_ERROR = 2
 
 
 class Worker:
-    """Makes one call after the other, in processes that a warm one forks. That is started with the first call, and
-    again where it was killed."""
+    """Makes one call after the other, in processes that a warm one forks. That is started by `start` or with the first
+    call, and again where it was killed."""
 
     def __init__(self, commands: Sequence[str]) -> None:
         """`commands`: those that it will call."""
@@ -38,6 +38,11 @@ class Worker:
         self._cold = set[str]()
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
+        self._called = False
+
+    def start(self) -> None:
+        """Begins the warm process, which loads the commands while this one does something else."""
+        self._connected()
 
     def call(
         self,
@@ -52,7 +57,7 @@ class Worker:
         None after `timeout` seconds or where it was stopped. Its output goes to the two files. Nothing that it
         started outlives this call.
         """
-        deadline = time.monotonic() + timeout
+        deadline, self._called = time.monotonic() + timeout, True
         with output[0].open("wb") as out, output[1].open("wb") as err:
             while True:
                 loaded = [use for use in operators if use not in self._cold]
@@ -112,11 +117,13 @@ class Worker:
         return None, []
 
     def close(self) -> None:
-        """Ends the warm process, and a call that it is at."""
+        """Ends the warm process, and a call that it is at; at once where it was never called."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
         if self._process is not None:
+            if not self._called:
+                self._process.kill()
             try:
                 self._process.wait(timeout=LEAVE_WITHIN)
             except subprocess.TimeoutExpired:

@@ -100,6 +100,8 @@ def _once(task: Task, timeout: float, worker: Worker, stop: Event | None) -> Res
     rows = () if report is None else verified(report) if task.what == "verify" else replayed(report)
     if task.what == "evaluate":
         rows = tuple(row for row in rows if row["figures"])
+        if outcome == "done" and not rows:
+            outcome, last = "failed", "no operator of the graph gives figures"
     wall, failed = time.monotonic() - began, outcome != "done"
     log = f"{said}\n{last}".strip() if failed else ""
     return Result(task.key, outcome, -1 if code is None else code, last if failed else "", rows or ({},), wall, log)

@@ -10,14 +10,19 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from dataflow.environments import EnvError, Environment
 from dataflow.execution.threads import environment
 from dataflow.text import json_text
+
+if TYPE_CHECKING:
+    from dataflow.graph import Graph
+    from dataflow.recording import Recording
 
 AT_ONCE = 2
 """Processes that answer calls."""
@@ -33,6 +38,8 @@ MOST_BYTES = 8000
 """Of an answer, in UTF-8."""
 NOTE = 200
 """Bytes of it for the note that there is more."""
+OF_ONE_OPERATOR = frozenset(("goto", "diff", "state", "lines", "history", "what_if", "capture"))
+"""Tools that make the calls of one operator, in its environment."""
 PRINTED = 2000
 """Characters that are shown of what operators printed."""
 
@@ -58,10 +65,10 @@ class Job:
 
 
 class Jobs:
-    """Makes calls. `threads`: by a recording the number of threads of its operators. `soon`: see `SOON`."""
+    """Makes calls. `soon`: see `SOON`."""
 
-    def __init__(self, threads: Callable[[Mapping[str, Any]], int] | None = None, *, soon: float = SOON) -> None:
-        self._threads, self._soon = threads or threads_of, soon
+    def __init__(self, *, soon: float = SOON) -> None:
+        self._soon = soon
         self._pool = ThreadPoolExecutor(AT_ONCE, "job")
         self._jobs: dict[str, Job] = {}
         self._lock = threading.Lock()
@@ -113,18 +120,19 @@ class Jobs:
         return text
 
     def _work(self, job: Job, arguments: Mapping[str, Any]) -> None:
+        python, variables = place_of(job.tool, arguments)
         with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as printed:
             with self._lock:
                 if job.cancelled or self._closed:
                     raise Refused(f"job {job.name} was cancelled")
                 job.progress = "runs"
                 job.process = process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", "dataflow.tool_server.work"],
+                    [python, "-P", "-m", "dataflow.tool_server.work"],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=printed,
                     text=True,
-                    env=environment(self._threads(arguments)),
+                    env=variables,
                     start_new_session=True,
                 )
             timer = threading.Timer(LONGEST, _end, [process])
@@ -163,20 +171,40 @@ def cut(text: str, offset: int, job: str) -> str:
     return data[offset:end].decode(errors="ignore") + rest
 
 
-def threads_of(arguments: Mapping[str, Any]) -> int:
-    """Returns the number of threads that the operators of a recording have; 1 where there is none."""
+def place_of(tool: str, arguments: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
+    """Returns the interpreter and the variables of the process of a call: those of the operators of its recording, in
+    the environment of the operator whose calls it makes. Raises `Refused`."""
     from dataflow.recording import Recording, RecordingError
-    from dataflow.reexecution.recorded_run import resolved_graph
+    from dataflow.reexecution.recorded_run import ReplayError, resolved_graph
 
-    file = Path(arguments.get("recording", ""))
-    if not file.is_file():
-        return 1
+    file, env, graph = Path(arguments.get("recording", "")), None, None
     try:
-        with Recording(file) as opened:
-            graph = resolved_graph(opened)
+        if file.is_file():
+            with Recording(file) as opened:
+                graph = resolved_graph(opened)
+                env = None if graph is None else _env_of(tool, arguments, opened, graph)
     except RecordingError:  # the process of the call reports it
-        return 1
-    return 1 if graph is None else graph.threads
+        graph = None
+    except (EnvError, ReplayError) as error:
+        raise Refused(str(error)) from None
+    variables = environment(1 if graph is None else graph.threads)
+    return (sys.executable, variables) if env is None else (env.python, env.variables(variables))
+
+
+def _env_of(tool: str, arguments: Mapping[str, Any], recording: Recording, graph: Graph) -> Environment | None:
+    from dataflow.blame.field import Field
+    from dataflow.verification.places import env_of_calls, env_of_chain
+
+    if not any(node.env for node in graph.nodes.values()):
+        return None
+    if tool in OF_ONE_OPERATOR:
+        return env_of_calls(recording, graph, str(arguments.get("operator", "")))
+    try:
+        return env_of_chain(graph, Field.parse(str(arguments.get("field", ""))).stream) if tool == "blame" else None
+    except EnvError:
+        raise
+    except ValueError:  # no field: the process of the call reports it
+        return None
 
 
 def _converse(process: subprocess.Popen[str], job: Job, arguments: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""Judges, by their verification, the operators that a fix of another one must not have changed.
+"""Judges what a fix has changed: calls of the mended operator, and other operators, by their verification.
 
 A fix edits the operator's modules, which others may share, or its parameters. An operator whose code, parameters and
 files are the recorded ones is none that it has changed: where that does not repeat, it did not before the fix either.
@@ -6,6 +6,7 @@ files are the recorded ones is none that it has changed: where that does not rep
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,8 +14,9 @@ from sys import modules
 from typing import TYPE_CHECKING
 
 from dataflow.debugging.debugger import Debugger
+from dataflow.debugging.fired import Fired
 from dataflow.debugging.suspects import recorded_code, recorded_text
-from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.graph.code import ReloadError, other_texts
 from dataflow.graph.model import Graph, OperatorImportError
 from dataflow.graph.reach import downstream
@@ -36,6 +38,33 @@ class Others:
 
     reasons: dict[str, str] = field(default_factory=dict)
     unrepeated: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Changes:
+    """The calls of the mended operator that do not give what was recorded, by number; `refused`: those that may not
+    change; `raised`: those that raise an error that is not the recorded one, and must not, with it."""
+
+    changed: list[int] = field(default_factory=list)
+    refused: list[int] = field(default_factory=list)
+    raised: list[tuple[int, str]] = field(default_factory=list)
+
+
+def changes_of(debugger: Debugger, may: Callable[[Fired], bool], may_raise: Callable[[Fired], bool]) -> Changes:
+    """Makes all calls of an operator. `may` and `may_raise` say of one that differs whether that is allowed."""
+    found = Changes()
+
+    def visit(each: Fired) -> bool:
+        if not each.same:
+            found.changed.append(each.number)
+            if each.raised is not None and not may_raise(each):
+                found.raised.append((each.number, readable(each.raised)))
+            elif not may(each):
+                found.refused.append(each.number)
+        return False
+
+    debugger.until(visit, first=0)
+    return found
 
 
 def unmade(verification: Verification) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,12 +15,15 @@ if TYPE_CHECKING:
     from dataflow.debugging.fired import Fired
     from dataflow.graph import Graph
     from dataflow.recording import Recording
+    from dataflow.tool_server.proof import Changes
     from dataflow.verification.report import VerifyReport
 
 MOST_CALLS = 200
 """Calls that `history` shows."""
 MOST_CHANGED = 50
 """Changed calls that `prove` names."""
+MOST_ERRORS = 8
+"""Errors of calls that it names."""
 
 CallName = str | int
 """The number of a call, or in text also "@SECONDS" and "diff"."""
@@ -272,60 +276,62 @@ def prove(
     """Check a fix (edited source, or `params`): it changes what it should, and nothing else.
 
     Proven is a fix by which the call gives another result than the recorded one, for which `expect` is true, all other
-    calls of the operator that change are such that `may_change` is true, and every other operator that is given the
-    recorded inputs makes what was recorded. Both are Python expressions over a call: inp, out, stamp, number, same,
-    error; `expect` also sees before and after, the states. `call`: as in `goto`. `right`: a recording that right code
-    made: the operator makes all that is recorded there, too. Operators that do not repeat with the recorded code either
-    are named, and not judged. Nothing is proven where calls could not be made again.
+    calls of the operator that change are such that `may_change` is true, none raises an error that is not the recorded
+    one (unless the expression names `error`), and every other operator that is given the recorded inputs makes what was
+    recorded. Both are Python expressions over a call: inp, out, stamp, number, same, error; `expect` also sees before
+    and after, the states. `call`: as in `goto`. `right`: a recording that right code made: the operator makes all that
+    is recorded there, too. Operators that do not repeat with the recorded code either are named, and not judged.
+    Nothing is proven where calls could not be made again.
     """
     from dataflow.tool_server.proof import judge
 
-    expected, allowed = _compiled("expect", expect), _compiled("may_change", may_change)
+    expected, _ = _compiled("expect", expect), _compiled("may_change", may_change)
     with _debugger(recording, operator, graph, params) as (debugger, origin, opened):
         fired = _at(debugger, origin, call)
         number, name, changed_graph = fired.number, debugger.node.name, debugger.graph
+        if right is None and not _named_in(expect) & _names(fired).keys():
+            raise ToolError(f"expect={expect!r} names nothing of the call, such as out: expected what is right in it")
         meets, differs = bool(_evaluated(expected, expect, _names(fired))), not fired.same
         shown = _shown(fired, debugger, origin)
         say(f"call {number} of {name} made again; all its calls follow")
-        changed, refused = _changed(debugger, lambda each: _evaluated(allowed, may_change, each.names()), but=number)
+        changes = _changes(debugger, number, expect, may_change)
         say("all operators are verified")
         with_graph = changed_graph if graph or params else None
         report = _verify(_file(recording), None, with_graph)
         others = judge(opened, report, changed_graph, name)
     of_right = "identical" if right is None else _verdict(_file(right), name, with_graph)
+    first = changes.changed[:MOST_CHANGED]
     reasons = [
         *(() if differs else [f"call {number} still gives what was recorded"]),
         *(() if meets else [f"call {number}: expect is false: {expect}"]),
-        *([f"calls that may not change do: {refused[:MOST_CHANGED]}"] if refused else ()),
+        *([f"calls raise what is not recorded: {raised}"] if (raised := dict(changes.raised[:MOST_ERRORS])) else ()),
+        *([f"calls that may not change do: {changes.refused[:MOST_CHANGED]}"] if changes.refused else ()),
         *([] if debugger.unmade is None else [f"{name}: {debugger.unmade}"]),
         *([f"{name} does not repeat: it differs each time"] if report.repeats(name) is False else ()),
         *([f"other operators: {others.reasons}"] if others.reasons else ()),
         *([f"{name} in {right}: {of_right}"] if of_right != "identical" else ()),
     ]
-    changes = {"count": len(changed), "of": len(debugger.calls), "first": changed[:MOST_CHANGED]}
     return {
         "proven": not reasons,
         "reasons": reasons,
         "do_not_repeat": others.unrepeated,
-        "changed_calls": changes | _not_made(debugger),
+        "changed_calls": {"count": len(changes.changed), "of": len(debugger.calls), "first": first}
+        | _not_made(debugger),
         "other_operators": _by_verdict(report, name),
         "call": shown,
     }
 
 
-def _changed(debugger: Debugger, may: Callable[[Fired], Any], *, but: int) -> tuple[list[int], list[int]]:
-    """Returns the calls that do not give what was recorded, and those of them that may not; call `but` may."""
-    changed, refused = list[int](), list[int]()
+def _changes(debugger: Debugger, number: int, expect: str, may_change: str) -> Changes:
+    """Returns the calls that a fix changes; that of `number` may change."""
+    from dataflow.tool_server.proof import changes_of
 
-    def visit(each: Fired) -> bool:
-        if not each.same:
-            changed.append(each.number)
-            if each.number != but and not may(each):
-                refused.append(each.number)
-        return False
-
-    debugger.until(visit, first=0)
-    return changed, refused
+    allowed, raises = _compiled("may_change", may_change), {True: expect, False: may_change}
+    return changes_of(
+        debugger,
+        lambda each: each.number == number or bool(_evaluated(allowed, may_change, each.names())),
+        lambda each: "error" in _named_in(raises[each.number == number]),
+    )
 
 
 TOOLS: Mapping[str, Callable[..., Any]] = {
@@ -494,6 +500,10 @@ def _compiled(argument: str, text: str) -> Any:
         return compile(text, f"<{argument}>", "eval")
     except SyntaxError as error:
         raise ToolError(f"{argument}={text!r}: no Python expression: {error.msg}") from None
+
+
+def _named_in(expression: str) -> set[str]:
+    return {node.id for node in ast.walk(ast.parse(expression, mode="eval")) if isinstance(node, ast.Name)}
 
 
 def _evaluated(code: Any, text: str, names: dict[str, Any]) -> Any:

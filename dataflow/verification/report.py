@@ -149,13 +149,17 @@ class VerifyReport:
 
     def altered(self, operator: str) -> tuple[str, ...]:
         """Returns the facts in the recording, of an operator and its machine, that are not as they were then."""
+        machine = (f"{fact}: {then or 'none'} → {now or 'none'}" for fact, then, now in self.facts)
+        return (*self.revised(operator), *machine)
+
+    def revised(self, operator: str) -> tuple[str, ...]:
+        """Returns what is not as it was recorded of an operator itself: its parameters, code, files, packages."""
         v = next(v for v in self.operators if v.operator == operator)
         return (
             *self.changes.get(operator, ()),
             *(f"code of {module}" for module in v.code_changed),
             *(f"file {file}" for file in v.files_changed),
             *v.packages_changed,
-            *(f"{fact}: {then or 'none'} → {now or 'none'}" for fact, then, now in self.facts),
         )
 
     def as_json(self) -> dict[str, Any]:

@@ -25,7 +25,17 @@ from operators.calibration import camera_imu as mounts
 from operators.calibration import coverage, stereo
 from operators.calibration.boards import Board, Charuco, Chessboard
 from operators.calibration.camera import BLURRED, MODELS, Fitted, Model, different, tilts
-from operators.calibration.recorded import Along, Seen, images_of, intrinsics_of, look, spaced, spaced_pairs, stream_of
+from operators.calibration.recorded import (
+    Along,
+    Seen,
+    images_of,
+    intrinsics_of,
+    look,
+    own_frames,
+    spaced,
+    spaced_pairs,
+    stream_of,
+)
 from operators.geometry.calibration_files import camera_text, read_camera, transforms_text
 
 COULD_NOT_RUN = 2
@@ -137,7 +147,8 @@ def stereo_pair(
         with opened(recording) as streams:
             images = images_of(streams, left, "--left"), images_of(streams, right, "--right")
             places = spaced_pairs(*images, every, round(tolerance * 1e9))
-            both = [look(board, each, chosen, _progress(json)) for each, chosen in zip(images, places, strict=True)]
+            looked = [look(board, each, chosen, _progress(json)) for each, chosen in zip(images, places, strict=True)]
+        both = own_frames(*looked)
         kept = [seen.fit(lens) for seen in both]
         pair = _pair(both, kept, tolerance)
         for k, info in enumerate((pair.left, pair.right)):
@@ -148,6 +159,11 @@ def stereo_pair(
         )  # fmt: skip
         words = [line for k in (0, 1) for line in _camera_words(both[k], kept[k])]
         warnings = [f"{both[k].name}: {warning}" for k in (0, 1) for warning in both[k].warnings(kept[k])]
+        if both[0].frame != looked[0].frame:
+            warnings.append(
+                f"both cameras have the frame {looked[0].frame!r}; the files name them {both[0].frame} and "
+                f"{both[1].frame}: give each source another `frame`"
+            )
         content = {"left": _camera_json(both[0], kept[0]), "right": _camera_json(both[1], kept[1])}
         _report(
             {**content, **_pair_json(pair)}, [*words, _pair_words(pair)], warnings + stereo.warnings_of(pair), files,
@@ -265,8 +281,6 @@ def _pair(both: Sequence[Seen], kept: Sequence[Fitted], tolerance: float) -> ste
     left, right = both
     if left.size != right.size:
         raise ValueError(f"images of a pair have one size; these have {left.size} and {right.size}")
-    if left.frame == right.frame:
-        raise ValueError(f"both cameras have the frame {left.frame!r}: each needs another")
     pairs = stereo.paired(left.views, right.views, round(tolerance * 1e9))
     chosen = {view.stamp for view in different([view for view, _ in pairs], left.size[0])}
     pairs = [(a, b) for a, b in pairs if a.stamp in chosen and b.blur <= BLURRED]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.api.asof import asof
+from dataflow.api.names import StreamNameError
 from dataflow.api.recordings import RecordedStreams
 from dataflow.api.stream import RecordedStream
 from dataflow.messages import CameraInfo, CompressedImage, Image, Message
@@ -110,17 +112,37 @@ def look(board: Board, stream: RecordedStream, places: list[int], along: Along) 
     return Seen(name, frame, board, size, looked, tuple(views))
 
 
+def own_frames(left: Seen, right: Seen) -> tuple[Seen, Seen]:
+    """Returns both cameras with different frames: where they have the same, the parts of their streams' names
+    that differ, such as `left` and `right`."""
+    if left.frame != right.frame:
+        return left, right
+    parts = zip_longest(left.name.split("/"), right.name.split("/"), fillvalue="")
+    apart = [pair for pair in parts if pair[0] != pair[1]]
+    one, other = ("/".join(filter(None, (pair[k] for pair in apart))) for k in (0, 1))
+    return replace(left, frame=one or left.name), replace(right, frame=other or right.name)
+
+
 def stream_of(
     streams: RecordedStreams, name: str | None, types: tuple[type[Message], ...], option: str, what: str
 ) -> RecordedStream:
-    """Returns the stream of a name, or the only one of its types. Raises ValueError, StreamNameError."""
+    """Returns the stream of a name, or the only one of its types below that name or, without one, of all.
+
+    Raises ValueError, StreamNameError.
+    """
     there = [each for each in streams if streams[each].info.message_type in types]
     if name is None:
         if len(there) != 1:
             listed = ", ".join(there) or "none"
             raise ValueError(f"{streams.path} has {len(there)} streams of {what} ({listed}): {option} names one")
         return streams[there[0]]
-    stream = streams[name]
+    try:
+        stream = streams[name]
+    except StreamNameError:
+        below = [each for each in there if f"/{name.strip('/')}/" in f"/{each}/"]
+        if len(below) != 1:
+            raise
+        stream = streams[below[0]]
     if stream.info.name not in there:
         raise ValueError(f"{stream.info.name} holds no {what}; there are {', '.join(there) or 'none'}")
     return stream

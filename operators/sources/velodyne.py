@@ -115,6 +115,12 @@ class VelodyneFile(_Velodyne):
         self._path = self.use_file(Path(self.input).expanduser())
         super().setup()
 
+    def finding(self) -> str:
+        """Returns what is wrong with the file, where nothing came out of it."""
+        if not (self._packets or self._others):
+            return f"{self._path.name} holds no packet"
+        return super().finding()
+
     def _received(self) -> Iterator[tuple[int, bytes]]:
         util = self._library.util
         try:

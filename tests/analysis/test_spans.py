@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from diamond_records import DIAMOND, message, one_round, record
 
-from dataflow.analysis.spans import AT_ONCE, Spans
+from dataflow.analysis.spans import AT_ONCE, Line, Spans
 from dataflow.graph import load_text
 from dataflow.records.firing import FiringRecord
 from dataflow.sync import RunRef
@@ -18,11 +18,16 @@ from dataflow.sync import RunRef
 
 def spans_of(graph_text: str, records: Mapping[str, list[FiringRecord]]) -> list[dict[str, Any]]:
     """Reads what a collector reads: each line a request. The operator that the resource names is added."""
+    return read(Spans(load_text(graph_text)).lines(records))
+
+
+def read(lines: Iterable[Line]) -> list[dict[str, Any]]:
     found = []
-    for line in Spans(load_text(graph_text)).lines(records):
+    for line, number in lines:
         (resource,) = json.loads(line)["resourceSpans"]
         about = {each["key"]: each["value"]["stringValue"] for each in resource["resource"]["attributes"]}
         (scope,) = resource["scopeSpans"]
+        assert len(scope["spans"]) == number
         found += [{**span, "operator": about["service.name"]} for span in scope["spans"]]
     return found
 
@@ -95,3 +100,23 @@ def test_the_newest_message_of_a_batch_is_the_cause_and_long_runs_come_in_parts(
 
     (cause,) = [span for span in spans if span["spanId"] == spans[-1]["parentSpanId"]]
     assert [each["value"]["intValue"] for each in cause["attributes"]][:2] == ["7", "7"]
+
+
+def test_spans_of_a_running_graph_wait_for_causes_that_are_told_later() -> None:
+    graph = load_text(DIAMOND)
+    rounds = [one_round(graph, k, 100.0 + 20 * k, slow=10) for k in range(4)]
+    whole = spans_of(DIAMOND, {name: [r for each in rounds for r in each[name]] for name in rounds[0]})
+    live, found = Spans(graph, whole=False), []
+    for k in range(5):  # the camera's process was asked before it made what the others were given
+        late = {"camera": rounds[k - 1]["camera"]} if k else {}
+        others = {name: each for name, each in rounds[k].items() if name != "camera"} if k < 4 else {}
+        found += [read(live.round({**late, **others}))]
+    found += [read(live.rest())]
+
+    def known(spans: list[dict[str, Any]]) -> set[tuple[str, str, str | None, str]]:
+        return {(s["traceId"], s["spanId"], s.get("parentSpanId"), str(s["links"])) for s in spans}
+
+    assert [len(each) for each in found] == [0, 4, 4, 4, 4, 0]
+    assert known([span for each in found for span in each]) == known(whole)
+    assert {a["key"] for a in found[1][0]["attributes"]} == {"dataflow.stamp", "dataflow.incarnation"}
+    assert read(live.rest()) == []

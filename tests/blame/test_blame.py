@@ -181,6 +181,49 @@ def test_two_inputs_that_each_suffice_are_named_together_and_the_readings_behind
     assert {number for _, number in sensed(chain)} == {k}
 
 
+def test_readings_of_two_sensors_that_each_suffice_are_named_behind_operators_between(tmp_path: Path) -> None:
+    a, b = ([3.0 + blamed_graphs.reading(0, s, k) / 2 for k in range(blamed_graphs.STEPS)] for s in "ab")
+    large = [(x >= blamed_graphs.LARGE, y >= blamed_graphs.LARGE) for x, y in zip(a, b, strict=True)]
+    k = next(k for k in range(2, len(large)) if all(large[k]) and not any(large[k - 1]))
+    path = tmp_path / "run.mcap"
+    either = f"either | Either | x: one/out, y: two/out | params: {{at: {blamed_graphs.LARGE}}}"
+    graph = blamed_graphs.graph_of("one | Scale | x: src/a", "two | Scale | x: src/b", either)
+    dataflow.run(graph, record=path)
+
+    with Recording(path) as recording:
+        chain = Blame(recording, Field.parse(blamed_graphs.at(k, "either/out"))).find()
+
+    assert sensed(chain) == {("a", k), ("b", k)}
+    assert chain.whole
+
+
+def test_of_a_batch_the_message_that_decided_is_named(tmp_path: Path) -> None:
+    path, k = tmp_path / "run.mcap", 4 * blamed_graphs.SLOW - 1
+    dataflow.run(blamed_graphs.graph_of("largest | Largest | x: src/a, t: src/slow"), record=path)
+    readings = {n: blamed_graphs.reading(0, "a", n) for n in range(k + 1 - blamed_graphs.SLOW, k + 1)}
+
+    with Recording(path) as recording:
+        chain = Blame(recording, Field.parse(blamed_graphs.at(k, "largest/out"))).find()
+
+    assert chain.value == max(readings.values())
+    own = [link for link in chain.sensed if any(effect.way == "nudged" for effect in link.effects)]
+    assert [link.message for link in own] == [("blamed/src/a", 0, max(readings, key=readings.__getitem__))]
+
+
+def test_a_state_has_forgotten_what_was_before_it_was_set_anew(two: Path) -> None:
+    flags = [blamed_graphs.reading(0, "b", k) >= blamed_graphs.HALF for k in range(blamed_graphs.STEPS)]
+    k = next(k for k in range(20, blamed_graphs.STEPS) if not any(flags[k - 2 : k]))
+    last = max(n for n in range(k) if flags[n])
+
+    with Recording(two) as recording:
+        line = Line(recording, blamed_graphs.graph_of(*TWO), "keep", lambda: None, lambda nbytes: None)
+        line.reach(0, k)
+        forgotten = {begin: line.has_forgotten(begin, k) for begin in (last - 1, last, last + 1)}
+        line.close()
+
+    assert forgotten == {last - 1: True, last: True, last + 1: False}
+
+
 @pytest.mark.parametrize("offset", [-HOUR, HOUR])
 def test_clocks_of_machines_that_are_off_do_not_hide_a_cause(
     offset: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

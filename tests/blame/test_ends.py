@@ -83,6 +83,8 @@ def test_what_changes_a_value_most_is_named_first(spiky: Path) -> None:
     chain = found(spiky, "smooth/out.value@4")
 
     assert sensed(chain)[0] == rangers.SPIKE
+    nudges = [effect for effect in chain.sensed[0].effects if effect.way == "nudged"]
+    assert [effect.fields for effect in nudges] == [("range",)], "its limits change nothing"
     assert next(link.maker for link in chain.links if not link.input) == ("smooth", rangers.SPIKE)
 
 
@@ -103,7 +105,7 @@ def test_a_value_that_nothing_changes_is_not_said_to_be_decided_by_nothing(spiky
 def test_a_link_beyond_which_nothing_shows_ends_the_chain_where_it_is(spiky: Path) -> None:
     chain = found(spiky, "guard/stop.on@1")
 
-    assert [effect.way for link in chain.links for effect in link.effects] == ["another"]
+    assert [(effect.way, effect.together) for link in chain.links for effect in link.effects] == [("another", 1)]
     assert chain.loose == [("smooth", 10)]
     assert not chain.whole
 

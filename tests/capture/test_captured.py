@@ -19,7 +19,9 @@ from dataflow.capture.capture import capture, write_test
 from dataflow.capture.captured import Captured, Change
 from dataflow.cli.main import app
 from dataflow.debugging.debugger import DebugError, Debugger
+from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.recording import Recording
+from dataflow.state import StateError
 
 CASES = {case.use.__name__: case for case in bugs.CASES}
 
@@ -69,6 +71,28 @@ def test_a_predicate_about_any_call_is_captured(late: Path) -> None:
 
     assert len(made.shots) == 1
     assert made.shots[0].firing.inputs["rare"] == ()  # not needed for that
+
+
+def test_a_state_that_holds_the_bug_is_begun_with_only_where_the_calls_are_too_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = seeded_bugs.recorded(bugs.Case(bugs.Drifts), tmp_path / "run.mcap")
+
+    made = captured(path)
+
+    assert made.state is None
+    assert len(made.shots) == 52
+    with pytest.raises(ValueError, match="out of range"):
+        made.check()
+    with monkeypatch.context() as patch:
+        patch.setenv("ZOO_FIXED", "1")
+        made.check()
+    monkeypatch.setattr("dataflow.capture.capture.LARGE", 100)
+    assert captured(path).state is not None
+    monkeypatch.undo()
+    monkeypatch.setattr("dataflow.capture.capture.check_repeats", lambda made: None)
+    monkeypatch.setattr("dataflow.capture.capture.SLOW", 0.0)
+    assert captured(path).state is not None
 
 
 def test_answers_of_a_service_are_in_the_test(tmp_path: Path) -> None:
@@ -145,7 +169,38 @@ def test_a_silent_output_is_none_for_an_expression(changed: Path) -> None:
     assert [shot.firing.inputs["x"].value.vectors[0, 0] for shot in made.shots] == [5.0]  # type: ignore[union-attr]
     with pytest.raises(AssertionError, match=r"rare: out\.out is None"):
         made.check()
-    replace(made, predicate="out.out.vectors[0, 0] > 3").check()  # raises: not true
+    with pytest.raises(AssertionError, match=r"out\.out\.vectors.* raises AttributeError: .*whether the call is right"):
+        replace(made, predicate="out.out.vectors[0, 0] > 3").check()
+
+
+def test_a_captured_state_is_taken_over_by_a_class_with_more_fields(
+    changed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = captured(changed, "tuned").state
+    assert state is not None
+    former = replace(captured(changed, "tuned"), state=pack_state({}))
+    made = replace(former, state=pack_state(unpack_state(state) | {"gone": 1}))
+
+    monkeypatch.setenv("ZOO_FIXED", "1")
+    made.check()
+    with pytest.raises(AssertionError, match="tuned: out"):
+        former.check()  # begins with a total of 0, the default
+    with pytest.raises(
+        StateError, match=r"tuned: the captured state does not fit the class as it is now: .*capture the"
+    ):
+        replace(former, state=pack_state({"total": "much"})).check()
+
+
+def test_a_call_that_raises_now_is_not_mended(late: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = captured(late, predicate=f"stamp > {bugs.STAMP + 5 * 10**9}")
+
+    def broken(operator: bugs.LateBatch, x: object, rare: object) -> None:
+        raise RuntimeError("a broken fix")
+
+    monkeypatch.setattr(bugs.LateBatch, "process", broken)
+    with pytest.raises(RuntimeError, match="a broken fix"):
+        replace(made, predicate="out.out is not None and out.out.vectors[0, 0] > 3").check()
+    replace(made, predicate="stamp < 0", recorded_error="RuntimeError: a broken fix").check()  # as recorded
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import random
 import secrets
@@ -9,12 +10,25 @@ import sys
 import threading
 import time
 import uuid
+from dataclasses import dataclass, field
 from datetime import date, datetime
 from random import random as drawn
 from time import time as now
 from uuid import uuid4
 
 import numpy as np
+
+
+class Thing:
+    """An object like those of an operator."""
+
+
+@dataclass
+class Stamped:
+    """An object whose `__init__` was made by `exec`."""
+
+    made: float = field(default_factory=now)
+
 
 AT_LOAD = drawn()
 NUMPY_AT_LOAD = np.random.normal()
@@ -40,6 +54,10 @@ def read() -> dict[str, object]:
         "secrets": secrets.token_hex(3),
         "system": random.SystemRandom().random(),
         "id": id(order),
+        "factory": Stamped().made,
+        "log record": logging.makeLogRecord({}).created,
+        "hash": hash(Thing()),
+        "repr": repr(Thing()),
         "pid": os.getpid(),
         "empty": np.empty(3000).tobytes()[-4:],
         "at load": AT_LOAD,

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from dataflow.causes import sources
-from dataflow.causes.interventions import changed
+from dataflow.causes.interventions import _step, changed
 from dataflow.causes.sources import CHANCE
 
 HERE = Path(__file__).resolve().parent
@@ -35,6 +35,7 @@ interventions = Interventions(Places([{module!r}]), 1_700_000_000_000_000_000)
 interventions.fix({fixed!r})
 interventions.vary({varied!r})
 import {module}
+interventions.number_objects()
 print({module}.read())
 """
 
@@ -65,6 +66,8 @@ def logged() -> set[tuple[str, str]]:
         (sources.WALL, '"bound time": now(),'),
         (sources.WALL, '"datetime": datetime.now(),'),
         (sources.WALL, '"date": date.today(),'),
+        (sources.WALL, '"factory": Stamped().made,'),
+        (sources.WALL, '"log record": logging.makeLogRecord({}).created,'),
         (sources.MONOTONIC, '"monotonic": time.monotonic_ns(),'),
         (sources.RANDOM, '"python": random.Random().random(),'),
         (sources.RANDOM, "AT_LOAD = drawn()"),
@@ -121,6 +124,75 @@ def test_a_source_that_is_left_free_is_free_alone(free: str, changes: set[str]) 
     one, other = (eval(ran(p), NAMES) for p in programs)
 
     assert {key for key in one if one[key] != other[key]} == changes
+
+
+def test_what_was_given_is_known_also_where_compiled_code_asked() -> None:
+    program = FIX.format(module="given", fixed=set(CHANCE), varied=set()) + "print(interventions.given)"
+
+    sorted_by_id, given = ran(program).splitlines()
+
+    assert eval(given) == {sources.IDENTITY, sources.ADDRESSES, sources.WALL}
+    assert eval(sorted_by_id) == sorted(eval(sorted_by_id))
+
+
+CALM = {
+    **{key: [0.0] * 40 for key in ("wall", "monotonic", "timer", "log")},
+    **{key: [False] * 40 for key in ("urandom", "random", "numpy")},
+    **{key: list(range(5)) for key in ("id", "hash")},
+    **{key: [0, 1, 2] for key in ("threads", "pool")},
+}
+"""The results of two quiet runs of `agreeing`, as a rule."""
+
+
+@pytest.mark.parametrize(
+    ("source", "changes"),
+    [
+        (sources.WALL, {"wall", "log"}),
+        (sources.MONOTONIC, {"monotonic", "timer"}),
+        (sources.RANDOM, {"random"}),
+        (sources.NUMPY, {"numpy"}),
+        (sources.ENTROPY, {"urandom"}),
+        (sources.IDENTITY, {"id"}),
+        (sources.ADDRESSES, {"hash"}),
+    ],
+)
+@pytest.mark.parametrize("fixed", [False, True])
+def test_a_change_shows_where_real_runs_agree(source: str, changes: set[str], fixed: bool) -> None:
+    others = set(CHANCE) - {source} if fixed else set()
+    program = FIX.format(module="agreeing", fixed=others, varied={source}) + "print(interventions.given)"
+
+    found, given = map(eval, ran(program).splitlines())
+
+    assert source in given
+    if fixed:
+        assert {key for key in found if found[key] != CALM[key]} == changes
+    else:
+        assert all(found[key] != CALM[key] for key in changes)
+
+
+def test_threads_and_the_tasks_of_a_pool_begin_late_in_turn() -> None:
+    found = eval(ran(FIX.format(module="agreeing", fixed=set(), varied={sources.THREADS})))
+
+    assert found["threads"] != CALM["threads"]
+    assert found["pool"] != CALM["pool"]
+
+
+def test_few_bytes_of_entropy_are_others_where_they_are_changed() -> None:
+    fixed, free = set(CHANCE), set(CHANCE) - {sources.ENTROPY}
+
+    one, other = (
+        eval(ran(FIX.format(module="chancy", fixed=f, varied=v)), NAMES)["secrets"]
+        for f, v in ((fixed, set()), (free, {sources.ENTROPY}))
+    )
+
+    assert one != other
+
+
+def test_an_uneven_clock_takes_steps_of_a_microsecond_and_of_a_third_of_a_second() -> None:
+    steps = [_step(k) for k in range(1000)]
+
+    assert min(steps) < 2_000
+    assert 200_000_000 < max(steps) <= 300_000_000
 
 
 def test_what_is_varied_differs() -> None:

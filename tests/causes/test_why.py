@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zoo.faulty
+from rich.console import Console
 from typer.testing import CliRunner
 
 from dataflow.api.runs import run
 from dataflow.causes.ladder import Findings
 from dataflow.causes.rerun import Rerun
-from dataflow.causes.why import _answer, refusal, why
+from dataflow.causes.traps import Site
+from dataflow.causes.why import Cause, Why, _Alone, _answer, refusal, why
 from dataflow.cli.main import app
+from dataflow.cli.support.causes import print_reasons
 from dataflow.graph import load_text
 from dataflow.records.comparison import Difference, Verification
 from dataflow.verification.report import VerifyReport
@@ -88,16 +94,80 @@ def test_what_repeats_or_cannot_be_run_again_is_refused(found: Verification, mor
     assert refusal(made, "x", next((v for v in made.operators if v.operator == "x"), None)) == reason
 
 
-@pytest.mark.parametrize(("newer", "causes", "older"), [(True, 2, 0), (False, 1, 1)])
-def test_a_folder_is_a_cause_only_where_it_was_changed_since_the_recording(
-    newer: bool, causes: int, older: int
+@pytest.mark.parametrize(
+    ("newer", "revised", "causes", "also"),
+    [
+        (True, False, {"folder", "environment variable"}, set()),
+        (False, False, {"environment variable"}, {"folder"}),
+        (True, True, {"folder"}, {"environment variable"}),
+        (False, True, set(), {"folder", "environment variable"}),
+    ],
+)
+def test_what_may_be_as_it_was_is_no_cause_where_the_operator_itself_has_changed(
+    newer: bool, revised: bool, causes: set[str], also: set[str]
 ) -> None:
     findings = Findings(Rerun(("",)), repeats=True, causes=["folder:models", "environment variable:GAIN"])
     alone: Any = SimpleNamespace(is_newer=lambda file, found: newer)
 
-    found = _answer("x", findings, alone, None, Verification("x"))
+    found = _answer(findings, alone, None, Verification("x"), revised)
 
-    assert (len(found.causes), len(found.older)) == (causes, older)
+    assert {cause.kind for cause in found.causes} == causes
+    assert {cause.kind for cause in found.also} == also
+    assert {cause["cause"] for cause in found.as_json()["also"]} == also
+
+
+def test_what_makes_runs_differ_is_a_cause_whatever_has_changed() -> None:
+    findings = Findings(Rerun(("",)), repeats=False, settled=True, causes=["wall clock"])
+
+    assert _answer(findings, None, None, Verification("x"), revised=True).causes  # type: ignore[arg-type]
+
+
+def test_facts_of_the_machine_are_no_change_of_an_operator() -> None:
+    found = Verification("x", code_changed=["op"], packages_changed=["numpy 1 → 2"])
+    made = report(found)
+    made = replace(made, facts=(("cpu", "a", "b"),))
+
+    assert made.revised("x") == ("code of op", "numpy 1 → 2")
+    assert made.altered("x") == ("code of op", "numpy 1 → 2", "cpu: a → b")
+
+
+def test_a_file_that_was_copied_with_its_times_is_newer_than_a_recording_made_before(tmp_path: Path) -> None:
+    copied = tmp_path / "cfg.json"
+    copied.write_text("{}")
+    os.utime(copied, (1.0, 1.0))
+    alone: Any = SimpleNamespace(recorded=copied.stat().st_ctime - 1)
+
+    assert _Alone.is_newer(alone, str(copied), Verification("x"))
+    alone.recorded += 2
+    assert not _Alone.is_newer(alone, str(copied), Verification("x"))
+
+
+def test_changed_code_is_reported_before_what_the_results_also_depend_on() -> None:
+    gain = Cause("environment variable:GAIN", (Site("/robot/op.py", 20, "setup", "os.environ"),), 1)
+    console = Console(file=io.StringIO(), width=200)
+
+    print_reasons(console, "", [Why("x", repeats=True, changed=("code of op",), also=(gain,))])
+
+    assert console.file.getvalue().splitlines() == [  # type: ignore[attr-defined]
+        "x: it repeats here, and this is not as it was recorded (0 re-runs, 0.00 s)",
+        "x: not as it was recorded: code of op",
+        "x: its results also depend on environment variable GAIN (op.py:20), not known for the recording",
+    ]
+
+
+def test_sources_of_chance_that_it_reads_in_vain_are_listed_before_devices() -> None:
+    site = Site("/robot/op.py", 60, "process", "time.monotonic")
+    findings = Findings(Rerun(("",), sites=(("monotonic clock", site, 40),)), repeats=True, reruns=5)
+    findings.cleared = ["monotonic clock", "random"]
+    console = Console(file=io.StringIO(), width=200)
+
+    found = _answer(findings, None, None, Verification("x"), revised=False)  # type: ignore[arg-type]
+    print_reasons(console, "", [found])
+
+    first, second = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert first == "x: reads the monotonic clock at op.py:60; no effect seen in 5 re-runs"
+    assert "devices" in second
+    assert [read["calls"] for read in found.as_json()["reads"]] == [40]
 
 
 def test_an_operator_that_is_refused_is_not_run(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
+from dataflow.cli.commands.following.health import silent
 from dataflow.cli.support.board import Board, Sample, heading, line, shown
 from dataflow.client.processes import ProcessStatus
 from dataflow.graph import load_text
@@ -19,6 +20,12 @@ GRAPH = """\
 graph: robot
 operators:
   left: {use: runtime_operators:Counter}
+"""
+CHAIN = """\
+graph: robot
+operators:
+  camera: {use: runtime_operators:Counter}
+  detector: {use: runtime_operators:Sum, inputs: {x: camera/fast}}
 """
 
 Counts = tuple[int, int, int, int, int, int]
@@ -163,3 +170,22 @@ def test_what_an_operator_found_wrong_is_among_the_notes() -> None:
     counts = dict.fromkeys(("camera", "check"), (1, 1, 0, 0, 10**9, 0))
     sample = board.update([ProcessStatus("eyes", counts, dict.fromkeys(counts, 0), frozenset(), found=found)], 1.0)
     assert "check: edges of colour and depth did not fit" in "\n".join(printed(sample, 80))
+
+
+@pytest.mark.parametrize(
+    ("silences", "named"),
+    [
+        ({"camera": 0.1, "detector": 0.1}, []),
+        ({"camera": 0.1, "detector": 14.0}, ["detector: has not fired for 14.0 s; before, every 0.20 s"]),
+        ({"camera": 14.0, "detector": 14.0}, ["camera: has not fired for 14.0 s; before, every 0.10 s"]),
+        ({"camera": 1.9, "detector": 0.9}, []),
+    ],
+)
+def test_an_operator_that_hangs_and_a_source_that_is_silent_are_named(
+    silences: dict[str, float], named: list[str]
+) -> None:
+    counts = {"camera": [1000, 0, 0, 0, NEVER, 0], "detector": [500, 0, 0, 0, NEVER, 0]}
+    status = ProcessStatus("eyes", counts, dict.fromkeys(counts, 0), frozenset(), silences=silences)
+
+    graph = load_text(CHAIN)
+    assert list(silent(graph, [status], running=100.0, over=2.0)) == named

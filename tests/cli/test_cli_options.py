@@ -56,7 +56,8 @@ TRIED: tuple[str, ...] = (
     "split RECORDING --out OUT --size 1MB",
     "merge RECORDING OTHER --prefix OTHER=other/ --out OUT.mcap --overwrite --compression lz4 --quiet --json",
     "recover RECORDING --out OUT.mcap --overwrite --compression lz4 --quiet --json",
-    "latency RECORDING --path HERE --spans OUT.jsonl --overwrite --json",
+    "latency RECORDING --path HERE --json",
+    "spans RECORDING --path HERE --to OUT.jsonl --overwrite",
     "lint RECORDING --write-contract OUT.yaml --overwrite --quick --json",
     "lint RECORDING --contract CONTRACT",
     "view RECORDING --to OUT.rrd --overwrite --stream left/* --without fast --start 0 --end 1 --clock auto",
@@ -91,6 +92,7 @@ UNANSWERED: tuple[str, ...] = (
     "param list --all --graph none --wait 0 --timeout 1 --json",
     "param dump --all --graph none --wait 0 --timeout 1 --out OUT.yaml --overwrite",
     "param load VALUES --graph none --wait 0 --timeout 1",
+    "spans --graph none --wait 0 --to OUT.jsonl",
     "health --graph none --wait 0 --rate sum=1 --losses 0.1 --free 1 --folder HERE --over 1 --json",
     "reload sum --graph none --wait 0 --timeout 1 --json",
 )

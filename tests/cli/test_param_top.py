@@ -13,6 +13,7 @@ from typing import Any
 import psutil
 import pytest
 from prometheus_text import prometheus
+from span_collector import collector
 
 from dataflow.client.attach import find_running
 from dataflow.client.metrics import collect
@@ -221,6 +222,45 @@ def test_top_prints_a_table(dataflow) -> None:
     assert told.startswith("tunable  running for ")
     assert [text.split()[0] for text in told.splitlines()[1:6]] == ["operator", "left", "tuned", "slow", "other"]
     assert "expected seconds, 0.05 or more" in dataflow("top", "--every", "0", code=2).stderr
+
+
+def test_spans_of_a_running_graph_reach_a_collector_with_their_causes(alone: Background, dataflow) -> None:
+    with collector([(200, "{}")]) as (url, taken):
+
+        def end_when_some_came() -> None:
+            for _ in range(600):
+                if len(spans_in(taken)) > 200:
+                    break
+                time.sleep(0.05)
+            alone.end()
+
+        ending = threading.Thread(target=end_when_some_came)
+        ending.start()
+        said = dataflow("spans", "--to", url).stderr
+        ending.join(90)
+    spans = spans_in(taken)
+
+    assert f"{len(spans):,} spans to {url}; " in said
+    by_id = {span["spanId"]: span for span in spans}
+    parents = {(s["name"], by_id[p]["name"]) for s in spans if (p := s.get("parentSpanId")) in by_id}
+    assert parents == {(f"{name} fire", "left fire") for name in ("tuned", "slow", "other")}
+    with Recording(alone.recording) as recording:
+        recorded = {(r.operator, r.wall_start) for name in ("tuned", "slow") for r in recorded_firings(recording, name)}
+    live = {
+        (s["name"].split()[0], int(s["startTimeUnixNano"])) for s in spans if s["name"] in ("tuned fire", "slow fire")
+    }
+    assert live <= recorded
+
+
+def spans_in(taken: list[Any]) -> list[dict[str, Any]]:
+    """All spans of the requests that a collector was sent."""
+    return [
+        span
+        for _, _, body in list(taken)
+        for resource in body["resourceSpans"]
+        for scope in resource["scopeSpans"]
+        for span in scope["spans"]
+    ]
 
 
 @pytest.mark.usefixtures("running")

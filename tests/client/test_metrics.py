@@ -28,6 +28,7 @@ def test_every_figure_of_an_operator_is_a_sample() -> None:
         frozenset(),
         {"camera": {("image", "timeout"): 4}},
         {"camera": (0.25, 0.5)},
+        silences={"camera": 0.125},
     )
     metrics = Metrics()
 
@@ -50,6 +51,7 @@ def test_every_figure_of_an_operator_is_a_sample() -> None:
         "dataflow_call_seconds_total": [("camera", 4), ("idle", 0)],
         "dataflow_restarts_total": [("camera", 3), ("idle", 0)],
         "dataflow_event_time_seconds": [("camera", 5)],
+        "dataflow_silence_seconds": [("camera", 0.125)],
         "dataflow_behind_clock_seconds": [("camera", 0.5)],
     }
 

@@ -20,7 +20,7 @@ from dataflow.cli.support.debug_shell import Shell, WrongCommand
 from dataflow.debugging.debugger import DebugError, Debugger, Unmade
 from dataflow.debugging.fired import SPACING, Fired, Probe, Process
 from dataflow.execution.failure import OperatorFailure
-from dataflow.graph import Graph, load_graph
+from dataflow.graph import Graph, load_graph, load_text
 from dataflow.graph.sections import Record
 from dataflow.messages.base import Message
 from dataflow.recording import Recorded, Recording
@@ -314,6 +314,49 @@ def test_edited_source_is_taken_over_and_compared_from_the_same_state(added: Rec
     debugger.reload()
     assert debugger.goto(10).same
     assert debugger.first_difference() is None
+
+
+@pytest.fixture
+def with_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recording]:
+    """As `added`, with a state every 0.5 s."""
+    written(tmp_path, RIGHT)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "debugged_adder", raising=False)
+    graph = load_text(
+        "graph: added\nrecord: {snapshots: 500ms}\noperators:\n  numbers: {use: 'debugged_adder:Numbers'}\n"
+        "  adder: {use: 'debugged_adder:Adder', inputs: {x: numbers/x}}\n"
+    )
+    dataflow.run(graph, record=tmp_path / "run.mcap")
+    with Recording(tmp_path / "run.mcap") as recording:
+        yield recording
+    monkeypatch.delitem(sys.modules, "debugged_adder", raising=False)
+
+
+COUNTS = RIGHT + "; self.state.calls += 1; self.state.total += (self.state.calls > 20)"
+
+
+def test_states_without_a_field_that_the_class_has_now_are_passed_by(with_states: Recording, tmp_path: Path) -> None:
+    debugger = Debugger(with_states, "adder")
+    assert debugger._recorded
+    assert debugger.goto(25).same
+    file = written(tmp_path, COUNTS)
+    file.write_text(file.read_text().replace("total: float = 0.0\n", "total: float = 0.0\n    calls: int = 0\n"))
+    debugger.reload()
+
+    for fired in (debugger.again(), debugger.goto(25), debugger.until(lambda fired: True, first=25)):
+        assert fired is not None
+        assert not fired.same
+        before, after = fired.states()
+        assert before == {"total": sum(range(25)) + 5, "calls": 25}  # of the calls from the beginning
+        assert after == {"total": sum(range(26)) + 6, "calls": 26}
+    debugger.goto(3)
+    assert debugger.goto(24).states()[1] == {"total": sum(range(25)) + 5, "calls": 25}
+    found = debugger.first_difference()
+    assert found is not None
+    assert found.number == 20
+    debugger.close()
+    fresh = Debugger(with_states, "adder")  # of the class as it is now
+    assert fresh.goto(25).states()[0] == {"total": sum(range(25)) + 5, "calls": 25}
 
 
 def test_source_that_does_not_run_leaves_the_old_one(added: Recording, tmp_path: Path) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import time
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from mutants import drawn, mutants_of, passes
+from mutants import drawn, mutants_of
 
 SOURCE = '''
 def share(a: int | None, b: float = 0.5) -> float:
@@ -46,22 +47,58 @@ def test_a_seed_draws_equal_faults(tmp_path: Path) -> None:
     assert len(drawn(tmp_path / "a.py", 60, 1)) == 10
 
 
-LEAVING = """
-import subprocess, sys
-def test_leaves_a_process():
-    left = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"])
-    open("left", "w").write(str(left.pid))
+PACKAGE = """
+def is_above(a, b):
+    return a > b
+
+def half(a):
+    return a / 2
+
+def never_run(a):
+    return -a
+"""
+TESTS = """
+import subprocess, sys, time
+from dataflow.toy.a import half, is_above
+
+def test_above():
+    assert is_above(2, 1)
+
+def test_half_in_another_process():
+    command = "from dataflow.toy.a import half; exit(half(4) != 2)"
+    subprocess.run([sys.executable, "-c", command], check=True)
+
+def test_leaves_a_process_in_a_session():
+    left = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"], start_new_session=True)
+    with open("PLACE", "a") as file:
+        file.write(f"{left.pid} ")
 """
 
 
 @pytest.mark.long
-def test_no_process_of_the_tests_is_left(tmp_path: Path) -> None:
-    (tmp_path / "test_leaving.py").write_text(LEAVING)
+def test_a_mutant_is_killed_survives_or_is_not_run_and_no_process_of_the_tests_is_left(
+    tmp_path: Path, repository: Path
+) -> None:
+    for file, text in {
+        "dataflow/toy/a.py": PACKAGE,
+        "tests/toy/test_a.py": TESTS.replace("PLACE", f"{tmp_path}/left"),
+    }.items():
+        (tmp_path / file).parent.mkdir(parents=True)
+        (tmp_path / file).write_text(text)
+    command = [sys.executable, "tools/mutants.py", "dataflow/toy", "--checkout", str(tmp_path)]
 
-    assert passes(tmp_path, "test_leaving.py")
+    lines = subprocess.run(command, cwd=repository, check=True, capture_output=True, text=True).stdout.splitlines()
 
-    left = Path("/proc") / (tmp_path / "left").read_text()
-    end = time.monotonic() + 10
-    while left.exists() and " Z " not in (left / "stat").read_text() and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not left.exists() or " Z " in (left / "stat").read_text()
+    assert {line.partition("  [")[0] for line in lines[1:-1]} == {
+        "killed   dataflow/toy/a.py:3: return None",
+        "SURVIVED dataflow/toy/a.py:3: (a >= b)",
+        "killed   dataflow/toy/a.py:6: return None",
+        "killed   dataflow/toy/a.py:6: (a * 2)",
+        "killed   dataflow/toy/a.py:6: (3)",
+        "NOT RUN  dataflow/toy/a.py:9: return None",
+    }
+    assert "killed   dataflow/toy/a.py:6: (3)  [tests/toy/test_a.py::test_half_in_another_process]" in lines
+    assert lines[-1].startswith("4 of 6 killed (seed 0)")
+    left = (tmp_path / "left").read_text().split()
+    assert len(left) >= 2
+    assert not [process for process in left if Path("/proc", process).exists()]

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from made_environments import environment, install, packages
 
+from dataflow.capture.captured import check
 from dataflow.debugging.debugger import Debugger
 from dataflow.environments import EnvError, environment_of, lock
 from dataflow.execution import threads
@@ -22,6 +23,7 @@ from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.run import run
+from dataflow.tool_server.jobs import Refused, place_of
 from dataflow.verification.complete import complete
 from dataflow.verification.verify import verify
 
@@ -159,6 +161,65 @@ def test_the_debugger_begins_in_the_environment_of_its_operator(operator: str, r
     assert told.returncode == 0, told.stderr
     assert f"{operator}  call 1 of " in told.stdout
     assert "as recorded" in told.stdout
+
+
+def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    here = str(Path(__file__).resolve().parent)
+    line = [sys.executable, "-m", "dataflow.cli.main", *words, "--path", here]
+    return subprocess.run(line, capture_output=True, text=True, timeout=200, cwd=folder)
+
+
+@pytest.mark.long
+def test_a_call_is_captured_in_the_environment_of_its_operator_and_its_test_runs_there(
+    recorded: Path, environments: Path, tmp_path: Path
+) -> None:
+    install(environments / "one", "1.5", 2.5)
+    try:
+        told = command("capture", str(recorded), "--op", "first", "--to", str(tmp_path / "test_it.py"), folder=tmp_path)
+        assert told.returncode == 0, told.stderr
+        with pytest.raises(AssertionError, match=r"in the environment .*one: (.|\n)*first: y.vectors: "):
+            check(tmp_path / "test_it.capture")
+    finally:
+        install(environments / "one", "1.0", 2.0)
+    check(tmp_path / "test_it.capture")
+
+
+@pytest.mark.long
+def test_what_decided_a_value_is_found_in_the_environment_of_its_operators(recorded: Path, tmp_path: Path) -> None:
+    told = command("blame", str(recorded), "--field", "first/y.vectors@0.01", folder=tmp_path)
+    assert told.returncode == 0, told.stderr
+    assert "first #10" in told.stdout
+
+    mixed = command("blame", str(recorded), "--field", "second/y.vectors@0.01", folder=tmp_path)
+    assert mixed.returncode == 2
+    assert re.search(
+        r"'second' runs in the environment '.*two', and what is in front of it in others: 'first' \(", mixed.stderr
+    )
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "env"),
+    [
+        ("goto", {"operator": "first", "call": 1}, "one"),
+        ("capture", {"operator": "second"}, "two"),
+        ("blame", {"field": "first/y.vectors@0.01"}, "one"),
+        ("blame", {"field": "first/y"}, None),  # no field: what the tool says
+        ("verify", {}, None),
+        ("prove", {"operator": "first", "call": 1}, None),
+    ],
+)
+def test_a_tool_of_an_agent_runs_in_the_environment_of_its_operator(
+    tool: str, arguments: dict[str, object], env: str | None, recorded: Path, environments: Path
+) -> None:
+    python, variables = place_of(tool, {"recording": str(recorded), **arguments})
+
+    assert python == (sys.executable if env is None else str(environments / env / "bin/python"))
+    assert (variables["PYTHONPATH"].split(os.pathsep)[0] == str(packages(environments / (env or "one")))) is bool(env)
+
+
+def test_a_tool_that_would_need_two_environments_is_refused(recorded: Path) -> None:
+    with pytest.raises(Refused, match=r"'second' runs in the environment"):
+        place_of("blame", {"recording": str(recorded), "field": "second/y.vectors@0.01"})
 
 
 def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_path: Path) -> None:

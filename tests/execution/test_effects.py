@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from email.message import Message as Headers
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,104 @@ def test_a_changed_argument_is_a_miss_with_call_and_line_never_the_next_answer()
         "argument 0 differs from the recorded call"
     )
     assert result.effects["ask"] == {"given": 4, "missed": 2, "again": 0, "same": 0}
+
+
+class Client:
+    """A client that counts its questions, and holds what may change them."""
+
+    system = "You are a robot."
+
+    def __init__(self, prompt: str, temperature: float = 0.0, token: str = "") -> None:
+        self.prompt, self.temperature, self.api_token, self.asked = prompt, temperature, token, 0
+
+    def ask(self) -> Any:
+        self.asked += 1
+        return next(WORLD)
+
+
+class Terse(Client):
+    """Another constant of the class."""
+
+    system = "You are a terse robot."
+
+
+def _closure(prompt: Any) -> Callable[[], Any]:
+    def call() -> Any:
+        return ask(prompt)
+
+    return call
+
+
+def _outer(prompt: str) -> Callable[[], Any]:
+    inner = _closure(prompt)
+
+    def call() -> Any:
+        return inner()
+
+    return call
+
+
+def _default(prompt: str) -> Callable[[], Any]:
+    def call(n: int = 1, *, prompt: str = prompt) -> Any:
+        return ask(prompt)
+
+    return call
+
+
+def _holding(client: Client) -> Callable[[], Any]:
+    def call() -> Any:
+        return client.ask()
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "place"),
+    [
+        (lambda: _closure("a?"), lambda: _closure("b?"), "closure.prompt"),
+        (lambda: _closure(np.arange(9)), lambda: _closure(np.arange(9) + 1), "closure.prompt"),
+        (lambda: _closure(partial(ask, "a?")), lambda: _closure(partial(ask, "b?")), "closure.prompt.args"),
+        (lambda: _outer("a?"), lambda: _outer("b?"), "closure.inner.closure.prompt"),
+        (lambda: _default("a?"), lambda: _default("b?"), "default.prompt"),
+        (lambda: _holding(Client("a?")), lambda: _holding(Client("b?")), "closure.client.prompt"),
+        (lambda: Client("a?").ask, lambda: Client("b?").ask, "self.prompt"),
+        (lambda: Client("a?", 0.2).ask, lambda: Client("a?", 0.9).ask, "self.temperature"),
+        (lambda: Client("a?").ask, lambda: Terse("a?").ask, "self.system"),
+    ],
+)
+def test_a_prompt_that_a_call_sees_besides_its_arguments_is_a_miss_where_it_changes(
+    one: Callable[[], Any], other: Callable[[], Any], place: str
+) -> None:
+    ran = recorded(lambda operator, x: operator.effect(one()))
+
+    assert again(ran).result.first is None
+    found = again(ran, lambda operator, x: operator.effect(other())).result.first
+    assert found is not None
+    assert f"{place} differs from the recorded call" in found.got
+
+
+def test_what_a_call_changes_in_its_object_and_credentials_are_no_miss() -> None:
+    def body(token: str) -> Body:
+        clients: list[Client] = []
+
+        def asking(operator: Asking, x: FeatureVector) -> float:
+            clients[:] = clients or [Client("a?", token=token)]
+            return float(operator.effect(clients[0].ask))
+
+        return asking
+
+    assert again(recorded(body("of the robot")), body("of the desk")).result.first is None
+
+
+def test_clocks_and_counts_of_an_operator_are_no_part_of_the_key_of_its_methods() -> None:
+    def key(prompt: str, began: float) -> Key:
+        operator = Asking()
+        vars(operator).update(prompt=prompt, began=began, latencies=[began], client=Client("a?"))
+        return Key.of(operator.setup, (), {})
+
+    assert key("a?", 1.0) == key("a?", 2.0)
+    assert key("b?", 1.0).missing(key("a?", 1.0)) == ["self.prompt"]
+    assert "self.client.prompt" in key("a?", 1.0).arguments
 
 
 @pytest.mark.parametrize("caught", [Exception, BaseException])
@@ -460,6 +559,15 @@ def test_an_error_of_a_recording_imports_no_package() -> None:
 
     assert type(error) is ValueError
     assert "antigravity" not in sys.modules
+
+
+def test_an_error_of_a_recording_calls_no_function(capsys: pytest.CaptureFixture[str]) -> None:
+    described = [[["builtins", "print"], ["builtins", "ValueError"]], "t", ["t"], {}, {}]
+
+    error = Answer(True, pack_state({"": described})).error()
+
+    assert type(error) is ValueError
+    assert not capsys.readouterr().out
 
 
 def test_without_a_run_the_call_is_made() -> None:

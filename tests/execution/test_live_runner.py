@@ -121,6 +121,30 @@ def test_a_second_jump_resets_again() -> None:
     assert runner.operator.resets == 2
 
 
+def test_after_a_jump_an_ended_stream_is_not_waited_for_and_one_that_begins_again_is_taken() -> None:
+    runner, collector = live(node(Pair, {"a": ["t/s/a"], "b": ["t/s/b"]}, Live("block", 16, {"a": None, "b": None})))
+    for stream in ("t/s/a", "t/s/b"):
+        runner.push(stream, entry(stream, 1000, 0))
+    runner.end("t/s/a", 1000, "")
+    run_all(runner)
+
+    runner.push("t/s/a", entry("t/s/a", 500, 0, 1))
+    runner.push("t/s/b", entry("t/s/b", 500, 0, 1))
+    run_all(runner)
+
+    assert [r.stamp for r in collector.records if r.kind == "fire"] == [1000, 500]
+
+
+def test_after_a_jump_a_static_stream_that_ended_without_its_message_is_not_waited_for() -> None:
+    runner, collector = live(node(Either, {"a": ["t/s/a"], "b": ["t/m/b"]}), static=frozenset({"t/m/b"}))
+    runner.end("t/m/b", None, "its source has none")
+    for stamp, incarnation in ((1000, 0), (500, 1)):
+        runner.push("t/s/a", entry("t/s/a", stamp, 0, incarnation))
+        run_all(runner)
+
+    assert [r.stamp for r in collector.records if r.kind == "fire"] == [1000, 500]
+
+
 @pytest.mark.parametrize("queue", ["newest", "block"])
 def test_what_breaks_the_promise_of_its_stream_is_refused_and_the_run_goes_on(queue: Any) -> None:
     inputs = {"x": ["t/s/x"], "rest": ["t/s/rest"]}

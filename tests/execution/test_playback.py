@@ -40,6 +40,10 @@ def test_speed_is_doubled_halved_and_chosen() -> None:
     playback = Playback(speed=1.0)
     playback.do("faster")
     assert playback.speed == 2.0
+    playback.do("slower")
+    assert playback.speed == 1.0
+    playback.do("slower")
+    assert playback.speed == 0.5
     for _ in range(20):
         playback.do("slower")
     assert playback.speed == SLOWEST

@@ -13,6 +13,7 @@ from firing_operators import Collector, Dice, Echo, entry, node, run_all
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dataflow.editing.spans import folded
 from dataflow.execution import runner as runner_module
 from dataflow.execution.calls import Calls
 from dataflow.execution.live import LiveRunner
@@ -119,25 +120,61 @@ class Fails(RuntimeError):
     """A failure on purpose."""
 
 
-def test_an_operator_that_was_restarted_with_changed_parameters_is_identical() -> None:
-    made = dice(shared=True, restart=Restart(max=1, backoff=0))
+def restarted_run(made: Node, messages: Iterable[Entry], changes: int) -> Collector:
+    """A live run whose second firing fails; behind as many of the first messages the gain becomes 3."""
     collector = Collector()
     errors = iter([None, Fails("once"), None])
     faults: Any = SimpleNamespace(before=lambda firing: next(errors, None))
-    runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: 10**6, faults=faults)
+    runner = LiveRunner(
+        made,
+        collector,
+        static=frozenset(),
+        event_clock=lambda: 10**6,
+        faults=faults,
+        snapshots=StateSpacing(1),
+    )
     runner.setup()
-    messages = [entry(STREAM, 100 * seq, seq) for seq in range(1, 4)]
-    for message in messages:
+    for number, message in enumerate(messages):
         runner.push(STREAM, message)
         run_all(runner)
-        runner.set_parameter("gain", 3.0)
-        run_all(runner)
+        if number < changes:
+            runner.set_parameter("gain", 3.0)
+            run_all(runner)
     runner.end(STREAM, None, "")
     run_all(runner)
-
     assert [r.detail.get("injected") for r in collector.records if r.outcome == "error"] == [True]
     assert runner.restarted == 1
-    assert again(made, collector, messages).result.verdict == "identical"
+    return collector
+
+
+def test_an_operator_that_was_restarted_with_changed_parameters_is_identical(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = dice(shared=True, restart=Restart(max=1, backoff=0))
+    messages = [entry(STREAM, 100 * seq, seq) for seq in range(1, 4)]
+    ran = restarted_run(made, messages, changes=3)
+    closed: list[Dice] = []
+    monkeypatch.setattr(Dice, "close", lambda self: closed.append(self))
+
+    runner = again(made, ran, messages)
+
+    assert runner.result.verdict == "identical"
+    assert closed
+    assert runner.operator not in closed
+
+
+def test_a_part_that_begins_behind_a_restart_begins_with_the_parameters_of_that() -> None:
+    made = dice(restart=Restart(max=1, backoff=0))
+    messages = [entry(STREAM, 100 * seq, seq) for seq in range(1, 5)]
+    ran = restarted_run(made, messages, changes=1)
+    begin = max(k for k, record in enumerate(ran.records) if record.kind == "setup")
+    while ran.records[begin].kind != "snapshot":
+        begin += 1
+    part = Collector()
+    part.records = [*folded(ran.records[: begin + 1]), *ran.records[begin + 1 :]]
+
+    result = again(made, part, messages).result
+
+    assert [record.kind for record in part.records[:3]] == ["setup", "cut", "fire"]
+    assert (result.verdict, result.verified) == ("identical", 2)  # the last firing, and the end
 
 
 def test_runs_live_runs_and_re_executions_draw_alike() -> None:

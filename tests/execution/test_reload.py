@@ -140,12 +140,24 @@ def _fire(runner: LiveRunner, stamp: int) -> None:
         ("step_of_reload", "STEP = \n", "SyntaxError"),
         ("sum_to_reload", "", "has no operator 'Sum'"),
         ("sum_to_reload", CODE.replace("    y: Out", "    z: Out"), "its outputs are declared otherwise now"),
+        (
+            "sum_to_reload",
+            CODE.replace("(Operator)", "(Operator, merge=True)"),
+            "its inputs are declared otherwise now",
+        ),
         ("sum_to_reload", CODE + "\n    def setup(self):\n        1 / 0\n", "ZeroDivisionError"),
+        ("sum_to_reload", CODE + "\n    def setup(self):\n        while True: pass\n", r"not over within 0\.05 s"),
     ],
 )
 def test_code_that_does_not_fit_is_refused_and_the_old_one_goes_on(
-    folder: Path, running: tuple[LiveRunner, Collector], module: str, text: str, reason: str
+    folder: Path,
+    running: tuple[LiveRunner, Collector],
+    module: str,
+    text: str,
+    reason: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("dataflow.execution.live.SET_UP_WITHIN", 0.05)
     runner, collector = running
     modules = {name: sys.modules[name] for name in MODULES}
     (folder / f"{module}.py").write_text(text)

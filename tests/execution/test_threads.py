@@ -31,6 +31,20 @@ def test_a_library_that_setup_loads_is_limited(monkeypatch: pytest.MonkeyPatch) 
     assert limits == [3]
 
 
+def test_each_loaded_library_is_limited_and_one_that_is_not_loaded_stays_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "_limit", None)
+    limits: list[tuple[str, int]] = []
+    monkeypatch.setitem(sys.modules, "cv2", SimpleNamespace(setNumThreads=lambda n: limits.append(("cv2", n))))
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(set_num_threads=lambda n: limits.append(("torch", n))))
+
+    threads.limit_threads(2)
+    assert limits == [("cv2", 2), ("torch", 2)]
+
+    monkeypatch.delitem(sys.modules, "torch")
+    threads.limit_threads_again()
+    assert limits[2:] == [("cv2", 2)]
+
+
 def test_an_inner_limit_gives_the_outer_one_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "_limit", 3)
     limits: list[int] = []

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 
+import pytest
+
 from dataflow.execution.work import Work
 
 
@@ -28,6 +30,34 @@ def test_computing_is_work() -> None:
         with work:
             burn(0.01)
     assert work.wall_ns >= work.cpu_ns * 0.999 >= 20_000_000 * 0.999
+
+
+class Clocks:
+    """Wall and CPU time (ns) that only go on when told to."""
+
+    def __init__(self) -> None:
+        self.wall = self.cpu = self.asked = 0
+
+    def monotonic_ns(self) -> int:
+        return self.wall
+
+    def thread_time_ns(self) -> int:
+        self.asked += 1
+        return self.cpu
+
+
+def test_short_calls_are_added_up_and_one_that_waited_counts_what_it_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks = Clocks()
+    monkeypatch.setattr("dataflow.execution.work.time", clocks)
+    work = Work()
+    for wall, cpu in [(1000, 1000)] * 1000 + [(5_000_000, 2000)]:
+        with work:
+            clocks.wall += wall
+            clocks.cpu += cpu
+
+    assert work.wall_ns == 1000 * 1000 + 5_000_000
+    assert 1000 * 1000 <= work.cpu_ns <= 1100 * 1000
+    assert clocks.asked < 200  # it costs as much as a short call
 
 
 def test_a_call_that_fails_is_counted_too() -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import graph_operators
@@ -14,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.graph import Graph, GraphError, load_bundle, load_graph, load_text
+from dataflow.graph.sections import as_values
 
 RGBD = """\
 graph: rgbd
@@ -302,6 +304,12 @@ def test_bundle_loads_the_same_graph_without_files_and_environment(
 def test_json_rebuilds_the_same_graph() -> None:
     graph = load_text(RGBD)
     assert Graph.from_json(json.loads(json.dumps(graph.to_json()))) == graph
+
+
+def test_the_values_of_a_graph_are_those_of_its_dataclasses() -> None:
+    graph = load_text(RGBD)
+    for part in (*graph.nodes.values(), *graph.streams.values(), graph.record, graph.view, graph.sources_bundle):
+        assert as_values(part) == asdict(part)
 
 
 def test_json_rebuilds_without_importing_operators() -> None:

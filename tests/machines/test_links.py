@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -21,7 +22,15 @@ from link_relay import Relay
 from needed_programs import need
 
 from dataflow.graph import load_text
-from dataflow.machines.keys import TOOLS, KeysError, issue, new_authority, settings
+from dataflow.machines.keys import (
+    TOOLS,
+    KeysError,
+    issue,
+    new_authority,
+    require_machine,
+    require_serving,
+    settings,
+)
 from dataflow.supervision.core.report import RunFailed, Status
 from dataflow.supervision.plan import Meeting
 from dataflow.supervision.run import run
@@ -173,6 +182,8 @@ def test_an_agent_that_gave_the_run_up_ends_it(keys: Path, link: tuple[int, Rela
 @pytest.mark.parametrize("who", ["stranger", pytest.param("tools", marks=pytest.mark.long)])
 def test_a_certificate_of_another_authority_or_of_a_tool_joins_nothing(keys: Path, tmp_path: Path, who: str) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"
+    if who == "tools":  # as keys of before this was noted
+        keys = Path(shutil.copytree(keys, tmp_path / "keys", ignore=shutil.ignore_patterns("machine")))
     stranger = join("robot", endpoint, tmp_path / "files", "--keys", str(keys / who))
     with pytest.raises(RunFailed, match=r"machine 'robot' did not join"):
         run(load_text(GRAPH), machines=Meeting(endpoint, keys / "laptop"), start_timeout=4.0)
@@ -197,10 +208,29 @@ def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:
         new_authority(keys / "authority")
 
 
+def test_keys_are_taken_by_whom_they_were_made_for_alone(keys: Path, tmp_path: Path) -> None:
+    require_machine(keys / "robot", "robot")
+    require_serving(keys / "laptop")
+    with pytest.raises(KeysError, match=r"holds the keys of machine 'robot', not those of 'arm'"):
+        require_machine(keys / "robot", "arm")
+    with pytest.raises(KeysError, match=r"holds the keys of tools, which join no run"):
+        require_machine(keys / "tools", "robot")
+    with pytest.raises(KeysError, match=r"cannot serve: .* --serves ADDRESS"):
+        require_serving(keys / "robot")
+
+
+@pytest.mark.parametrize("address", ["10.88.0.2:7447", "not,a:host", "", "-x"])
+def test_an_address_with_a_port_is_refused(keys: Path, tmp_path: Path, address: str) -> None:
+    with pytest.raises(KeysError, match=r"expected an address or host name, without a port"):
+        issue(keys / "authority", tmp_path / "arm", "arm", serves=["192.168.1.3", address])
+
+
 def test_keys_that_could_not_be_made_leave_nothing_in_the_way(keys: Path, tmp_path: Path) -> None:
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "authority.key").write_text("no key")
     with pytest.raises(KeysError, match="openssl x509"):
-        issue(keys / "authority", tmp_path / "arm", "arm", serves=["not,a:host"])
-    assert not list(tmp_path.iterdir())
+        issue(tmp_path / "broken", tmp_path / "arm", "arm", serves=["192.168.1.3"])
+    assert [path.name for path in tmp_path.iterdir()] == ["broken"]
 
     issue(keys / "authority", tmp_path / "arm", "arm", serves=["192.168.1.3"])
 
@@ -208,6 +238,7 @@ def test_keys_that_could_not_be_made_leave_nothing_in_the_way(keys: Path, tmp_pa
         "authority.pem",
         "certificate.pem",
         "key.pem",
+        "machine",
         "name",
     }
 

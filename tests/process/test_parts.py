@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +159,63 @@ def test_the_newest_part_stays_however_large_it_is(recorded: Path, graph: Graph,
     assert facts["parts"] == [str(part) for part in parts_of(tmp_path / "run.mcap")] == [str(tmp_path / "run_001.mcap")]
 
 
+def test_a_part_that_is_stored_does_not_give_way_to_one_that_holds_nothing_yet(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
+) -> None:
+    """What stands in for the calls before may take more than all parts may, and the run may end before a message."""
+    sink = Given(recorded, graph, tmp_path / "run.mcap", replace(GO_ON, keep=2_000)).sink
+    with Recording(recorded) as recording:
+        messages = [m for m in recording.messages() if m.stamp <= 2 * SECOND]
+    for found in messages:
+        sink.message(found.stream, found.message, found.seq, found.incarnation)
+    sink.flush()
+    disk.full = True
+    sink.message(messages[-1].stream, messages[-1].message.replace(stamp=3 * SECOND), 999, 0)
+    sink.flush()
+    disk.full = False
+    sink.flush()
+    facts = sink.close("complete")
+
+    assert facts["parts"] == [str(tmp_path / "run.mcap")]
+    assert facts["messages"] == len(messages)
+
+
+def test_a_part_that_holds_firing_records_alone_is_kept(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
+) -> None:
+    """As one may that begins after a full disk, of a recording of few streams."""
+    given = Given(recorded, graph, tmp_path / "run.mcap", GO_ON)
+    with Recording(recorded) as recording:
+        records = [r for r in _records(recording) if r.kind in CALLS]
+    for number, record in enumerate(records):
+        if number == len(records) // 2:
+            disk.full = True
+            given.sink.flush()
+            disk.full = False
+            given.sink.flush()
+        given.sink.firings(record.operator, [record], encode_batch([record]))
+    facts = given.sink.close("complete")
+
+    stored = 0
+    for part in facts["parts"]:
+        with Recording(Path(part)) as recording:
+            log = FiringLog.read(recording)
+            stored += sum(r.kind in CALLS for name in log.operators for r in log.of(name))
+    assert stored + facts["lost"]["firings"] == len(records)
+    assert stored >= len(records) // 2
+
+
+def test_a_recording_of_firing_records_alone_is_split(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    options = {"metadata": {}, "compression": "zstd", "overwrite": False, "storage": Storage(Splitting(every=SECOND))}
+    sink = PartsSink(tmp_path / "run.mcap", graph, [], options)
+    with Recording(recorded) as recording:
+        for record in _records(recording):
+            sink.firings(record.operator, [record], encode_batch([record]))
+    facts = sink.close("complete")
+
+    assert len(facts["parts"]) >= 9
+
+
 def test_a_part_without_calls_of_an_operator_is_verified(
     recorded: Path, graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,6 +233,39 @@ def test_a_part_without_calls_of_an_operator_is_verified(
     parts = parts_of(tmp_path / "run.mcap")
     assert len(parts) == 5
     assert [sorted(verdicts(part)) for part in parts] == [["first", "second"]] * 5
+
+
+@pytest.mark.parametrize("first", ["message", "record"])
+def test_nothing_that_follows_a_jump_of_the_clock_is_in_the_part_before(
+    first: str, recorded: Path, graph: Graph, tmp_path: Path
+) -> None:
+    """Stamps that come again belong behind what was given before them, also while the part before is still open."""
+    given = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(every=5 * SECOND)))
+    with Recording(recorded) as recording:
+        messages = [m for m in recording.messages() if m.message.stamp]
+        records = list(_records(recording))
+    begin = messages[0].stamp
+
+    def give(start: float, end: float, life: int) -> None:
+        for found in messages:
+            if start <= (found.stamp - begin) / SECOND < end:
+                calls = [replace(r, incarnation=life) for r in records if r.stamp == found.stamp and r.kind in CALLS]
+                acts = [lambda m=found: given.sink.message(m.stream, m.message, m.seq, life)]
+                acts += [lambda r=r: given.sink.firings(r.operator, [r], encode_batch([r])) for r in calls]
+                for act in acts if first == "message" else reversed(acts):
+                    act()
+
+    give(0, 5.3, 0)
+    give(4.8, 5.3, 1)
+    given.sink.close("complete")
+
+    lives = []
+    for part in parts_of(tmp_path / "run.mcap"):
+        with Recording(part) as recording:
+            log = FiringLog.read(recording)
+            found = {record.incarnation for name in log.operators for record in log.of(name)}
+            lives.append((found, {message.incarnation for message in recording.messages() if message.stamp}))
+    assert lives == [({0}, {0}), ({0, 1}, {0, 1})]
 
 
 def test_the_oldest_parts_are_deleted_and_the_rest_verifies(recorded: Path, graph: Graph, tmp_path: Path) -> None:

@@ -118,3 +118,11 @@ def test_what_is_owed_is_told_at_once_to_who_asks() -> None:
 
     assert one.told == [10, 20]
     assert one.progress.next_due() is None
+
+
+def test_the_time_since_the_last_firing_is_known_while_a_call_does_not_end() -> None:
+    one = Reporting()
+    one.fires(idle=True)
+    one.now += 7.5
+
+    assert one.progress.silences() == {"last": 7.5}

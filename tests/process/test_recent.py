@@ -40,5 +40,46 @@ def test_firings_of_long_ago_are_left_out() -> None:
     assert [r.index for r in kept(call(0, ago=OVER + 1), call(1, ago=OVER - 1), call(2))] == [1, 2]
 
 
+def test_each_answer_begins_behind_the_cursor_and_counts_what_is_no_longer_kept() -> None:
+    recent, cursor, told, missed = RecentFirings(), {}, list[int](), list[int]()
+    for first, end in ((0, 3), (3, 3), (3, 40), (40, KEPT + 60)):
+        for k in range(first, end):
+            recent.add(call(k))
+        answer = recent.after(cursor)
+        cursor = answer["cursor"]
+        told += [r.index for batch in answer["batches"] for r in decode_batch(batch).records]
+        missed.append(answer["missed"])
+
+    assert missed == [0, 0, 0, 20]
+    assert told == [*range(40), *range(60, KEPT + 60)]
+    assert answer["full"] == 1.0
+    assert RecentFirings().after(cursor)["missed"] == 0
+
+
+def test_another_process_in_its_place_is_asked_from_its_beginning() -> None:
+    before, after = RecentFirings(), RecentFirings()
+    after._since = before._since + 1
+    for k in range(50):
+        before.add(call(k))
+    for k in range(KEPT + 5):
+        after.add(call(k))
+    assert before.after({})["missed"] == 0
+
+    answer = after.after(before.after({})["cursor"])
+
+    assert answer["missed"] == 5
+    assert decode_batch(answer["batches"][0]).records[0].index == 5
+
+
+def test_a_failure_is_told_with_the_beginning_of_its_text() -> None:
+    recent = RecentFirings()
+    recent.add(FiringRecord("op", 0, 0, "fire", 0, outcome="error", detail={"error": "e" * 900, "more": 1}))
+
+    (batch,) = recent.after({})["batches"]
+
+    assert decode_batch(batch).records[0].detail == {"error": "e" * 500}
+    assert recent.batches() == []
+
+
 def test_nothing_is_answered_before_the_first_firing() -> None:
     assert kept() == []

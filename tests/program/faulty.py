@@ -43,7 +43,7 @@ while True:
     frames = [read(*struct.unpack("<I", read(4))) for _ in range(count)]
     if kind == 0:
         value = {name: json.loads(text) for name, _, text in (f.decode().partition("=") for f in frames)}["value"]
-        messages()
+        reply(struct.pack("<BI", 0, 0) * (2 if FAULT == "unasked" else 1))
     elif kind == 1 and FAULT == "silent":
         time.sleep(600)
     elif kind == 1 and FAULT in REPLIES:

@@ -143,9 +143,10 @@ def test_a_run_in_processes_verifies_and_a_changed_program_is_named(
 @pytest.mark.parametrize(
     ("fault", "text"),
     [
-        ("text", "no reply: outcome 104"),
-        ("outcome", r"no reply: outcome 7, 0 frames"),
-        ("frames", "no reply: outcome 0, 2147483648 frames"),
+        ("text", r"no reply on standard output, which is for replies alone: b'hello from print\(\)"),
+        ("outcome", r"no reply on standard output, .*x07"),
+        ("frames", r"no reply on standard output, .*x80"),
+        ("unasked", r"before process\(\) at 7 it wrote to its standard output unasked"),
         ("size", "a frame of 2147483648 bytes in the reply"),
         ("half", r"python\S* ended with exit code 3 in process\(\) at 7"),
     ],

@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from example_messages import example
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 
 from dataflow.messages import CameraInfo, Imu, Message, Odometry
 from dataflow.messages.base import is_built_in, message_types
 from dataflow.recording import Recording, RecordingError, RecordingWriter
 from dataflow.recording.streams import access
+from dataflow.recording.streams.foxglove import file_descriptor_set
 
 
 def imu(stamp: int, **fields: object) -> Imu:
@@ -89,6 +91,25 @@ def test_columns_of_many_messages_are_joined_from_batches(tmp_path: Path, monkey
 
     assert np.asarray(found["angular_velocity"])[:, 0].tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
     assert found["temperature"] == [None] * 7 + [1.5]
+
+
+def test_columns_of_another_programs_stream_are_those_of_its_messages(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as out:
+        writer = Writer(out)
+        writer.start()
+        schema = writer.register_schema("foxglove.RawImage", "protobuf", file_descriptor_set(RawImage))
+        channel = writer.register_channel("/grey", "protobuf", schema)
+        for k in range(3):
+            image = RawImage(width=2, height=1, encoding="mono8", step=2, data=bytes([k, k + 1]), frame_id=f"camera{k}")
+            writer.add_message(channel, log_time=k, publish_time=k, data=image.SerializeToString())
+        writer.finish()
+
+    with Recording(path) as recording:
+        found = recording.index("/grey").columns(np.arange(3), ["frame", "data"])
+
+    assert list(found["frame"]) == ["camera0", "camera1", "camera2"]
+    assert np.array(found["data"]).tolist() == [[[0, 1]], [[1, 2]], [[2, 3]]]
 
 
 @pytest.mark.parametrize("damage", [b'{"value":[1],"unit":""}', b'{"value":', b"[1]", b'{"_exact":3}'])

@@ -85,5 +85,5 @@ def test_any_millimetres_take_two_bytes(whole: npt.NDArray[np.uint16]) -> None:
 
 
 def test_another_encoding_is_refused() -> None:
-    with pytest.raises(RecordingError, match="'mono16' is no DepthImage; those known are 32FC1 and 16UC1"):
+    with pytest.raises(RecordingError, match="'mono16' is no DepthImage; those known are 32FC1, 64FC1, 16UC1"):
         decode_depth(RawImage(encoding="mono16", width=1, height=1, data=bytes(2)))

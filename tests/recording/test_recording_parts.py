@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -9,6 +10,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from mcap.data_stream import ReadDataStream
+from mcap.records import Channel
+from mcap.writer import Writer
 
 from dataflow.editing.merge import merge
 from dataflow.editing.split import split
@@ -17,6 +21,7 @@ from dataflow.messages import Pose
 from dataflow.recording import Recording, RecordingError, RecordingWriter, describe
 from dataflow.recording.mcap.attachments import Attachment
 from dataflow.recording.mcap.contents import Entries
+from dataflow.recording.parts import Splitting, Storage
 from dataflow.recording.streams.copying import Origin
 from dataflow.recording.streams.part_folder import _JoinedIndex, parts_in
 from dataflow.records.reading import FiringLog, whole
@@ -125,24 +130,42 @@ def test_a_missing_part_is_named(folder: Path, tmp_path: Path) -> None:
         Recording(there)
 
 
-@pytest.mark.parametrize("kept", [0, 8, 53, 200])
-def test_a_part_that_its_writer_died_as_it_began_is_passed_over(folder: Path, tmp_path: Path, kept: int) -> None:
+@pytest.mark.parametrize("kept", [0, 8, 53, 200, None])
+def test_a_part_that_its_writer_died_as_it_began_is_passed_over(folder: Path, tmp_path: Path, kept: int | None) -> None:
+    """None: a full disk took its header and its end."""
     shutil.copytree(folder, tmp_path / "parts")
     parts = parts_in(tmp_path / "parts")
     begun = parts[-1].with_name(parts[-1].name.replace(f"_{len(parts) - 1:03}", f"_{len(parts):03}"))
-    begun.write_bytes(parts[-1].read_bytes()[:kept])
+    if kept is None:
+        writer = Writer(str(begun))
+        writer.start()
+        writer.finish()
+    else:
+        begun.write_bytes(parts[-1].read_bytes()[:kept])
 
     with Recording(folder) as expected, Recording(tmp_path / "parts") as recording:
         assert recording.digests() == expected.digests()
         assert recording.torn
         assert any(begun.name in note and "holds nothing" in note for note in recording.damage)
-    if kept:
+    if kept != 0:
         with ExitStack() as stack:
             origins = [stack.enter_context(Origin(part)) for part in parts_in(tmp_path / "parts")]
             done = merge(origins, tmp_path / "whole.mcap")
         assert any(begun.name in note and "holds nothing" in note for note in done.notes)
         with Recording(KEPT) as expected, Recording(tmp_path / "whole.mcap") as recording:
             assert recording.digests() == expected.digests()
+
+
+def test_what_a_file_declares_is_parsed_once_however_often_it_is_opened(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(stream: ReadDataStream) -> Channel:
+        raise AssertionError("a channel is parsed again")
+
+    with Recording(folder) as expected:
+        monkeypatch.setattr(Channel, "read", staticmethod(refused))
+        with Recording(folder) as recording:
+            assert recording.streams == expected.streams
 
 
 def test_parts_without_what_they_share_follow_each_other(tmp_path: Path, pose: Callable[..., Pose]) -> None:
@@ -162,3 +185,9 @@ def test_parts_without_what_they_share_follow_each_other(tmp_path: Path, pose: C
         assert recording.metadata["note"] == {"part": "2"}
     (tmp_path / "b.mcap").write_bytes(b"")
     assert parts_in(tmp_path) == []
+
+
+def test_the_storage_that_another_process_is_told_is_the_same() -> None:
+    storage = Storage(Splitting(size=1000, every=60_000_000_000), keep=10**6, on_failure="end", mode=0o640)
+
+    assert Storage.from_json(json.loads(json.dumps(storage.to_json()))) == storage

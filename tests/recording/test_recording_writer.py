@@ -20,6 +20,7 @@ from mcap.reader import make_reader
 from dataflow.messages import Image, Pose
 from dataflow.recording import Recording, RecordingError, RecordingWriter
 from dataflow.recording.mcap import container
+from dataflow.recording.streams.codecs import SchemaText
 
 WRITE_UNTIL_KILLED = """
 import sys, numpy as np
@@ -462,3 +463,17 @@ def test_the_index_of_a_long_run_takes_no_more_memory_than_its_bytes(tmp_path: P
         after, _ = tracemalloc.get_traced_memory()
         tracemalloc.stop()
     assert (after - before) / 200 < 2 * (len(streams) * 10 + 100)  # an entry of the index: 10 bytes a channel, and more
+
+
+def test_a_topic_without_a_schema_is_kept_without_one(tmp_path: Path) -> None:
+    path = tmp_path / "kept.mcap"
+    with RecordingWriter(path, metadata={}) as writer:
+        writer.add_untouched("/raw", "x-bytes", SchemaText("", "", b""), {})
+        writer.add_untouched("/typed", "json", SchemaText("other.Type", "jsonschema", b"{}"), {})
+        writer.write_untouched("/raw", 5, b"as it was")
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        ((schema, channel, message),) = reader.iter_messages(["/raw"])
+
+    assert schema is None
+    assert (channel.schema_id, channel.message_encoding, message.data) == (0, "x-bytes", b"as it was")

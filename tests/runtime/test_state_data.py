@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Number, Odometry
 from dataflow.operator import KEPT, In, Operator, Out, Param, Remembered
-from dataflow.state import Counts, StateError, plain, state_hints, take_over, typed
+from dataflow.state import Counts, StateError, of_another_version, plain, state_hints, take_over, typed
 
 V = TypeVar("V")
 
@@ -247,13 +247,13 @@ def test_states_of_two_operators_share_nothing() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"kind": ...}, "snapshot of another version: State lacks kind and has nothing besides"),
-        ({"older": 1}, "snapshot of another version: State lacks nothing and has older besides"),
+        ({"kind": ...}, "snapshot of another version: the state of State has no kind, which the class has now"),
+        ({"older": 1}, "snapshot of another version: the state of State has older, which the class has no more"),
         ({"raw": 3}, "State.raw: expected a bytes, got a int"),
         ({"spare": [1.0, "x"]}, r"State.spare\[1\]: expected a float, got a str"),
-        ({"tracks": [[1, {"id": 1}]]}, r"State.tracks\[1\] \(Track\) lacks label, mean, mode"),
+        ({"tracks": [[1, {"id": 1}]]}, r"the state of State.tracks\[1\] \(Track\) has no label, mean, mode"),
         ({"last": {"schema": "Nothing"}}, "unknown message schema"),
-        ({"windows": [["left", {}]]}, "snapshot of another version: Window lacks values"),
+        ({"windows": [["left", {}]]}, "snapshot of another version: the state of Window has no values"),
         ({"windows": {"left": {}}}, "snapshot of another version: State.windows: expected a list"),
     ],
 )
@@ -355,3 +355,17 @@ def test_one_of_several_dataclasses_is_found_by_its_fields() -> None:
     back = typed(Place | Kept[int] | Track, unpack_state(pack_state(plain(Track(1, np.zeros(3))))))
 
     assert isinstance(back, Track)
+
+
+def test_a_state_of_another_version_is_taken_over_as_far_as_there_are_defaults() -> None:
+    snapshot = plain(filled())
+    former = {name: value for name, value in snapshot.items() if name not in ("kind", "spare")} | {"older": 1}
+    operator = Averager()
+
+    with of_another_version():
+        operator.restore(former)
+    assert pack_state(plain(operator.state)) == pack_state({**snapshot, "kind": "a", "spare": []})
+    with of_another_version(), pytest.raises(StateError, match=r"\(Track\) has no mean, which the class has now"):
+        operator.restore({**snapshot, "tracks": [[1, {"id": 1}]]})
+    with pytest.raises(StateError, match="has no kind, spare, which the class has now; it has older, which"):
+        operator.restore(former)

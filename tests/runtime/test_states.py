@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dataflow.execution.judge import Judge
 from dataflow.execution.snapshots import differing_fields, pack_state, unpack_state
+from dataflow.records.firing import FiringRecord
 from dataflow.state import StateError
 
 arrays = hnp.arrays(
@@ -123,3 +125,23 @@ def test_what_two_states_differ_in_is_said(recorded: Any, here: Any, words: str)
     packed = [b"" if state is None else pack_state(state) for state in (recorded, here)]
 
     assert differing_fields(packed[0], packed[1]) == words
+
+
+@pytest.mark.parametrize(
+    ("recorded", "here", "alike"),
+    [
+        ({"a": 1}, {"a": 1, "b": 2}, True),
+        ({"a": [{"c": np.ones(2), "gone": 1}]}, {"a": [{"c": np.ones(2), "new": 2}]}, True),
+        ({"a": 1}, {"a": 2, "b": 2}, False),
+        ({"a": [{"c": 1}]}, {"a": [{"c": 1}, {"c": 1}], "b": 2}, False),
+        ({"a": {"schema": "Pose", "b": 1}}, {"a": {"schema": "Pose", "c": 1}}, False),
+    ],
+)
+def test_states_of_changed_code_are_compared_in_the_fields_of_both(recorded: Any, here: Any, alike: bool) -> None:
+    record = FiringRecord("op", 0, 3, "snapshot", 5, detail={"state": pack_state(recorded)})
+
+    for changed in ({"robot": "before"}, {}):
+        judge = Judge("op", (), {})
+        judge.code(changed, {"robot": "now"})
+        judge.state(record, pack_state(here))
+        assert (judge.result.differing == 0) == (alike and bool(changed))

@@ -126,6 +126,31 @@ def test_names_of_modules_and_classes(name: str, module: str, kind: str) -> None
 GRAPH = "graph: patrol\noperators:\n  camera: {use: operators.sources:SyntheticRgbd}\n"
 
 
+def test_the_services_of_a_graph_over_two_machines_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("laptop", "robot"):
+        Path(name).mkdir()
+        for file in ("authority.pem", "certificate.pem", "key.pem"):
+            Path(name, file).write_text("made elsewhere")
+    two = GRAPH.replace("SyntheticRgbd}", "SyntheticRgbd, machine: robot}")
+    Path("patrol.yaml").write_text(two)
+    given = ("--listen", "tls/192.168.1.2:7447", "--keys", "laptop")
+
+    assert "operators run on robot: --listen says where" in call("new", "service", "patrol.yaml", code=2).stderr
+    call("new", "service", "patrol.yaml", *given)
+    call("new", "agent", "robot", "--connect", "tls/192.168.1.2:7447", "--keys", "robot", "--user", "root")
+
+    unit = Path("patrol.service").read_text()
+    assert f"--listen tls/192.168.1.2:7447 --keys {tmp_path}/laptop --record" in unit
+    joins = Path("dataflow-robot.service").read_text()
+    assert (
+        f"join robot --connect tls/192.168.1.2:7447 --keys {tmp_path}/robot --folder {tmp_path}/dataflow-agent" in joins
+    )
+    assert "tmpfiles" not in joins
+    wrong = call("new", "agent", "robot", "--connect", "tcp/x:1", "--keys", "robot", code=2).stderr
+    assert "expected tls/<address>:<port>" in wrong
+
+
 @pytest.mark.parametrize("flight", [False, True])
 def test_a_service_is_a_unit_that_systemd_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flight: bool) -> None:
     folder = tmp_path / "my robot 100%"

@@ -6,9 +6,10 @@ import os
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, ModuleType, SimpleNamespace
 
 import pytest
 
@@ -119,6 +120,17 @@ def test_nothing_reads_the_clock_past_the_simulation() -> None:
     for module in names:
         bound = [name for name, thing in vars(sys.modules[module]).items() if callable(thing) and thing in real]
         assert not bound, f"{module} binds {bound}"
+        functions = [thing for thing in _functions(sys.modules[module]) if thing.__module__ == module]
+        defaults = {f.__qualname__: [*(f.__defaults__ or ()), *(f.__kwdefaults__ or {}).values()] for f in functions}
+        given = [name for name, values in defaults.items() if any(value is each for value in values for each in real)]
+        assert not given, f"{module} has the real clock as a default of {given}"
+
+
+def _functions(module: ModuleType) -> Iterator[FunctionType]:
+    """The functions of a module, and those of its classes."""
+    for thing in vars(module).values():
+        inner = vars(thing).values() if isinstance(thing, type) else (thing,)
+        yield from (function for function in inner if isinstance(function, FunctionType))
 
 
 # Runs
@@ -407,7 +419,7 @@ def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     streams, files = {"robot/nothing/out": (5, "")}, {"@recorder": {"kept": [], "not_kept": 0}}
     report = RunReport("robot", streams, {}, {}, {}, {}, files, 0, 1, 0.0, interrupted=False, notes=())
     with pytest.raises(Violation, match="of 5 messages of robot/nothing/out 0 are stored"):
-        check_losses_of_files(report, RUN)
+        check_losses_of_files(report, RUN, streams)
     monkeypatch.setattr("simulation.check.complete", lambda *_, **__: SimpleNamespace(whole=True))
     with pytest.raises(Violation, match="lacks messages of robot/nothing/out"):
         checks._check_completion(RUN, RUN, PLAIN.load(), report)

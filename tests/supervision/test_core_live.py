@@ -11,6 +11,7 @@ from plays import LEFT, STEP, Play, asked_where, killed, sent, spawned
 from dataflow.chaos.plan import Fault
 from dataflow.recording.parts import Storage
 from dataflow.records.firing import Emission, FiringRecord
+from dataflow.supervision.core.closing import SHORTEST
 from dataflow.supervision.core.commands import Send, Signal, Spawn
 from dataflow.supervision.core.events import Begin, ClockMeasured, Died, LinkChanged, NotReading, Said, Tick
 from dataflow.sync import FOREVER
@@ -475,6 +476,17 @@ def test_news_of_processes_that_ended_crosses_other_news_without_harm() -> None:
     play.tell(Died("smooth", -9), play.progress("smooth", {"smooth": FOREVER}), play.ended("smooth"), Tick())
 
     assert play.over is None
+
+
+def test_a_run_that_is_stopped_while_a_machine_is_out_of_reach_waits_shortly_and_names_it() -> None:
+    play = Play(LEFT, SUM, live=True).starts()
+    play.tell(LinkChanged("robot", ("sum",), up=False))
+    play.deaf.add("sum")
+    play.stops()
+    play.tell(play.ended("left"))
+    play.wait(4 * SHORTEST)
+
+    assert f"not everything was drained within {SHORTEST:g} s: machine 'robot' is out of reach" in play.failure()
 
 
 def test_processes_behind_a_link_that_is_down_are_neither_silent_nor_started_again() -> None:

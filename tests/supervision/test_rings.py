@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from dataflow.graph import load_text
+from dataflow.graph import Graph, load_text
 from dataflow.process.descriptors import Descriptors, take_descriptors
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.plan import RunPlan, process_plans
@@ -59,6 +60,22 @@ def test_a_process_sends_to_the_recorder_first_so_that_what_others_took_is_recor
 def test_one_process_needs_no_link() -> None:
     made = plan(placement="one_process")
     assert pairs_of(made.graph, process_plans(made)) == {}
+
+
+def test_what_all_processes_are_told_is_found_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a hundred processes, all links would be looked for two hundred times."""
+    asked = Counter[str]()
+
+    def counted(name: str, function: Any) -> Any:
+        return lambda *args: (asked.update([name]), function(*args))[1]
+
+    monkeypatch.setattr(Graph, "to_json", counted("graph", Graph.to_json))
+    monkeypatch.setattr("dataflow.supervision.configs.pairs_of", counted("links", pairs_of))
+    made = plan(record=Path("run.mcap"))
+    processes = process_plans(made)
+    configurations(made, processes, dict.fromkeys(processes, "unixsock-stream//nowhere"))
+
+    assert asked == {"graph": 1, "links": 1}
 
 
 @contextmanager

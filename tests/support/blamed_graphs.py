@@ -19,6 +19,8 @@ from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
 
 STEPS, SLOW, WINDOW, HALF = 60, 6, 3, 60.0
 LOW, HIGH = 31.0, 95.0
+LARGE = 33.0
+"""Of what `Scale` gives: that of `HALF`."""
 SENSORS = ("a", "b", "c", "d")
 STAMP, STEP = 10**18, 100_000_000
 Sensed = tuple[str, int]
@@ -164,9 +166,10 @@ class Either(Operator):
     x: In[FeatureVector]
     y: In[FeatureVector]
     out: Out[FeatureVector]
+    at: float = Param(HALF, doc="the least that is large")
 
     def process(self, x: FeatureVector, y: FeatureVector) -> FeatureVector:
-        return vector(x.stamp, float(number(x) >= HALF or number(y) >= HALF))
+        return vector(x.stamp, float(number(x) >= self.at or number(y) >= self.at))
 
 
 class Mean(Operator):

@@ -25,10 +25,23 @@ class Robot:
 
 
 def join(name: str, connect: str, folder: Path, *words: str, code: Path = HERE) -> subprocess.Popen[str]:
-    """Starts an agent, which finds operators in `code`."""
+    """Starts an agent, which finds operators in `code`; it is given relative paths, as users give them."""
+    given = [os.path.relpath(word, folder.parent) if os.path.isabs(word) else word for word in words]
     return subprocess.Popen(
-        [sys.executable, "-m", "dataflow.cli.main", "join", name, "--connect", connect, "--folder", folder, *words],
+        [
+            sys.executable,
+            "-m",
+            "dataflow.cli.main",
+            "join",
+            name,
+            "--connect",
+            connect,
+            "--folder",
+            folder.name,
+            *given,
+        ],
         env={**os.environ, "PYTHONPATH": str(code)},
+        cwd=folder.parent,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -140,10 +140,11 @@ def test_a_stream_that_ended_opens_again_when_its_source_restarts() -> None:
     push(aligner, "b", 9)
     assert stamps(poll_all(aligner)) == [5, 9]
     aligner.push("a", Entry(7, seq=0, incarnation=1))
+    aligner.push("b", Entry(11, seq=1))
+    assert stamps(poll_all(aligner)) == []  # it is waited for again
     aligner.push("a", Entry(12, seq=1, incarnation=1))
-    push_b = Entry(12, seq=1)
-    aligner.push("b", push_b)
-    assert stamps(poll_all(aligner)) == [12]
+    aligner.push("b", Entry(12, seq=2))
+    assert stamps(poll_all(aligner)) == [11, 12]
     assert aligner.drops == {("a", "late"): 1}
     assert "a" not in aligner.ends
 

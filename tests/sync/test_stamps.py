@@ -54,6 +54,7 @@ def test_formatted_durations_parse_back(duration: int) -> None:
 def test_stamps_are_shown_with_all_nine_decimals() -> None:
     assert format_stamp(1_700_000_000_123_456_789) == "2023-11-14T22:13:20.123456789Z"
     assert format_stamp(1_500_000_000) == "1.500000000s"
+    assert format_stamp(86_400 * 10**9) == "86400.000000000s"  # a clock that began with the machine
     assert format_stamp(-1) == "-0.000000001s"
     assert (format_stamp(NEVER), format_stamp(FOREVER)) == ("never", "forever")
 

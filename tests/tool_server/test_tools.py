@@ -185,6 +185,23 @@ def test_a_proven_fix(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> 
     assert only["other_operators"] == {"identical": ["sine"]}
 
 
+def test_a_fix_that_raises_in_later_calls_is_not_proven(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def mended(operator: Any, k: float, kind: int) -> list[float]:
+        return _added(operator.state, k) if k < 690 else [1 / 0]
+
+    monkeypatch.setattr("zoo.bugs.Skips.work", mended)
+    arguments = {"operator": "sum", "call": str(SKIPPED), "expect": "out.out.vectors[0, 0] == 188_191"}
+
+    told = ask("prove", bugs["wrong"], **arguments)
+
+    assert not told["proven"]
+    [reason] = told["reasons"]
+    assert reason.startswith("calls raise what is not recorded: {690: 'ZeroDivisionError: division by zero'")
+    assert ask("prove", bugs["wrong"], **arguments, may_change="error is None or number > 600")["proven"]
+    with pytest.raises(ToolError, match="expect='True' names nothing of the call"):
+        ask("prove", bugs["wrong"], **arguments | {"expect": "True"})
+
+
 @pytest.mark.long
 def test_a_fix_makes_all_that_is_recorded_of_right_code(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = {"operator": "sum", "call": str(SKIPPED), "expect": "True", "right": bugs["right"]}

@@ -24,6 +24,7 @@ from dataflow.cli.support.arguments import (
 from dataflow.cli.support.output import count, err, fail, friendly_errors, out, plural, print_json, seconds, table
 
 if TYPE_CHECKING:
+    from dataflow.blame.field import Field
     from dataflow.blame.links import Chain, Effect, Link
     from dataflow.drops.search import Cost
     from dataflow.graph import Graph
@@ -82,8 +83,9 @@ def blame(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        loaded = begin_again(recording, graph, settings, path)
-        chain, begin = _found(recording, field, loaded, budget, tolerance)
+        asked = _field(field)
+        loaded = begin_again(recording, graph, settings, path, stream=asked.stream)
+        chain, begin = _found(recording, asked, loaded, budget, tolerance)
     if json:
         print_json(chain.as_json())
     else:
@@ -167,15 +169,19 @@ def _print_cost(cost: Cost, worse: str, begin: int) -> None:
     out.print(Text(text), soft_wrap=True)
 
 
-def _found(recording: Path, text: str, graph: Graph | None, budget: float, tolerance: float) -> tuple[Chain, int]:
-    from dataflow.blame.chain import Blame
+def _field(text: str) -> Field:
     from dataflow.blame.field import Field
-    from dataflow.recording import Recording
 
     try:
-        field = Field.parse(text)
+        return Field.parse(text)
     except ValueError as error:
         raise fail(f"--field {error}") from None
+
+
+def _found(recording: Path, field: Field, graph: Graph | None, budget: float, tolerance: float) -> tuple[Chain, int]:
+    from dataflow.blame.chain import Blame
+    from dataflow.recording import Recording
+
     with Recording(recording) as opened, progress() as show:
 
         def watch(made: int, links: int) -> None:

@@ -30,8 +30,6 @@ from dataflow.cli.support.run_options import LiveEffects
 
 EDITOR_COMES = 3600.0
 """Seconds that --dap waits for an editor."""
-MOST_BYTES = 1_000_000
-"""Of a captured call, which is to lie beside tests under version control."""
 
 ViewTarget = Annotated[
     str | None,
@@ -154,7 +152,7 @@ def capture(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        loaded = begin_again(recording, graph, settings, path)
+        loaded = begin_again(recording, graph, settings, path, operator)
         words = [] if graph is None else ["--graph", str(graph)]
         words += [word for setting in settings or () for word in ("--set", setting)]
         words += [word for folder in path or () for word in ("--path", str(folder))]
@@ -174,8 +172,8 @@ def _capture(
     json: bool,
 ) -> None:
     """`options`: further words of the command, for the test."""
+    from dataflow.capture.capture import LARGE, write_test
     from dataflow.capture.capture import capture as captured
-    from dataflow.capture.capture import write_test
     from dataflow.debugging.debugger import Debugger
     from dataflow.recording import Recording
 
@@ -202,8 +200,8 @@ def _capture(
     out.print(Text(f"{plural(found.left, 'call')} of {found.calls} kept, begun with {found.begins}"), soft_wrap=True)
     beside = f"{path.with_suffix('.capture').name} ({size(nbytes)})"
     out.print(Text(f"wrote {path} and {beside}: pytest {path}"), soft_wrap=True)
-    if nbytes > MOST_BYTES:
-        out.print(Text(f"its inputs are large: more than {size(MOST_BYTES)}", style="yellow"))
+    if nbytes > LARGE:
+        out.print(Text(f"its inputs are large: more than {size(LARGE)}", style="yellow"))
 
 
 def _debug(

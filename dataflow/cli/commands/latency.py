@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
 from rich.text import Text
 
 from dataflow.cli.support.arguments import (
     Json,
     ModuleFolders,
-    Overwrite,
     RecordingFile,
     existing,
     find_modules_in,
-    output_file,
 )
 from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
 
@@ -26,11 +22,6 @@ if TYPE_CHECKING:
 def latency(
     recording: RecordingFile,
     folders: ModuleFolders = None,
-    spans: Annotated[
-        Path | None,
-        typer.Option("--spans", metavar="FILE.jsonl", help="Write every firing as a span of OpenTelemetry, too."),
-    ] = None,
-    overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Print the latency of every path of a recorded run, from source to sink.
@@ -38,17 +29,14 @@ def latency(
     The time runs from the moment a source gave a message to the end of the sink's firing that the message caused. It is
     computed from the firing records, so every recorded run has it: of a live run the latencies of that run, of a run as
     fast as the graph goes those under full load. "costs most" names the operator with the largest share: its own calls
-    and the time that messages waited in front of it. A file of spans is what a collector of OpenTelemetry reads by its
-    receiver `otlpjsonfile`; each message of a source begins a trace.
+    and the time that messages waited in front of it. `dataflow spans` gives the calls themselves.
 
     Examples:
 
       dataflow latency run.mcap
       dataflow latency run.mcap --json
-      dataflow latency run.mcap --spans run.jsonl
     """
     from dataflow.analysis.latency import latencies, records_of
-    from dataflow.analysis.spans import Spans
     from dataflow.recording import Recording
     from dataflow.reexecution.recorded_run import recorded_graph, resolved_graph
 
@@ -61,9 +49,6 @@ def latency(
             )
         graph = resolved_graph(opened) or recorded_graph(opened)
         records = records_of(opened, graph)
-        if spans is not None:
-            with output_file(spans, ".jsonl", overwrite=overwrite, option="--spans").open("w") as file:
-                file.writelines(f"{line}\n" for line in Spans(graph).lines(records))
         found = latencies(graph, records)
     if not found:
         raise fail(f"{recording}: no firing of a sink is recorded that a source's message caused")

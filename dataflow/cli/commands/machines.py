@@ -10,14 +10,15 @@ import typer
 from dataflow.cli.support.arguments import FLAG, ModuleFolders, find_modules_in
 from dataflow.cli.support.output import fail, friendly_errors, say
 
+Connect = Annotated[
+    str, typer.Option("--connect", metavar="ENDPOINT", help="Where the run listens (`dataflow run --listen`).")
+]
 Authority = Annotated[Path, typer.Option("--authority", metavar="FOLDER", help="The folder of `dataflow keys new`.")]
 
 
 def join(
     name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name in graphs (`machine:`).")],
-    connect: Annotated[
-        str, typer.Option("--connect", metavar="ENDPOINT", help="Where the run listens (`dataflow run --listen`).")
-    ],
+    connect: Connect,
     keys: Annotated[Path | None, typer.Option("--keys", metavar="FOLDER", help="This machine's keys.")] = None,
     folder: Annotated[
         Path, typer.Option("--folder", metavar="FOLDER", help="Where operators run, and files that are sent lie.")
@@ -41,10 +42,13 @@ def join(
     """
     import signal
 
+    from dataflow.machines.keys import require_machine
     from dataflow.supervision.agent import Agent
 
     find_modules_in(path)
     with friendly_errors():
+        if keys is not None:
+            require_machine(keys, name)
         agent = Agent(name, connect, keys, folder, say, patience=timeout)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: agent.stop())
@@ -85,8 +89,11 @@ def add(
       dataflow keys add robot --authority authority
       dataflow keys add my_tools --authority authority --tools
     """
+    from dataflow.graph.keys import NAME_RULE, name_fault
     from dataflow.machines.keys import TOOLS, issue
 
+    if fault := name_fault(name):
+        raise fail(f"machine name {fault}: {NAME_RULE}")
     if tools and serves:
         raise fail("--tools and --serves exclude each other: tools only connect")
     folder = out or Path(name)

@@ -1,4 +1,4 @@
-"""`dataflow new operator`, `new graph`, `new project`, `new service`."""
+"""`dataflow new operator`, `new graph`, `new project`, `new service`, `new agent`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from typing import Annotated, TypeVar
 import typer
 from rich.text import Text
 
+from dataflow.cli.commands.machines import Connect
 from dataflow.cli.support.arguments import GraphFile, Json, find_modules_in
 from dataflow.cli.support.output import fail, out, print_json
+from dataflow.cli.support.run_options import Keys, Listen, machines_of
 
 HERE = Path()
 Made = TypeVar("Made")
+User = Annotated[str | None, typer.Option("--user", metavar="USER", help="Who runs it; by default you.")]
 To = Annotated[
     Path, typer.Option("--to", "--out", "-o", metavar="DIR", help="The folder to write into; made where it is missing.")
 ]
@@ -104,25 +107,29 @@ def service(
     name: Annotated[
         str | None, typer.Option("--name", metavar="NAME", help="Of the service; by default that of the graph.")
     ] = None,
-    user: Annotated[str | None, typer.Option("--user", metavar="USER", help="Who runs it; by default you.")] = None,
+    user: User = None,
     keep_disk: Annotated[
         str, typer.Option("--keep-disk", metavar="SIZE", help="Bytes of recordings that a run keeps.")
     ] = "20GB",
     days: Annotated[
         int, typer.Option("--days", metavar="N", help="Days after which recordings are deleted.", min=1)
     ] = 14,
+    listen: Listen = None,
+    keys: Keys = None,
     to: To = HERE,
     json: Json = False,
 ) -> None:
     """Write a systemd unit that runs a graph live from the start of the machine, in this folder and installation.
 
     A graph with a flight recorder keeps what that keeps; any other is recorded into out/, in files of ten minutes, the
-    oldest of which are deleted beyond `--keep-disk`. The second file deletes the recordings of earlier runs.
+    oldest of which are deleted beyond `--keep-disk`. The second file deletes the recordings of earlier runs. A graph
+    over several machines needs `--listen` and `--keys`; `dataflow new agent` writes the unit of the others.
 
     Examples:
 
       dataflow new service robot.yaml
       dataflow new service robot.yaml --user robot --keep-disk 50GB --to deploy
+      dataflow new service robot.yaml --listen tls/192.168.1.2:7447 --keys laptop
     """
     import getpass
     import sys
@@ -136,14 +143,54 @@ def service(
     find_modules_in(None)
     with friendly_errors():
         loaded = load_graph(file, live=True)
+        machines_of(loaded, listen, keys, here=False)
+    away = sorted({node.machine for node in loaded.nodes.values() if node.machine is not None})
+    if away and listen is None:
+        raise fail(f"operators run on {', '.join(away)}: --listen says where they join, --keys with which keys")
     flight, folder = loaded.record.flight, Path.cwd()
     command = [str(Path(sys.executable).with_name("dataflow")), "run", str(file.resolve()), "--live", "--quiet"]
+    command += [] if listen is None else ["--listen", listen]
+    command += [] if keys is None else ["--keys", str(keys.resolve())]
     if flight is None:
         command += ["--record", "out/{time}.mcap", "--split-every", "10min", "--keep-disk", keep_disk]
     kept = folder / (flight.folder if flight is not None else "out")
     wanted, who = name or loaded.name, user or getpass.getuser()
     files = _named(lambda: service_files(wanted, command, folder=folder, out=kept, user=who, days=days))
     hints = (f"check it: systemd-analyze verify {_shown(to / f'{wanted}.service')}", "install it as its head describes")
+    _write({to / made: text for made, text in files.items()}, hints, json=json)
+
+
+def agent(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name in graphs (`machine:`).")],
+    connect: Connect,
+    keys: Annotated[Path, typer.Option("--keys", metavar="FOLDER", help="This machine's keys.")],
+    user: User = None,
+    to: To = HERE,
+    json: Json = False,
+) -> None:
+    """Write a systemd unit by which this machine joins runs from its start on, in this folder and installation.
+
+    Operators run in the folder dataflow-agent below this one.
+
+    Examples:
+
+      dataflow new agent robot --connect tls/192.168.1.2:7447 --keys robot
+    """
+    import getpass
+    import sys
+
+    from dataflow.cli.support.output import friendly_errors
+    from dataflow.machines.keys import require_machine, settings
+    from dataflow.scaffold.files import agent_files
+
+    with friendly_errors():
+        settings(keys, connect)
+        require_machine(keys, name)
+    command = [str(Path(sys.executable).with_name("dataflow")), "join", name, "--connect", connect]
+    command += ["--keys", str(keys.resolve()), "--folder", str(Path("dataflow-agent").resolve())]
+    files = _named(lambda: agent_files(name, command, folder=Path.cwd(), user=user or getpass.getuser()))
+    unit = to / f"dataflow-{name}.service"
+    hints = (f"check it: systemd-analyze verify {_shown(unit)}", "install it as its head describes")
     _write({to / made: text for made, text in files.items()}, hints, json=json)
 
 

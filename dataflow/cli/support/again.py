@@ -14,7 +14,6 @@ from dataflow.cli.support.output import fail, out
 if TYPE_CHECKING:
     from dataflow.environments import Environment
     from dataflow.graph import Graph
-    from dataflow.recording import Recording
 
 
 def begin_again(
@@ -23,10 +22,13 @@ def begin_again(
     settings: Sequence[str] | None,
     folders: Sequence[Path] | None,
     operator: str = "",
+    *,
+    stream: str = "",
 ) -> Graph | None:
     """Makes operators importable, and this process one like those of the run; returns the graph that `--graph` names.
 
-    `operator`: the one whose calls are made, in its environment where it has one (`env:`).
+    `operator`: the one whose calls are made, in its environment where it has one (`env:`); `stream`: what is asked for,
+    which is made by operators of one environment.
 
     Raises `GraphError`, `EnvError`, `ReplayError`, and ends the command where `--set` has no graph file to change.
     """
@@ -38,24 +40,15 @@ def begin_again(
 
     with Recording(recording) as opened:
         recorded = resolved_graph(opened)
-        env = None if recorded is None else _env_of(opened, recorded, operator)
+        env = None
+        if recorded is not None and any(node.env for node in recorded.nodes.values()):
+            from dataflow.verification.places import env_of_calls, env_of_chain
+
+            env = env_of_chain(recorded, stream) if stream else env_of_calls(opened, recorded, operator)
     take_environment(1 if recorded is None else recorded.threads, env)
     from dataflow.graph import load_graph
 
     return None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-
-
-def _env_of(recording: Recording, graph: Graph, operator: str) -> Environment | None:
-    """The environment of an operator and of those that are repeated for its calls."""
-    names = [n for n, node in graph.nodes.items() if n == operator or (operator and n.endswith(f"/{operator}"))]
-    if not any(graph.nodes[name].env for name in names):
-        return None
-    from dataflow.environments import environment_of
-    from dataflow.reexecution.engine import plan_feeding
-    from dataflow.verification.choice import env_of
-
-    env = env_of(graph, plan_feeding(recording, graph, names).operators, recording.streams.keys())
-    return None if env is None else environment_of(env)
 
 
 def take_environment(threads: int, env: Environment | None = None) -> None:

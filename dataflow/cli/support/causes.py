@@ -8,12 +8,40 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from dataflow.causes.sources import SOURCES, kind_of
-from dataflow.causes.why import Why
+from dataflow.causes.sources import (
+    ENTROPY,
+    FILE,
+    FOLDER,
+    HEAP,
+    IDENTITY,
+    MONOTONIC,
+    NUMPY,
+    PROCESS,
+    RANDOM,
+    SOURCES,
+    THREADS,
+    UUID,
+    WALL,
+    kind_of,
+)
+from dataflow.causes.why import Cause, Why
 from dataflow.cli.support.output import count, plural, seconds, table
 
 OUTSIDE = "files that C libraries read, files that are gone, devices, services"
 """Sources that --why does not see."""
+_READS = {
+    WALL: "reads the wall clock",
+    MONOTONIC: "reads the monotonic clock",
+    ENTROPY: "reads the entropy of the system",
+    PROCESS: "reads the number of its process",
+    RANDOM: "draws from a generator that nothing seeded",
+    NUMPY: "draws from a generator of numpy that nothing seeded",
+    UUID: "makes random identifiers",
+    IDENTITY: "calls id()",
+    THREADS: "starts threads",
+    HEAP: "takes fresh memory",
+}
+"""What an operator does with a source of chance."""
 
 
 def as_recorded(*, code_known: bool) -> str:
@@ -51,19 +79,34 @@ def _lines(found: Why) -> Iterator[str]:
     if found.refused:
         yield f"{found.operator}: no cause looked for: {found.refused}"
         return
+    if not found.causes and not found.changed:
+        for read in found.reads:
+            tried = f"no effect seen in {plural(found.reruns, 're-run')}"
+            yield f"{found.operator}: {_READS.get(read.kind, f'reads {read.kind}')} at {_lines_of(read)}; {tried}"
     yield f"{found.operator}: {_outcome(found)} ({plural(found.reruns, 're-run')}, {seconds(found.seconds)})"
-    if found.older:
-        yield f"{found.operator}: it depends on what was not changed since the recording: {', '.join(found.older)}"
+    if found.repeats:
+        for fact in found.changed:
+            yield f"{found.operator}: not as it was recorded: {fact}"
+    for cause in found.also:
+        yield f"{found.operator}: its results also depend on {_also(cause)}"
     for group in found.open:
         yield f"{found.operator}: not tried by itself, re-runs were used up: {_list(group)}"
     for source, reason in (found.left_out or {}).items():
         yield f"{found.operator}: not tried: {source}: {reason}"
-    if found.repeats:
-        for fact in found.changed:
-            yield f"{found.operator}: not as it was recorded: {fact}"
+
+
+def _also(cause: Cause) -> str:
+    where = f" ({_lines_of(cause)})" if cause.sites else ""
+    return f"{cause.what}{where}, {'older than' if cause.kind in (FILE, FOLDER) else 'not known for'} the recording"
+
+
+def _lines_of(cause: Cause) -> str:
+    return ", ".join(f"{Path(site.file).name}:{site.line}" for site in cause.sites)
 
 
 def _outcome(found: Why) -> str:
+    if found.repeats and found.changed and found.causes:
+        return "it repeats here; besides the causes above, this is not as it was recorded"
     if found.causes:
         return "each cause shown by its effect: with it alone free or changed, the results differ"
     if found.repeats and found.changed:
@@ -72,7 +115,8 @@ def _outcome(found: Why) -> str:
         return f"it repeats here, and {as_recorded(code_known=found.code_known)} ({OUTSIDE})"
     if found.settled is False:
         return "it does not repeat even with all known sources of chance fixed (a device, a service, a thread?)"
-    return "with all known sources of chance fixed it repeats, and with each of them free, too"
+    freed = "those that were tried" if found.open else "each of them"
+    return f"with all known sources of chance fixed it repeats, and with {freed} free, too"
 
 
 def _list(sources: Sequence[str]) -> str:

@@ -154,6 +154,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No pro
 
 def machines_of(graph: Graph, listen: str | None, keys: Path | None, *, here: bool) -> dict[str, Any]:
     """Returns the field of a `RunPlan` for other machines, if an option is about them."""
+    from dataflow.machines.keys import require_serving, settings
     from dataflow.supervision.plan import Meeting
 
     if here and listen is not None:
@@ -162,4 +163,8 @@ def machines_of(graph: Graph, listen: str | None, keys: Path | None, *, here: bo
         raise fail("--keys is for --listen: where do other machines join?")
     if listen is not None and all(node.machine is None for node in graph.nodes.values()):
         raise fail("--listen: no operator is to run on another machine; place one there by `machine: NAME`")
+    if listen is not None and not here:
+        settings(keys, listen)
+    if keys is not None:
+        require_serving(keys)
     return {"machines": Meeting(listen, keys)} if listen is not None else {"machines": None} if here else {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import xxhash
 
+from dataflow.execution.effects.surroundings import surroundings
 from dataflow.execution.failure import text_of
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages.base import Message
@@ -34,7 +35,8 @@ class EffectMiss(BaseException):
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """The key of a call: its `module:name`, and the digest (16 bytes) of each argument by its position or name."""
+    """The key of a call: its `module:name`, and the digest (16 bytes) of each argument by its position or name, and of
+    what it sees besides by a place with a dot, such as `self.prompt`."""
 
     function: str
     arguments: Mapping[str, bytes]
@@ -51,19 +53,34 @@ class Key:
         if name.endswith("<lambda>"):
             raise EffectError(f"effect({call!r}): a call is known by its name: give it a function or method with `def`")
         given = {**{str(k): value for k, value in enumerate(args)}, **kwargs}
-        return Key(
-            f"{getattr(call, '__module__', None)}:{name}",
-            {place: _digest(value, f"{name}({place})") for place, value in given.items()},
-        )
+        digests = {place: _digest(value, f"{name}({place})") for place, value in given.items()}
+        return Key(f"{getattr(call, '__module__', None)}:{name}", {**digests, **_seen(call)})
+
+    def without(self, places: Collection[str]) -> Key:
+        """Returns the key without some places."""
+        return Key(self.function, {place: d for place, d in self.arguments.items() if place not in places})
+
+    def moved(self, call: Call) -> set[str]:
+        """Returns the places that the call itself has changed, such as a count in its object."""
+        after = _seen(call)
+        before = {place for place in self.arguments if "." in place}
+        return {place for place in before | after.keys() if self.arguments.get(place) != after.get(place)}
+
+    def missing(self, recorded: Key) -> list[str]:
+        """Returns the places in which a call is not the `recorded` one. Besides arguments, only places count that were
+        recorded: others were changed by calls, or belonged to a library then."""
+        mine, its = self.arguments, recorded.arguments
+        roots = {place.partition(".")[0] for place in mine if "." in place}
+        places = [p for p in {**mine, **its} if "." not in p or (p in its and p.partition(".")[0] in roots)]
+        return [place for place in places if mine.get(place) != its.get(place)]
 
     def differing(self, others: Sequence[Key]) -> str:
         """Returns in words how a call differs from the recorded ones that were not asked for."""
         alike = [other for other in others if other.function == self.function]
         if not alike:
             return f"recorded there: {', '.join(other.function for other in others) or 'no further call'}"
-        mine, its = self.arguments, alike[0].arguments
-        places = [place for place in {**mine, **its} if mine.get(place) != its.get(place)]
-        return f"argument {', '.join(places)} differs from the recorded call"
+        places = [place if "." in place else f"argument {place}" for place in self.missing(alike[0])]
+        return f"{', '.join(places)} differs from the recorded call"
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +185,17 @@ def _of_kind(module: str, name: str, args: Sequence[Any], attributes: Mapping[st
         return None
     vars(error).update(attributes)
     return error
+
+
+def _seen(call: Call) -> dict[str, bytes]:
+    """Returns the digests of what a call sees besides its arguments, as far as that has any."""
+    found: dict[str, bytes] = {}
+    for place, value in surroundings(call).items():
+        try:
+            found[place] = _digest(value, place)
+        except (EffectError, RecursionError):
+            continue
+    return found
 
 
 def _digest(value: Any, place: str) -> bytes:

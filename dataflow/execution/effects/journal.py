@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ class Journal:
         self.asked = 0
         self.missed: EffectMiss | None = None
         self._before = 0
+        self._moving = defaultdict[str, set[str]](set)
 
     def ask(self, call: Call, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Returns the answer in the form that is recorded. Raises what the call raises, and `EffectError`."""
@@ -35,6 +36,9 @@ class Journal:
         self.asked += 1
         left = MAX_EFFECT_BYTES - sum(len(data) for *_, data in self.made)
         answer = Answer.of(key.name, call, args, kwargs, left)
+        moving = self._moving[key.function]
+        moving |= key.moved(call)
+        key = key.without(moving)
         self.made.append([key.function, dict(key.arguments), answer.raised, answer.data])
         return answer.value()
 
@@ -71,7 +75,8 @@ class RecordedJournal(Journal):
     def ask(self, call: Call, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         key = Key.of(call, args, kwargs)
         self.asked += 1
-        found = next((n for n, (recorded, _) in enumerate(self._left) if recorded == key), None)
+        left = enumerate(self._left)
+        found = next((n for n, (it, _) in left if it.function == key.function and not key.missing(it)), None)
         if found is None:
             return self._miss(key, call, args, kwargs)
         _, answer = self._left.pop(found)

@@ -184,5 +184,5 @@ def gathered(data: npt.NDArray[np.uint8], places: Column, kind: np.dtype[Any]) -
     """The structures at some places of the data, which has them whole."""
     if not len(places):
         return np.empty(0, kind)
-    windows = np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)
-    return windows[places].view(kind)[:, 0]
+    windows: npt.NDArray[Any] = np.ndarray((len(data) - kind.itemsize + 1,), kind, data, strides=(1,))
+    return windows[places]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import os
 import struct
@@ -22,8 +23,19 @@ Watch = Callable[[], None]
 """Is called before every read of a file: a sign of progress, however long it is."""
 
 
+KNOWN_BYTES = 2**14
+"""Records up to this size are parsed once: the files of one run declare the same, and so does a file opened again."""
+
+
 def _unwatched() -> None:
     """Takes no notice."""
+
+
+def _read(record: Any, body: bytes) -> Any:
+    return record.read(ReadDataStream(io.BytesIO(body)))
+
+
+_known = functools.lru_cache(maxsize=512)(_read)
 
 
 class RawFile:
@@ -87,7 +99,7 @@ class RawFile:
     def parse(self, record: Any, body: bytes, offset: int) -> Any:
         """A record of the `mcap` package from its body; `offset` is where it lies."""
         try:
-            return record.read(ReadDataStream(io.BytesIO(body)))
+            return _known(record, bytes(body)) if len(body) <= KNOWN_BYTES else _read(record, body)
         except (McapError, struct.error, UnicodeDecodeError, ValueError) as error:
             raise self.damaged(f"the {record.__name__} record at byte {offset} cannot be read: {error!r}") from error
 

@@ -6,6 +6,7 @@ import json
 import threading
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 
 import xxhash
@@ -75,6 +76,10 @@ class JsonCodec(Generic[M]):
         self._message = message
 
     def schema(self) -> SchemaText:
+        return self._schema
+
+    @cached_property
+    def _schema(self) -> SchemaText:
         message = self._message
         return SchemaText(f"dataflow.{message.SCHEMA}", "jsonschema", json_schema(message, message.FIELDS))
 
@@ -110,8 +115,10 @@ class FoxgloveCodec(Generic[M]):
         return SchemaText(self._schema.name, "protobuf", file_descriptor_set(self._schema.proto))
 
     def companion_schema(self) -> SchemaText | None:
-        if not self._companion:
-            return None
+        return self._companion_schema if self._companion else None
+
+    @cached_property
+    def _companion_schema(self) -> SchemaText:
         data = json_schema(self._message, self._companion, companion_of=self._schema.name)
         return SchemaText(f"dataflow.{self._message.SCHEMA}.companion", "jsonschema", data)
 

@@ -35,8 +35,9 @@ NOTHING_IN_IT = "holds nothing: its writer died as it began the file"
 
 
 def holds_nothing(file: McapFile | PartedFile) -> bool:
-    """Tells whether the writer of a file died before it had stored a message or a record."""
-    return file.torn and not any(map(file.index.count, file.channels))
+    """Tells whether the writer of a file died before it had stored a message or a record, or could store nothing."""
+    blank = not (file.channels or file.metadata or file.attachments)
+    return (file.torn or blank) and not any(map(file.index.count, file.channels))
 
 
 def parts_in(folder: Path) -> list[Path]:

@@ -52,8 +52,8 @@ class RunState:
         self.now = Moment(0.0, 0.0)
         self.release: Release | None = None
         self._clocks: dict[str, float] = {}
-        self.unreachable: set[str] = set()
-        """The processes on machines of which nothing is heard."""
+        self.unreachable: dict[str, str] = {}
+        """By process on a machine of which nothing is heard, that machine."""
         self._phase = Phase.STARTING
         self._commands: list[Command] = []
         for label, process in self.processes.items():
@@ -158,10 +158,10 @@ class RunState:
 
     def link_changed(self, machine: str, labels: Collection[str], *, up: bool) -> None:
         """Notes that processes on another machine are out of reach, or no longer: none of them need have ended."""
-        if up:
-            self.unreachable -= set(labels)
-        else:
-            self.unreachable |= set(labels)
+        for label in labels:
+            self.unreachable.pop(label, None)
+        if not up:
+            self.unreachable |= dict.fromkeys(labels, machine)
         what = "is back" if up else "is down: nothing of that machine is heard, and its operators go on"
         self.event("link", f"the link to machine {machine!r} {what}", machine=machine, up=up)
 

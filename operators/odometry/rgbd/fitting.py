@@ -128,9 +128,9 @@ class Fitter:
         self, points_world: Points, pixels: Pixels, ages: NDArray[np.int64], threshold: float, fewest: int
     ) -> Sighting | None:
         """Returns the pose that most points agree with, and those that do, if enough do: see `agreed_pose`."""
-        return self._consensus(points_world, pixels, ages, threshold, fewest)[0]
+        return self.consensus(points_world, pixels, ages, threshold, fewest)[0]
 
-    def _consensus(
+    def consensus(
         self, points_world: Points, pixels: Pixels, ages: NDArray[np.int64], threshold: float, fewest: int
     ) -> tuple[Sighting | None, NDArray[np.bool_]]:
         """Returns the pose that most agree with, if enough do, and which (N,) do."""
@@ -162,7 +162,7 @@ class Fitter:
         What moves stands before the world: it may fill most of the image, and yet is smaller than what it hides. Some
         corners agree with both motions, far ones above all, and count for both.
         """
-        first, agree = self._consensus(points_world, pixels, ages, threshold, fewest)
+        first, agree = self.consensus(points_world, pixels, ages, threshold, fewest)
         if first is None:
             return None
         rivals = max(fewest, int(RIVAL * len(first.pixels)))

@@ -42,15 +42,21 @@ def standing(sighting: Sighting, seen: Points, fitter: Fitter, fewest: int) -> S
     if body is None or _count(sighting, body[1]) < fewest:
         return sighting
     T, agree = body
-    rest = _part(sighting, ~agree)
+    rest = part(sighting, ~agree)
     other = _body(rest, seen[~agree], fitter)
-    still = replace(_part(sighting, agree), T_world_camera=T)
+    still = replace(part(sighting, agree), T_world_camera=T)
     if other is None or _count(rest, other[1]) < fewest:
         return still
     return replace(still, contrary=seen[~agree][other[1]])
 
 
-def _part(sighting: Sighting, chosen: NDArray[np.bool_]) -> Sighting:
+def doubtful(sighting: Sighting, seen: Points, fitter: Fitter) -> int:
+    """Returns how many features its pose has at other depths than the view, or at other pixels."""
+    return int(np.count_nonzero(_squared(sighting.T_world_camera[None], sighting, seen, fitter) >= BEYOND))
+
+
+def part(sighting: Sighting, chosen: NDArray[np.bool_]) -> Sighting:
+    """Returns a sighting of some of its features (N,) alone."""
     return replace(
         sighting, points_world=sighting.points_world[chosen], pixels=sighting.pixels[chosen], ages=sighting.ages[chosen]
     )
@@ -69,7 +75,7 @@ def _body(sighting: Sighting, seen: Points, fitter: Fitter) -> tuple[Matrix, NDA
     best = poses[np.argsort(_cost(poses, sighting, seen, fitter), kind="stable")[:BEST]]
     for _ in range(ROUNDS):
         agree = _squared(best, sighting, seen, fitter) < BEYOND
-        best = np.stack([_fitted(T, _part(sighting, on), fitter) for T, on in zip(best, agree, strict=True)])
+        best = np.stack([_fitted(T, part(sighting, on), fitter) for T, on in zip(best, agree, strict=True)])
     T = best[int(np.argmin(_cost(best, sighting, seen, fitter)))]
     return T, _squared(T[None], sighting, seen, fitter)[0] < BEYOND
 

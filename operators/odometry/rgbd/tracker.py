@@ -16,7 +16,7 @@ from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, Vector
 from operators.monitoring.image_flaws import Watch
-from operators.odometry.keyframes import RECALL_NEAR, RECALL_OTHERS, candidates, recall_due, view_distance
+from operators.odometry.keyframes import RECALL_EVERY, RECALL_NEAR, RECALL_OTHERS, candidates, recall_due, view_distance
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.corners import Corners, Layer, followed, renewed, with_new
@@ -32,6 +32,8 @@ from operators.odometry.rgbd.trial import Trial, taken_back, with_trial
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
+INTERVALS = 5  # between the last frames, whose median is the stream's own
+LATE = 1.5  # times that: a frame that comes later comes after a gap
 
 
 @dataclass(eq=False)
@@ -44,6 +46,7 @@ class RgbdState:
     shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
     noise: Noise = field(default_factory=Noise)
     watch: Watch = field(default_factory=Watch)
+    intervals: tuple[int, ...] = ()  # nanoseconds between the last frames, the oldest first
     recalls: int = 0  # frames that the map was searched for since the last loss
     apart_since: int | None = None  # stamp at which the newest segment began, while its place is unknown
     trials: tuple[Trial, ...] = ()  # of the places that were found last
@@ -78,9 +81,10 @@ class RgbdOdometry:
         sighting = self._follow(frame, T_predicted)
         # 4. Refine with the depth image, against the surfaces of nearby keyframes.
         fit = self._refine(frame, sighting, T_predicted, self.state.map.newest)
-        # 5. Failing that, after a gap, or in a new map, recognise the view by its descriptors.
+        # 5. Failing that, after a gap, now and then, or in a new map, recognise the view by its descriptors.
         measured = self._measured(frame, fit)
         recalled = self._recall(frame, fit if measured else None, T_predicted)
+        self.state.intervals = (*self.state.intervals, stamp - self.state.motion.stamp)[-INTERVALS:]
         # 6. Decide what the pose rests on, and remember it.
         if recalled is not None:
             return self._relocalised(frame, fit if measured else None, T_predicted, *recalled)
@@ -129,6 +133,13 @@ class RgbdOdometry:
         assert self.state.motion is not None
         return self.state.motion.blind_s + (frame.stamp - self.state.motion.stamp) * 1e-9 > self.config.patience_s
 
+    def _slow(self, frame: Frame) -> bool:
+        """Returns whether a frame that comes after longer than the patience is as usual for its stream."""
+        assert self.state.motion is not None
+        intervals = self.state.intervals
+        usual = len(intervals) > 1 and frame.stamp - self.state.motion.stamp <= LATE * float(np.median(intervals))
+        return self.state.motion.blind_s == 0.0 and usual
+
     def _measured(self, frame: Frame, fit: Fit) -> bool:
         """Returns whether a fit counts: after a gap with more evidence."""
         if self._after_gap(frame) and frame.image_flaw is None and frame.depth_flaw is None:
@@ -140,18 +151,21 @@ class RgbdOdometry:
         """Looks for the view in the map: while nothing is tracked, once after a gap, and now and then in a new map.
 
         What is tracked after a gap was looked for around a prediction: a place that more speaks for takes its place.
+        In a stream that is slower than the patience every frame is such a one, so it is looked for now and then.
         """
         assert self.state.motion is not None
-        steady = tracked is not None and not self._after_gap(frame)
-        if steady and self.state.apart_since is None:
+        gap, apart = self._after_gap(frame), self.state.apart_since
+        slow = gap and self._slow(frame)
+        steady = tracked is not None and (slow or not gap)
+        if steady and not slow and apart is None:
             self.state.recalls = 0
             return None
         self.state.recalls += 1
-        waits = steady and not recall_due(frame.stamp, self.state.apart_since, self.state.recalls)
-        if frame.image_flaw is not None or waits:
+        due = recall_due(frame.stamp, apart, self.state.recalls) or (slow and self.state.recalls % RECALL_EVERY == 0)
+        if frame.image_flaw is not None or (steady and not due):
             return None
         newest = self.state.map.newest.segment
-        others = self.state.map.elsewhere if steady else self.state.map.keyframes
+        others = self.state.map.elsewhere if steady and apart is not None else self.state.map.keyframes
         chosen = candidates(others, T_predicted, RECALL_NEAR, RECALL_OTHERS, self.state.recalls)
         for found, known in recognised(frame, chosen, self._fitter, self.state.motion, T_predicted, self.state.map):
             if known.segment != newest:

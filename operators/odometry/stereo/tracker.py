@@ -19,7 +19,7 @@ from operators.odometry.features import Gray, Mask, Pixels, detect_corners, trac
 from operators.odometry.keyframes import RECALL_NEAR, RECALL_OTHERS, candidates, recall_due
 from operators.odometry.mono.pose import solved
 from operators.odometry.motion import Motion
-from operators.odometry.stereo.adjustment import Offset, Sightings, StereoRig, adjust
+from operators.odometry.stereo.adjustment import Offset, Past, Sightings, StereoRig, adjust
 from operators.odometry.stereo.map import StereoMap
 from operators.odometry.stereo.relocalizer import TYPICAL, FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
@@ -83,6 +83,7 @@ class StereoState:
     pixels: Pixels = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) where the last image shows them
     seen: Sightings = field(default_factory=Sightings.none)
     offset: Offset = field(default_factory=Offset)
+    past: Past = field(default_factory=lambda: Past.none(np.zeros((0, 4, 4)), 0.0))  # of the window's poses
     map: StereoMap = field(default_factory=StereoMap)
 
 
@@ -120,7 +121,7 @@ class StereoOdometry:
         again = self._recall(pair, T_predicted, measured=T is not None)
         if again is not None and (T is None or self._supersedes(again, agree)):
             return self._relocalised(pair, T, again)
-        return self._guessed(pair, T_predicted, reason) if T is None else self._measured(pair, T, pixels, agree)
+        return self._guessed(pair, T_predicted, reason) if T is None else self._measured(pair, T, pixels, agree, ~found)
 
     # -- the steps ---------------------------------------------------------------------------------------
 
@@ -137,20 +138,24 @@ class StereoOdometry:
         agree[chosen[inliers]] = True
         return T, agree
 
-    def _measured(self, pair: StereoPair, T_world_camera: Matrix, pixels: Pixels, agree: Mask) -> TrackResult:
-        """Adds a frame to the window, adjusts it, and drops what does not fit."""
+    def _measured(
+        self, pair: StereoPair, T_world_camera: Matrix, pixels: Pixels, agree: Mask, gone: Mask
+    ) -> TrackResult:
+        """Adds a frame to the window, adjusts it, and drops what is gone and what does not fit."""
         state, config = self.state, self.config
         assert state.motion is not None
         kept = np.flatnonzero(agree)
         points, pixels = state.points[kept], pixels[kept]
         sightings, matched = self._across(pair, pixels, transform_points(invert(T_world_camera), points))
-        poses = np.concatenate([state.poses, T_world_camera[None]])
+        left = np.flatnonzero(gone)
+        past = state.past.also(self.rig, state.points[left], state.seen.of_points(left), config.sigma)
+        poses, past = np.concatenate([state.poses, T_world_camera[None]]), past.with_pose(T_world_camera)
         here = np.flatnonzero(matched)
         seen = state.seen.of_points(kept).also(len(poses) - 1, here, sightings[here])
         if len(poses) > config.window:
-            poses, seen = poses[1:], seen.without_first()
+            poses, seen, past = poses[1:], seen.without_first(), past.without_first()
         fixed = min(config.fixed, len(poses) - 1)
-        adjusted = adjust(self.rig, poses, points, seen, state.offset, config.sigma, fixed, config.iterations)
+        adjusted = adjust(self.rig, poses, points, seen, state.offset, past, config.sigma, fixed, config.iterations)
         T = adjusted.poses[-1]
         ahead = transform_points(invert(T), adjusted.points)[:, 2] > 0.3
         good = seen.fitting(adjusted.squared, len(points)) & ahead
@@ -164,6 +169,7 @@ class StereoOdometry:
             left=pair.left,
             poses=adjusted.poses,
             offset=adjusted.offset,
+            past=adjusted.past,
             points=adjusted.points[good],
             pixels=pixels[good],
             seen=seen.of_points(np.flatnonzero(good)),
@@ -209,7 +215,13 @@ class StereoOdometry:
         assert state.motion is not None
         T, none = state.motion.T_world_camera, StereoState()
         self.state = replace(
-            state, left=pair.left, poses=T[None], points=none.points, pixels=none.pixels, seen=none.seen
+            state,
+            left=pair.left,
+            poses=T[None],
+            points=none.points,
+            pixels=none.pixels,
+            seen=none.seen,
+            past=Past.none(T[None], state.offset.pixels),
         )
         self._replenish(pair)
         if len(self.state.points) < self.config.min_inliers:

@@ -21,6 +21,7 @@ from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.relocalizer import rough_points
+from operators.odometry.rgbd.standing import doubtful, part, standing
 from operators.odometry.rgbd.surface import Surface
 from operators.slam.visual.guided import guided_pairs
 from operators.slam.visual.place_index import rooted
@@ -176,7 +177,21 @@ def _solved(known: View, seen: View, pairs: NDArray[np.int64], fitter: Fitter) -
     points = known.points[pairs[:, 0]].astype(np.float64)
     there = np.isfinite(points[:, 2])
     pixels = seen.pixels[pairs[there, 1]].astype(np.float64)
-    return fitter.solve(points[there], pixels, np.zeros(len(pixels), np.int64), PIXELS, FIRST)
+    found, agree = fitter.consensus(points[there], pixels, np.zeros(len(pixels), np.int64), PIXELS, FIRST)
+    return found if found is None else _still(found, known, seen, pairs[there][agree], fitter)
+
+
+def _still(sighting: Sighting, known: View, seen: View, pairs: NDArray[np.int64], fitter: Fitter) -> Sighting:
+    """Returns a sighting without the features of a body that has moved between the views, if depths show one.
+
+    Pixels alone hardly tell a step aside with a turn from a robot before a wall that has moved.
+    """
+    steady = known.steady[pairs[:, 0]] & seen.steady[pairs[:, 1]]
+    points, sure = seen.points[pairs[steady, 1]].astype(np.float64), part(sighting, steady)
+    if doubtful(sure, points, fitter) < FIRST:
+        return sighting
+    still = standing(sure, points, fitter, FIRST)
+    return still if len(still.contrary) else sighting
 
 
 def relief(points: NDArray[np.float64]) -> int:

@@ -34,6 +34,19 @@ def test_corners_are_where_the_lens_put_them_however_the_board_is_turned(board: 
     assert off.max() < 0.8
 
 
+@pytest.mark.parametrize("board", BOARDS[:2], ids=str)
+@pytest.mark.parametrize("roll", [0.1, 1.4])
+def test_corners_of_a_soft_image_are_exact_where_the_outer_squares_are_cut_to_half(board: Board, roll: float) -> None:
+    T_camera_board, drawn, margin = pose(board, turned(0.2, -0.3, roll), (0.02, -0.01, 0.42)), texture(board), 120
+    drawn[:margin], drawn[-margin:], drawn[:, :margin], drawn[:, -margin:] = 255, 255, 255, 255
+    view = board.find(0, cv2.GaussianBlur(picture(board, drawn, LENS, T_camera_board), (0, 0), 1.2))
+
+    assert view is not None
+    off = np.linalg.norm(view.pixels - LENS.project(seen(board, T_camera_board))[view.ids], axis=1)
+    assert np.sqrt((off**2).mean()) < 0.09
+    assert off.max() < 0.3
+
+
 def test_a_part_of_a_charuco_board_is_enough_and_a_part_of_a_chessboard_is_not() -> None:
     charuco, chessboard = BOARDS[2], BOARDS[0]
     for board, there in ((charuco, True), (chessboard, False)):

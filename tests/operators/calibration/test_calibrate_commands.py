@@ -12,13 +12,14 @@ from made_boards import Array, Lens, picture, pose, texture, turned
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from dataflow.api.names import StreamNameError
 from dataflow.api.recordings import open as opened
 from dataflow.messages import CameraInfo, CompressedImage, Image, Imu
 from dataflow.recording import RecordingWriter
 from dataflow.testing import play
 from operators.calibration.boards import Board, Charuco, Chessboard
 from operators.calibration.commands import calibrate
-from operators.calibration.recorded import spaced_pairs
+from operators.calibration.recorded import Seen, images_of, own_frames, spaced_pairs
 from operators.geometry.calibration_files import camera_text
 from operators.sources import ImageFolder, StaticTransforms
 
@@ -109,6 +110,40 @@ def test_a_pair_is_found_and_its_files_are_taken_by_sources(pair: Path, tmp_path
         "left.yaml", "left.png", "right.yaml", "right.png", "stereo.yaml",
     }  # fmt: skip
     assert "baseline" in run(f"stereo {pair} {CHARUCO} --model equidistant --every 0 --out {tmp_path} --overwrite")
+
+
+def test_the_name_of_a_camera_means_its_only_stream_of_images(tmp_path: Path) -> None:
+    info = CameraInfo(stamp=0, frame="a", width=1, height=1, distortion_model="plumb_bob", K=np.eye(3))
+    with RecordingWriter(tmp_path / "pair.mcap", metadata={}) as writer:
+        for name in ("left/image", "right/image", "right/second"):
+            writer.add_stream(name, Image)
+            writer.write(name, Image(stamp=0, frame="a", data=np.zeros((1, 1), np.uint8)), seq=0)
+        writer.add_stream("left/image_info", CameraInfo, static=True)
+        writer.write("left/image_info", info, seq=0)
+    with opened(tmp_path / "pair.mcap") as streams:
+        assert images_of(streams, "left", "--left").info.name == "left/image"
+        with pytest.raises(StreamNameError, match="no stream 'right'"):
+            images_of(streams, "right", "--right")
+
+
+@pytest.mark.parametrize(
+    ("streams", "frames"),
+    [
+        (("robot/left/image", "robot/right/image"), ("left", "right")),
+        (("cam0", "cam1"), ("cam0", "cam1")),
+        (("a/left/raw", "b/right/image"), ("a/left/raw", "b/right/image")),
+        (("eyes", "eyes/right"), ("eyes", "right")),
+    ],
+)
+def test_cameras_with_one_frame_get_frames_from_their_streams(
+    streams: tuple[str, str], frames: tuple[str, str]
+) -> None:
+    board = Chessboard(9, 6, 0.03)
+    left, right = (Seen(name, "camera_optical", board, (320, 240), 0, ()) for name in streams)
+    found = own_frames(left, right)
+
+    assert tuple(seen.frame for seen in found) == frames
+    assert own_frames(*found) == found
 
 
 def test_pairs_are_spaced_together_when_one_camera_begins_later_and_loses_an_image(tmp_path: Path) -> None:

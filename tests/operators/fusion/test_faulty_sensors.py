@@ -293,7 +293,7 @@ def test_alarms_and_doubts_come_back_from_a_snapshot() -> None:
 def test_a_snapshot_from_before_there_were_alarms_is_refused() -> None:
     operator = EkfFusion()
     old = {name: value for name, value in (operator.snapshot() or {}).items() if name != "alarms"}
-    with pytest.raises(StateError, match="snapshot of another version: State lacks alarms"):
+    with pytest.raises(StateError, match="snapshot of another version: the state of State has no alarms"):
         operator.restore(old)
 
 

@@ -179,3 +179,12 @@ def test_without_the_package_the_extra_is_named(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setitem(sys.modules, "velodyne_decoder", None)
     with pytest.raises(SourceError, match=r"need the package velodyne_decoder: pip install 'robot-dataflow\[lidar\]'"):
         VelodyneFile(input=str(capture(tmp_path / "a.pcap", []))).setup()
+
+
+@need
+def test_a_capture_without_a_packet_is_a_finding(tmp_path: Path) -> None:
+    source = VelodyneFile(input=str(capture(tmp_path / "none.pcap", [])))
+    source.setup()
+
+    assert list(source.stream()) == []
+    assert source.finding() == "none.pcap holds no packet"

@@ -12,6 +12,7 @@ import contextlib
 import functools
 import importlib
 import os
+import random
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,14 +36,18 @@ from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.processes import Call
 from simulation import reloading
 from simulation.bindings import bound
+from simulation.blocks import by_blocks
 from simulation.flights import check_reasons, check_spans
 from simulation.keeping import check_losses_of_files, files_of, joined, kept_by_flight
+from simulation.opening import opened_once
 from simulation.run import Machine, Outcome, simulate
 from simulation.scenario import PATIENCE, TICKING, TIMEOUT, Scenario
 from simulation.world import Violation
 
 BUSY = 0.9
 """Share of the time after a stop in which a recorder waits for a disk that it cannot keep up with."""
+MOST_PARTS = 8
+"""Parts of a recording that are verified each by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +77,17 @@ def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
     graph = scenario.load()
     plan = _plan(scenario, graph, folder)
     outcome = simulate(plan, scenario.machine, scenario.happenings, limit=scenario.limit)
-    report = outcome.report
     refused = outcome.disk_full and "not ready within" in str(outcome.failure)  # a disk that was full at the beginning
     if outcome.failure is not None and not (scenario.may_fail or refused or is_outrun(outcome)):
         raise Violation(f"the run failed: {outcome.failure}\n{outcome.failure.details}")
     if scenario.only_paused:
         _check_pauses(outcome)
+    with opened_once():
+        return _check_outcome(scenario, folder, graph, outcome, replay=replay)
+
+
+def _check_outcome(scenario: Scenario, folder: Path, graph: Graph, outcome: Outcome, *, replay: bool) -> Result:
+    report = outcome.report
     if scenario.keeping.flight:
         return Result(outcome, _check_flight(outcome, graph, folder / "flight"))
     path = _joined(scenario, folder, outcome)
@@ -86,9 +96,10 @@ def _check(scenario: Scenario, folder: Path, *, replay: bool) -> Result:
         _verify_from_middle(path)
     drops = 0
     if report is not None and _holds_all(outcome):
-        drops = _check_losses(path, graph, report, live=scenario.live)
+        records = _records_of(path, graph)
+        drops = _check_losses(records, graph, report, live=scenario.live)
         if not scenario.live:
-            _check_window(path, graph, scenario, report)
+            _check_window(records, graph, scenario, report)
     if report is not None and verdict == "identical" and scenario.keeping.topics:
         _check_completion(path, folder / "complete.mcap", graph, report)
     replayed = replay and report is not None and verdict == "identical" and _may_replay(scenario, report)
@@ -133,12 +144,13 @@ def _holds_all(outcome: Outcome) -> bool:
 
 
 def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
-    """The recording as one file; each of its parts is verified as far as it goes."""
+    """The recording as one file; of its parts, `MOST_PARTS` at most, each is verified as far as it goes."""
     files = files_of(folder / "run.mcap")
     if len(files) < 2:
         return files[0] if files else folder / "run.mcap"
-    for file in files:
-        _unchanged(file, lacks=not _holds_all(outcome))
+    lacks = not (_holds_all(outcome) and _has_sources(scenario.load()))
+    for file in _some(files, scenario.seed):
+        _unchanged(file, lacks=lacks)
     try:
         path = joined(files, folder / "joined.mcap")
     except RecordingError as error:
@@ -148,8 +160,16 @@ def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
     if outcome.report is not None and "@recorder" not in outcome.killed:
         deleted = outcome.report.files["@recorder"]["deleted"]
         if not deleted:
-            check_losses_of_files(outcome.report, path)
+            check_losses_of_files(outcome.report, path, scenario.load().record.streams)
     return path
+
+
+def _some(parts: Sequence[Path], seed: int) -> list[Path]:
+    """The first and the last parts, and drawn ones between them: a run may have a hundred."""
+    if len(parts) <= MOST_PARTS:
+        return list(parts)
+    drawn = random.Random(f"parts {seed}").sample(parts[1:-1], MOST_PARTS - 2)
+    return [parts[0], *sorted(drawn), parts[-1]]
 
 
 def _check_flight(outcome: Outcome, graph: Graph, folder: Path) -> str:
@@ -293,8 +313,11 @@ def verified(path: Path, *, start: float | None = None, jobs: int = 1) -> Verify
         return verify(path, start=start, jobs=jobs, workers=_call_here)
 
 
-_load_bundle = functools.lru_cache(maxsize=1024)(load_bundle)
-"""The graph in a recording; the same ones come again and again."""
+@functools.lru_cache(maxsize=1024)
+def _load_bundle(bundle: str) -> Graph:
+    """The graph in a recording; the same ones come again and again."""
+    with by_blocks():
+        return load_bundle(bundle)
 
 
 def _call_here(calls: Sequence[Call], **options: Any) -> list[Any]:
@@ -325,17 +348,16 @@ Place = tuple[str, int, int]
 Records = Mapping[str, Sequence[FiringRecord]]
 
 
-def _records(path: Path, graph: Graph) -> Records:
+def _records_of(path: Path, graph: Graph) -> Records:
     """The firing records of a recording, by operator."""
     with Recording(path) as recording:
         log = FiringLog.read(recording)
         return {name: log.of(name) for name in graph.nodes}
 
 
-def _check_losses(path: Path, graph: Graph, report: RunReport, *, live: bool) -> int:
+def _check_losses(records: Records, graph: Graph, report: RunReport, *, live: bool) -> int:
     """Every message that was made is taken by each trigger it reaches, or dropped or missed and counted."""
     counted = 0
-    records = _records(path, graph)
     _check_stale(graph, records)
     for name, node in graph.nodes.items():
         if node.source or report.restarts.get(name):
@@ -397,14 +419,13 @@ def _made(graph: Graph, records: Records, stream: str, report: RunReport) -> dic
 # Flow control
 
 
-def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunReport) -> None:
+def _check_window(records: Records, graph: Graph, scenario: Scenario, report: RunReport) -> None:
     """Sources were never further ahead of the operators than their window; it grew only where the graph needs it."""
     grown = any("further ahead than the window" in note for note in report.notes)
     if grown:
         if graph.name in NO_LOOK_AHEAD:
             raise Violation(f"the window of graph {graph.name!r} had to grow, which looks no stamp ahead")
         return
-    records = _records(path, graph)
     worked = [
         (record.stamp, record.wall_start + record.duration)
         for name, node in graph.nodes.items()

@@ -4,8 +4,9 @@ of its files."""
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,13 @@ def keeping_of(r: random.Random, plain: Keeping) -> Keeping:
     return Keeping(EVERYTHING, states)
 
 
+def thinner(keeping: Keeping, r: random.Random) -> Keeping:
+    """Returns a recording in parts that holds fewer streams; some are left as they are, and all others."""
+    if not keeping.has_parts or keeping.flight or r.random() < 0.7:
+        return keeping
+    return replace(keeping, topics=r.choice((SOURCES, *CHOICES)))
+
+
 def files_of(path: Path) -> list[Path]:
     """Returns the files of a recording, in order."""
     return [each for each in (path, *parts_of(path)) if each.exists()]
@@ -92,14 +100,15 @@ def joined(files: list[Path], out: Path) -> Path:
     return out
 
 
-def check_losses_of_files(report: RunReport, path: Path) -> None:
+def check_losses_of_files(report: RunReport, path: Path, recorded: Iterable[str]) -> None:
     """Every message that was made is in the files, or counted as lost by the recorder or on the way to it."""
     facts = report.files["@recorder"]
     lost: dict[str, int] = facts.get("lost", {}).get("streams", {})
     missed = sum(n for _, why, n in report.drops.get("@recorder", ()) if why == "missed")
     with Recording(path) as recording:
         stored = {name: stream.count for name, stream in recording.streams.items()}
-    for stream, (made, _) in report.streams.items():
+    for stream in recorded:
+        made, _ = report.streams.get(stream, (0, ""))
         maker = stream.rpartition("/")[0].partition("/")[2]
         if report.restarts.get(maker):
             continue

@@ -514,6 +514,8 @@ class System:
 class Selector(selectors._BaseSelectorImpl):
     """`selectors.DefaultSelector`: finds what is ready, in any order."""
 
+    _fd_to_key: dict[int, selectors.SelectorKey]
+
     def __init__(self, system: System) -> None:
         super().__init__()
         self._system, self._world = system, system.world
@@ -525,9 +527,8 @@ class Selector(selectors._BaseSelectorImpl):
         while not (found := self._ready()) and (until is None or world.now < until):
             task = world.task
             assert task is not None
-            waiters = [
-                each for fd in self.get_map() if fd in self._system.things for each in self._system.things[fd].waiters
-            ]
+            things = self._system.things
+            waiters = [each for fd in self._fd_to_key if fd in things for each in things[fd].waiters]
             for each in waiters:
                 each.add(task)
             try:
@@ -540,7 +541,7 @@ class Selector(selectors._BaseSelectorImpl):
 
     def _ready(self) -> list[tuple[selectors.SelectorKey, int]]:
         found, things = [], self._system.things
-        for key in self.get_map().values():
+        for key in self._fd_to_key.values():
             fd = key.fd
             thing = things.get(fd)
             if thing is None:

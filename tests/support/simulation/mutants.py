@@ -22,12 +22,15 @@ from dataflow.sinks.flight_recorder import FlightSink, Wanted
 from dataflow.sinks.parts import PartsSink
 from dataflow.sinks.triggers import Triggers
 from dataflow.sync import FOREVER, NEVER
+from dataflow.sync.sampled import Sampled
 
 
 class Mutant:
     """A fault: methods that take the place of others, by class and name."""
 
     said = ""
+    replays = False
+    """Whether only replays can find it."""
 
     def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
         raise NotImplementedError
@@ -206,6 +209,16 @@ class SleeplessClock(Mutant):
         return {(AwakeClock, "__call__"): lambda self: self._clock()}
 
 
+class HastySample(Mutant):
+    """A firing samples what has arrived, whatever may still come at or before its stamp."""
+
+    said = "a firing does not wait for what it samples"
+    replays = True
+
+    def replaced(self) -> Mapping[tuple[Any, str], Callable[..., Any]]:
+        return {(Sampled, "knows"): lambda self, stamp: True}
+
+
 class GapTaken(Mutant):
     """The pipe between machines goes on behind what a reset link has lost."""
 
@@ -313,5 +326,6 @@ MUTANTS: Mapping[str, Mutant] = {
     "again": ToldTwice(),
     "drops": DeafToDrops(),
     "half": ShortMemory(),
+    "sample": HastySample(),
     "link": GapTaken(),
 }

@@ -188,6 +188,8 @@ class Simulation:
             **dict.fromkeys(bindings.clocks(), time),
             (f"{supervision}.process_main", "threading"): threads,
             (f"{supervision}.process_main", "os"): system,
+            (f"{supervision}.process_main", "show_name"): _nothing,
+            ("dataflow.sinks.freed_memory", "keep_freed_memory"): _nothing,
             (f"{process}.channel", "socket"): machine.Sockets(system),
             (f"{process}.channel", "threading"): threads,
             (f"{process}.watchdog", "threading"): threads,

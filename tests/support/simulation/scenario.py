@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 from dataflow.chaos.plan import Fault
 from dataflow.graph import Graph, GraphError, load_text
 from dataflow.graph.model import Placement
+from simulation.blocks import by_blocks
 from simulation.drawn import NESTED, drawn, nested, repeats
-from simulation.keeping import PLAIN, Keeping, keeping_of
+from simulation.keeping import PLAIN, Keeping, keeping_of, thinner
 from simulation.operators import Revised
 from simulation.run import LIMIT, Happening, Machine
 
@@ -190,7 +191,7 @@ def load(
     """Loads one of the graphs; loading takes longer than some runs, so each is loaded once."""
     drawn_here = "".join(f"\n  {part}" for part in parts) + "\n"
     operators = {TICKING: TICKS, DRAWN: drawn_here}.get(graph) or GRAPHS[graph]
-    text = f"graph: {graph}\nnamespace: sim\n{record}operators:{operators}"
+    text = f"graph: {graph}\nnamespace: sim\noperators:{operators}{record}"
     words = {
         "SOURCE": _DEVICE if live else _SOURCE,
         "PAIR": _JUMPS if live else _PAIR,
@@ -207,7 +208,8 @@ def load(
     part = "\n".join(inner)
     for word, meaning in words.items():
         text, part = text.replace(word, meaning), part.replace(word, meaning)
-    return load_text(text, files={NESTED: part} if inner else None)
+    with by_blocks():
+        return load_text(text, files={NESTED: part} if inner else None)
 
 
 def scenario_of(seed: int) -> Scenario:
@@ -243,10 +245,12 @@ def scenario_of(seed: int) -> Scenario:
     elif random.Random(f"drawn {seed}").random() < 0.6:
         plain = _drawn(plain, random.Random(f"wired {seed}"))
     kept = random.Random(f"kept {seed}")
-    with contextlib.suppress(GraphError):  # its streams are not in this graph
-        recorded = replace(plain, keeping=keeping_of(kept, plain.keeping))
-        recorded.load()
-        plain = recorded
+    whole = keeping_of(kept, plain.keeping)
+    for keeping in (whole, thinner(whole, random.Random(f"less {seed}"))):
+        with contextlib.suppress(GraphError):  # its streams are not in this graph
+            recorded = replace(plain, keeping=keeping)
+            recorded.load()
+            plain = recorded
     if plain.keeping.storage.on_failure == "go_on" and (plain.machine.room is not None or kept.random() < 0.5):
         plain = replace(plain, machine=replace(plain.machine, room=kept.choice((20_000, 30_000, 60_000))))
     if plain.keeping.flight or plain.keeping.has_parts:

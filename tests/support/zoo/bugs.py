@@ -194,6 +194,18 @@ class Door(Bug):
         return [float(self.open)]
 
 
+class Drifts(Bug):
+    """Raises: a sum of the wrong sign, which leaves its range after 52 numbers; all of them are needed to show it."""
+
+    state: Sum
+
+    def work(self, k: float, kind: int) -> list[float]:
+        if self.state.total < -5:
+            raise ValueError("out of range")
+        self.state.total += 0.1 if fixed() else -0.1
+        return [self.state.total]
+
+
 @dataclass(frozen=True)
 class Case:
     """How a bug shows: recorded by right code (`differs`), by its own (an error or a predicate)."""

@@ -13,13 +13,27 @@ from rich.text import Text
 
 from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
 from dataflow.cli.support.arguments import Json
-from dataflow.cli.support.output import DIFFERENT, INTERRUPTED, fail, friendly_errors, out, print_json, say, size
+from dataflow.cli.support.output import (
+    DIFFERENT,
+    INTERRUPTED,
+    fail,
+    friendly_errors,
+    out,
+    print_json,
+    say,
+    seconds,
+    size,
+)
 
 if TYPE_CHECKING:
     from dataflow.cli.support.board import Row
+    from dataflow.client.processes import ProcessStatus
+    from dataflow.graph.model import Graph
 
 ANSWER_WITHIN = 1.0
 CONNECT_WITHIN = 3.0
+PERIODS = 5
+"""Usual periods of an operator after which it counts as silent."""
 PORT = 9464
 HERE = Path()
 
@@ -48,8 +62,8 @@ def health(
     """Check whether a running graph does its work: for a watchdog, a container's health check, a cron job.
 
     It does not where the process of an operator gives no answer, an operator was restarted meanwhile, no operator
-    fires, one drops more than `--losses` of its messages or is slower than its `--rate`, or the disk has less than
-    `--free` left. Each reason is a line.
+    fires, one has not fired for five of its usual periods (and `--over`), drops more than `--losses` of its messages
+    or is slower than its `--rate`, or the disk has less than `--free` left. Each reason is a line.
 
     Exit codes: 0 healthy; 1 not; 2 no such graph runs.
 
@@ -71,8 +85,13 @@ def health(
             processes.connected(len(found.endpoints), CONNECT_WITHIN)
             before = board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
             time.sleep(over)
-            sample = board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
-        reasons = [*faults(before.rows, sample.rows, least=least, losses=losses), *_disk(folder, free)]
+            statuses = processes.statuses(ANSWER_WITHIN)
+            sample = board.update(statuses, time.monotonic())
+        reasons = [
+            *faults(before.rows, sample.rows, least=least, losses=losses),
+            *silent(resolved, statuses, time.time() - found.started, over),
+            *_disk(folder, free),
+        ]
     if json:
         print_json({"graph": found.name, "healthy": not reasons, "reasons": reasons})
     else:
@@ -100,6 +119,22 @@ def faults(before: Sequence[Row], now: Sequence[Row], *, least: Mapping[str, flo
     working = [row for row in now if row.state not in ("ended", "no answer")]
     if working and not any(row.rate for row in working):
         yield "no operator fires"
+
+
+def silent(graph: Graph, statuses: Sequence[ProcessStatus], running: float, over: float) -> Iterator[str]:
+    """Yields the operators that have not fired for `over` seconds and five of their usual periods, but those of which
+    an operator in front is silent, too. `running`: seconds since the run began."""
+    from dataflow.graph.reach import upstream
+
+    quiet: dict[str, tuple[float, float]] = {}
+    for status in statuses:
+        for name, silence in status.silences.items():
+            period = running / max(status.counts[name][0], 1)
+            if name in graph.nodes and name not in status.ended and silence > max(over, PERIODS * period):
+                quiet[name] = silence, period
+    for name, (silence, period) in quiet.items():
+        if upstream(graph, [name]).isdisjoint(quiet):
+            yield f"{name}: has not fired for {seconds(silence)}; before, every {seconds(period)}"
 
 
 def metrics(

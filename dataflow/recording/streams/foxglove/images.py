@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,6 @@ from dataflow.recording.streams.pixels import (
     as_image,
     as_image16,
     as_millimetres,
-    rows_without_padding,
     stored_rows,
 )
 
@@ -51,10 +51,7 @@ def encode_image16(message: Image16) -> tuple[Parts, tuple[str, ...]]:
 
 
 def decode_image16(proto: RawImage) -> Fields:
-    flat = np.frombuffer(proto.data, np.uint8)
-    data = as_image16(proto.encoding, stored_rows(proto.encoding, proto.width, proto.height, proto.step, flat))
-    data.flags.writeable = False
-    return {"frame": proto.frame_id, "data": data}
+    return _decoded(proto, as_image16)
 
 
 def encode_depth(message: DepthImage) -> tuple[Parts, tuple[str, ...]]:
@@ -62,41 +59,19 @@ def encode_depth(message: DepthImage) -> tuple[Parts, tuple[str, ...]]:
     return _raw_image(message, "32FC1", message.data) if whole is None else _raw_image(message, "16UC1", whole)
 
 
-def rows_of(proto: RawImage, dtype: str, channels: int) -> npt.NDArray[Any]:
-    """The pixels (H, W) or (H, W, C) of a raw image, its row padding removed; raises `RecordingError`."""
-    itemsize = np.dtype(dtype).itemsize
-    used = proto.width * channels * itemsize
-    step = proto.step or used
-    if step < used or len(proto.data) < step * (proto.height - 1) + used:
-        raise RecordingError(
-            f"RawImage of {proto.width}x{proto.height} {proto.encoding} needs rows of {used} bytes, "
-            f"got step {proto.step} and {len(proto.data)} bytes"
-        )
-    shape = (proto.height, proto.width) if channels == 1 else (proto.height, proto.width, channels)
-    data = rows_without_padding(np.frombuffer(proto.data, np.uint8), proto.height, step, used)
-    pixels = data.view(dtype).reshape(shape)
-    pixels.flags.writeable = False
-    return pixels
-
-
 def decode_image(proto: RawImage) -> Fields:
-    channels = {"rgb8": 3, "mono8": 1, "8UC1": 1}.get(proto.encoding)
-    if channels is not None:
-        return {"frame": proto.frame_id, "data": rows_of(proto, "u1", channels)}
-    flat = np.frombuffer(proto.data, np.uint8)
-    pixels = as_image(proto.encoding, stored_rows(proto.encoding, proto.width, proto.height, proto.step, flat))
-    pixels.flags.writeable = False
-    return {"frame": proto.frame_id, "data": pixels}
+    return _decoded(proto, as_image)
 
 
 def decode_depth(proto: RawImage) -> Fields:
-    if proto.encoding == "32FC1":
-        return {"frame": proto.frame_id, "data": rows_of(proto, "<f4", 1)}
-    if proto.encoding == "16UC1":
-        depth = as_depth("16UC1", rows_of(proto, "<u2", 1))
-        depth.flags.writeable = False
-        return {"frame": proto.frame_id, "data": depth}
-    raise RecordingError(f"RawImage encoding {proto.encoding!r} is no DepthImage; those known are 32FC1 and 16UC1")
+    return _decoded(proto, as_depth)
+
+
+def _decoded(proto: RawImage, pixels_of: Callable[[str, npt.NDArray[Any]], npt.NDArray[Any]]) -> Fields:
+    data = np.frombuffer(proto.data, np.uint8)
+    pixels = pixels_of(proto.encoding, stored_rows(proto.encoding, proto.width, proto.height, proto.step, data))
+    pixels.flags.writeable = False
+    return {"frame": proto.frame_id, "data": pixels}
 
 
 def encode_compressed(message: CompressedImage) -> tuple[Parts, tuple[str, ...]]:

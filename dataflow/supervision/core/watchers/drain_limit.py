@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataflow.supervision.core.closing import bounded
+from dataflow.supervision.core.closing import SHORTEST, bounded
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.core.run_state import Phase, RunState
 from dataflow.supervision.core.watchers.watcher import Watcher
@@ -21,11 +21,16 @@ class DrainLimit(Watcher):
             return
         if self._since is None:
             self._since = self.run.steady
-        limit = bounded(self.run.plan.stall_timeout)
+        limit = SHORTEST if self._away() else bounded(self.run.plan.stall_timeout)
         if self.run.steady - self._since > limit:
             raise RunFailed(
                 f"interrupted, and not everything was drained within {limit:g} s: {self._owed()}", interrupted=True
             )
+
+    def _away(self) -> list[str]:
+        """Returns the machines out of reach on which something would have to drain."""
+        away = self.run.unreachable
+        return sorted({away[p.label] for p in self.run.working() if p.report is None and p.label in away})
 
     def _owed(self) -> str:
         run = self.run
@@ -33,7 +38,9 @@ class DrainLimit(Watcher):
         front = max((stamp for stamp in reached if stamp not in (NEVER, FOREVER)), default=None)
         upto = "" if front is None else f", sources had given up to {front}"
         left = [process for process in run.working() if process.report is None]
-        silent = [f"{process.describe()} gives no sign of life" for process in left if process.silent]
+        silent = [f"machine {machine!r} is out of reach" for machine in self._away()]
+        left = [process for process in left if process.label not in run.unreachable]
+        silent += [f"{process.describe()} gives no sign of life" for process in left if process.silent]
         behind = [
             self._at(name)
             for process in left

@@ -24,6 +24,7 @@ from dataflow.messages.geometry import invert
 from dataflow.testing import play
 from operators.geometry import se3
 from operators.odometry import VisualOdometry
+from operators.odometry.rgbd import tracker
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fit, Fitter
 from operators.odometry.rgbd.local_map import LocalMap
@@ -410,6 +411,25 @@ def test_a_track_across_a_gap_is_believed_whatever_the_size_of_the_image(monkeyp
     result, truth = after_a_second(monkeypatch, (0.0, 0.0, 0.0), scale=2)
     assert result.status in MEASURED
     assert np.linalg.norm((invert(truth) @ result.T_world_camera)[:3, 3]) < 0.02
+
+
+@pytest.mark.long
+def test_a_stream_slower_than_the_patience_is_searched_for_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames each 0.6 s: the first come after a gap for all that is known; one that is missing is a gap."""
+    frames, poses = sequence(60, 1.5)
+    looked, real = list[int](), tracker.recognised
+    odometry = RgbdOdometry(camera())
+
+    def counted(frame: Any, *given: Any) -> Any:
+        looked.append(frame.stamp // 600_000_000)
+        return real(frame, *given)
+
+    monkeypatch.setattr(tracker, "recognised", counted)
+    results = [odometry.track(*frames[i], 600_000_000 * i) for i in range(20) if i != 14]
+    assert {r.status for r in results} <= {Status.TRACKING, Status.RELOCALISED}
+    assert errors(results, [poses[i] for i in range(20) if i != 14])[0] < 0.03
+    assert 15 in looked
+    assert len([i for i in looked if 3 <= i < 14]) <= 4
 
 
 def test_a_view_that_is_found_again_is_remembered_for_the_corners_of_the_next() -> None:

@@ -137,7 +137,7 @@ def test_a_state_of_a_version_without_a_map_is_refused() -> None:
     recorded = operator.snapshot()
     assert recorded is not None
     former = {name: value for name, value in recorded["odometry"].items() if name != "map"}
-    with pytest.raises(StateError, match=r"snapshot of another version: .*StereoState\) lacks map"):
+    with pytest.raises(StateError, match=r"snapshot of another version: .*StereoState\) has no map"):
         operator.restore({**recorded, "odometry": former})
 
 

@@ -10,13 +10,15 @@ import cv2
 import numpy as np
 import pytest
 from made_hallway import RIG, SIZE, Gray, K, Matrix, Pair, driving, sequence
+from numpy.typing import NDArray
 
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, Image
-from dataflow.messages.geometry import invert
+from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
+from operators.geometry.pinhole import Points
 from operators.odometry import StereoVisualOdometry
-from operators.odometry.stereo.adjustment import Offset, Sightings, StereoRig, adjust
+from operators.odometry.stereo.adjustment import Offset, Past, Sightings, StereoRig, adjust
 from operators.odometry.stereo.odometry import rig_of
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.stereo.tracker import StereoOdometry
@@ -84,7 +86,15 @@ def test_no_part_of_the_window_holds_the_length_that_a_wrong_offset_gave_it() ->
     found, far = stretched, points * 1.02
     for _ in range(30):  # an offset is believed slowly
         adjusted = adjust(
-            RIG, found, far, Sightings(frames, indices, pixels), offset, 0.3, StereoOdometryConfig().fixed, 4
+            RIG,
+            found,
+            far,
+            Sightings(frames, indices, pixels),
+            offset,
+            Past.none(found, offset.pixels),
+            0.3,
+            StereoOdometryConfig().fixed,
+            4,
         )
         found, far, offset = adjusted.poses, adjusted.points, adjusted.offset
     lengths = np.diff(found[:, 2, 3]) / np.diff(poses[:, 2, 3])
@@ -101,7 +111,9 @@ def test_a_window_counts_for_what_it_shows_of_the_offset() -> None:
     learnt = {}
     for name, poses in {"standing": np.array([np.eye(4)] * 8), "driving": np.array(driving(8))}.items():
         pixels = np.concatenate([RIG.project((points - T[:3, 3]) @ T[:3, :3]) for T in poses])
-        found = adjust(RIG, poses, points, Sightings(frames, indices, pixels), Offset(), 0.3, 1, 4)
+        found = adjust(
+            RIG, poses, points, Sightings(frames, indices, pixels), Offset(), Past.none(poses, 0.0), 0.3, 1, 4
+        )
         learnt[name] = found.offset.information - Offset().information
     assert learnt["standing"] < 0.01 * learnt["driving"]
 
@@ -114,10 +126,55 @@ def test_adjustment_finds_poses_and_points_again() -> None:
     pixels = np.concatenate([RIG.project((points - T[:3, 3]) @ T[:3, :3]) for T in poses])
     off = np.array([T @ se3.exp(rng.normal(0, 0.01, 6)) if i else T for i, T in enumerate(poses)])
     seen = Sightings(frames, indices, pixels)
-    found = adjust(RIG, off, points + rng.normal(0, 0.1, points.shape), seen, Offset(), 0.3, 1, 10)
+    found = adjust(RIG, off, points + rng.normal(0, 0.1, points.shape), seen, Offset(), Past.none(off, 0.0), 0.3, 1, 10)
     np.testing.assert_allclose(found.poses, poses, atol=1e-3)
     np.testing.assert_allclose(found.points, points, atol=2e-2)
     assert found.offset.pixels == pytest.approx(0.0, abs=1e-2)
+
+
+def test_points_that_are_gone_still_hold_the_window() -> None:
+    """The oldest of six frames shares nothing with the others but four points 70 m away; what was near is behind."""
+    rng = np.random.default_rng(1)
+    poses = np.array(driving(6))
+    near = np.column_stack([rng.uniform(-4, 4, 40), rng.uniform(-1, 1, 40), rng.uniform(6, 20, 40)])
+    far = np.column_stack([rng.uniform(-20, -18, 4), rng.uniform(-2, 2, 4), rng.uniform(68, 72, 4)])
+
+    def seen(points: Points, frames: NDArray[np.int64]) -> Sightings:
+        every = np.repeat(frames, len(points))
+        local = np.concatenate([transform_points(invert(poses[k]), points) for k in frames])
+        return Sightings(
+            every, np.tile(np.arange(len(points)), len(frames)), RIG.project(local) + rng.normal(0, 0.3, local.shape)
+        )
+
+    ahead = near + np.array([0.0, 0.0, 8.0])
+    gone, later, all_along = seen(near, np.arange(3)), seen(ahead, np.arange(2, 6)), seen(far, np.arange(6))
+    here = Sightings(
+        np.concatenate([later.frames, all_along.frames]),
+        np.concatenate([later.points, all_along.points + len(near)]),
+        np.concatenate([later.pixels, all_along.pixels]),
+    )
+    points, off = np.concatenate([ahead, far]), dict[str, float]()
+    for name, past in {
+        "forgotten": Past.none(poses, 0.0), "held": Past.none(poses, 0.0).also(RIG, near, gone, 0.3)
+    }.items():  # fmt: skip
+        found = adjust(RIG, poses, points, here, Offset(), past, 0.3, 1, 10)
+        off[name] = float(np.linalg.norm((invert(poses[-1]) @ found.poses[-1])[:3, 3]))
+    assert off["forgotten"] > 0.5
+    assert off["held"] < 0.1
+
+
+def test_what_is_known_of_poses_stays_when_the_first_of_them_goes() -> None:
+    """The last poses are as sure of each other as with the first one beside them."""
+    rng = np.random.default_rng(2)
+    poses = np.array(driving(4))
+    points = np.column_stack([rng.uniform(-4, 4, 40), rng.uniform(-1, 1, 40), rng.uniform(6, 20, 40)])
+    frames, indices = (a.ravel() for a in np.meshgrid(np.arange(4), np.arange(40), indexing="ij"))
+    pixels = np.concatenate([RIG.project(transform_points(invert(T), points)) for T in poses])
+    whole = Past.none(poses, 0.0).also(RIG, points, Sightings(frames, indices, pixels), 0.3)
+    rest = whole.without_first()
+    held = whole.H + np.diag([0.0] * 6 + [1e8] * 6 + [0.0] * 13)  # all given the second pose
+    expected = np.linalg.inv(held)[12:, 12:]
+    np.testing.assert_allclose(np.linalg.inv(rest.H[6:, 6:]), expected, rtol=0.02, atol=1e-7)
 
 
 # -- failures ------------------------------------------------------------------------------------------------

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
-from operators.geometry.se3 import Matrix
+from operators.geometry.pinhole import project
+from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.recognition import match
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fitter
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.surface import Surface
 from operators.odometry.rgbd.tracker import RgbdOdometry
 from operators.slam.visual.view import STRIDE, Judge, Sight, View, relief, sight
 from operators.sources.room import Room, camera_path, look_at
@@ -78,6 +80,30 @@ def test_a_wrong_expectation_misleads_no_sight() -> None:
     seen = sight(known, other, FITTER, 20, astray)
     assert seen is not None
     assert np.linalg.norm(se3.log(invert(T) @ seen.T_known_seen)[:3]) < 0.015
+
+
+def picture_and_robot(shift: Vector) -> View:
+    """What a camera at the origin sees: 40 features of a picture on a wall 4 m away, 50 of a robot before it."""
+    rng = np.random.default_rng(3)
+    picture = rng.uniform((-2.2, -1.6, 4.0), (0.6, 1.4, 4.0), (40, 3))
+    robot = rng.uniform((0.2, -0.4, 1.9), (0.8, 0.6, 1.9), (50, 3)) + shift
+    points, descriptors = np.concatenate([picture, robot]), rng.integers(0, 120, (90, 128), np.uint8)
+    depth = np.full((144, 192), 4.0, np.float32)
+    (left, top), (right, bottom) = project(np.array([[0.2, -0.4, 1.9], [0.8, 0.6, 1.9]]) + shift, K).astype(np.int64)
+    depth[top:bottom, left:right] = 1.9 + shift[2]
+    surface = Surface.from_depth(depth, K, 0.3, 6.0, 2)
+    return View(
+        project(points, K).astype(np.float32), descriptors, points.astype(np.float32), surface, np.zeros(1, np.uint8)
+    )
+
+
+@pytest.mark.parametrize("shift", [(0.15, 0.0, 0.0), (-0.2, 0.0, 0.1)])
+def test_a_body_that_has_moved_does_not_place_a_view(shift: tuple[float, float, float]) -> None:
+    """More features lie on it, and yet what it hides is larger."""
+    seen = sight(picture_and_robot(np.zeros(3)), picture_and_robot(np.array(shift)), FITTER, 20)
+    assert seen is not None
+    assert np.linalg.norm(se3.log(seen.T_known_seen)[:3]) < 0.03
+    assert Judge().doubt(seen) == ""
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,41 @@
+"""Parameters of ROS sources that cannot be are refused before anything connects."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import dataflow.ros as topics
+from dataflow.graph import GraphError, load_text
+from dataflow.operator import SourceError
+
+GRAPH = "graph: ros\nnamespace: test\noperators:\n  imu: {use: 'dataflow.ros:Imu', params: {topic: '%s', type: '%s'}}\n"
+
+
+@pytest.mark.parametrize("topic", ["/*", "/cam two", "imu/", "", "/imu//data", "/2d", "/a$b"])
+def test_a_name_that_no_topic_has_is_a_fault_of_the_graph(topic: str) -> None:
+    with pytest.raises(GraphError, match="topic"):
+        load_text(GRAPH % (topic, ""))
+
+
+@pytest.mark.parametrize("type_", ["sensor_msgs/Imu", "Imu", "sensor_msgs/srv/SetCameraInfo"])
+def test_a_type_is_named_as_ros_2_does(type_: str) -> None:
+    with pytest.raises(GraphError, match="type"):
+        load_text(GRAPH % ("/imu", type_))
+
+
+def test_what_ros_takes_is_taken() -> None:
+    for topic in ("imu", "/imu", "/robot/imu_1/data", "~/imu"):
+        load_text(GRAPH % (topic, "sensor_msgs/msg/Imu"))
+
+
+def test_a_type_that_becomes_another_message_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    source: Any = topics.Imu(topic="/imu", type="sensor_msgs/msg/Image")
+    monkeypatch.setattr(source, "join", lambda: SimpleNamespace())
+
+    with pytest.raises(
+        SourceError, match=r"a sensor_msgs/msg/Image becomes .* Image, not Imu: use dataflow\.ros:Image"
+    ):
+        source.setup()
