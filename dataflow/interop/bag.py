@@ -86,7 +86,7 @@ class Bag(Protocol):
     promised: Mapping[str, int]
     """Messages by topic according to the file's metadata, statistics or index; empty where none of them counts."""
     lost: Lost
-    """What is there and cannot be read; complete when all messages have been read."""
+    """Messages that damage keeps from being read; complete when all others have been."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:

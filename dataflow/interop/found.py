@@ -45,7 +45,7 @@ class Found:
         return Times(topic.name, column(self.logs), header, topic.latched, shares)
 
     def digests_of(self, *, distinct: bool) -> npt.NDArray[np.uint64]:
-        """What tells entries of one stamp apart: their content if that is `distinct`, else nothing joins them."""
+        """Digests by which entries of one stamp are compared: of their content; where not `distinct`, a number each."""
         count = len(self.digests)
         return np.frombuffer(self.digests, np.uint64) if distinct and count else np.arange(count, dtype=np.uint64)
 

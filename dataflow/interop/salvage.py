@@ -269,7 +269,7 @@ def _values(record: bytes) -> list[Any]:
 
 _CHUNK, _CONNECTION, _MESSAGE, _INDEX = b"\x05", b"\x07", b"\x02", b"\x04"
 _USEFUL = re.compile(rb"\x04\x00\x00\x00op=[\x02\x05\x07]")
-"""The field of a header that tells a chunk, a connection, or a message."""
+"""The field of a header of a chunk, a connection, or a message."""
 _MAX_HEADER = 1 << 16
 _FIELDS_BEFORE = 256
 """Bytes of a header before that field, at most: where a record begins is looked for within them."""
@@ -304,7 +304,7 @@ class Ros1Wreck(Wreck):
         self._settle()
 
     def _take_chunk(self, begin: int) -> bool:
-        """Takes the messages of a chunk; tells whether it could be unpacked."""
+        """Takes the messages of a chunk; returns whether it could be unpacked."""
         try:
             inner = self._unpacked(begin)
         except (OSError, RuntimeError, EOFError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""What of a dataset cannot be read: passed over, counted, and named in the log."""
+"""Counts the files of a dataset that cannot be read and are passed over, and names them in the log."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ MOST_IN_A_FOLDER = 25
 MOST_ARROWS_IN_ODOMETRY = 40
 MOST_LINES = 60
 LONG = {
-    "dataflow.cli.commands.convert:convert": 122,
+    "dataflow.cli.commands.convert:convert": 111,
     "dataflow.cli.commands.demo:demo": 65,
     "dataflow.cli.commands.following.live:hz": 63,
     "dataflow.cli.commands.following.logs:logs": 69,

@@ -10,6 +10,7 @@ from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from dataflow.messages import Image, Image16, Transforms
@@ -18,6 +19,7 @@ from dataflow.messages import PointCloud as CloudMessage
 from dataflow.recording import RecordingError
 from dataflow.recording.streams.codecs import SchemaText
 from dataflow.recording.streams.foreign import foreign_decoder, foreign_losses
+from dataflow.recording.streams.foxglove.values import orientation_of
 
 HALF = float(np.sqrt(0.5))
 
@@ -115,3 +117,15 @@ def test_16_bit_images_keep_their_bits() -> None:
 
     assert isinstance(found, Image16)
     assert found.data.tolist() == pixels.tolist()
+
+
+@pytest.mark.parametrize(
+    ("sent", "read"),
+    [
+        ((0, 0, 0, 0), (0, 0, 0, 1)),  # not set, which is usual where a pose is a place alone
+        ((0, 0, 3, 4), (0, 0, 0.6, 0.8)),
+        ((0, 0, 0.0004, 1), (0, 0, 0.0004, 1)),
+    ],
+)
+def test_orientations_of_others_are_read_as_those_of_ros(sent: tuple[float, ...], read: tuple[float, ...]) -> None:
+    assert orientation_of(Quaternion(**dict(zip("xyzw", sent, strict=True)))) == pytest.approx(read, abs=1e-15)

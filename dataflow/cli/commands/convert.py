@@ -161,19 +161,7 @@ def convert(
         _check_output(output, to, overwrite)
         scales = _depth_scales(depth or (), to)
         if to == "rrd":
-            from dataflow.cli.support.drawing import draw_recording, drawn_as_json, report
-            from dataflow.view import Save
-
-            with _complete(output) as place:
-                drawn = draw_recording(recording, Save(place), streams, without, start, end, clock, strict=strict)
-            done = _left_by_rrd(recording)
-            if json:
-                told = {"left_out": done.left_out, "source": drawn.account.as_json()}
-                print_json(drawn_as_json(drawn.sink, output) | told)
-                _fail_if_short(drawn.account)
-            else:
-                _print_left_out(done)
-                report(drawn, output)
+            _draw(recording, output, streams, without, start, end, clock, strict=strict, json=json)
             return
         from dataflow.interop.playing import Wishes
 
@@ -206,6 +194,33 @@ def convert(
     for file in files:
         out.print(f"wrote {escape(file)}", soft_wrap=True)
     _fail_if_short(account)
+
+
+def _draw(
+    recording: Path,
+    output: Path,
+    streams: list[str] | None,
+    without: list[str] | None,
+    start: float | None,
+    end: float | None,
+    clock: Literal["auto", "header", "log"],
+    *,
+    strict: bool,
+    json: bool,
+) -> None:
+    from dataflow.cli.support.drawing import draw_recording, drawn_as_json, report
+    from dataflow.view import Save
+
+    with _complete(output) as place:
+        drawn = draw_recording(recording, Save(place), streams, without, start, end, clock, strict=strict)
+    done = _left_by_rrd(recording)
+    if json:
+        told = {"left_out": done.left_out, "source": drawn.account.as_json()}
+        print_json(drawn_as_json(drawn.sink, output) | told)
+        _fail_if_short(drawn.account)
+    else:
+        _print_left_out(done)
+        report(drawn, output)
 
 
 def _left_by_rrd(recording: Path) -> Exported:

@@ -64,7 +64,7 @@ def info(
     with friendly_errors():
         if is_foreign(existing_recording(recording)):
             if digests:
-                raise fail("--digests tells of recordings; messages of a bag have none")
+                raise fail("--digests is of recordings; messages of a bag have none")
             describe_bag(recording, metadata=metadata, json=json)
             return
     with friendly_errors(), Recording(recording) as opened:

@@ -179,8 +179,7 @@ def replay(
             words = (recording, given, maps or (), clock, start, end, outputs, options)
             replay_bag(*words, strict=strict, began=began, json=json, quiet=quiet, verbose=verbose)
             return
-        refuse_of_recording(recording, clock, strict=strict)
-        with Recording(recording) as opened:
+        with Recording(refuse_of_recording(recording, clock, strict=strict)) as opened:
             loaded = _recorded_graph(opened, network=network) if given is None else given
             if complete is not None:
                 others = (start, end, rate, record, view, place)

@@ -279,11 +279,12 @@ def check_offset(option: str, value: float | None) -> None:
         raise fail(f"{option} {value:g}: expected seconds from the recording's first message, 0 or more")
 
 
-def refuse_of_recording(path: Path, clock: str, *, strict: bool = False) -> None:
-    """Refuses options of bags for a recording, where they have no effect."""
+def refuse_of_recording(path: Path, clock: str, *, strict: bool = False) -> Path:
+    """Returns the path of a recording; refuses options of bags, which have no effect on it."""
     options = [word for word, given in (("--clock", clock != "auto"), ("--strict", strict)) if given]
     if options:
         raise fail(f"{' and '.join(options)}: {path} is a recording, whose messages have stamps; of bags alone")
+    return path
 
 
 def window(

@@ -63,7 +63,7 @@ def together(
     material: Material, anchor: str, others: Mapping[str, type[Message]], done: Exported
 ) -> Iterator[tuple[Recorded, dict[str, Any]]]:
     """Each message of a stream with the nearest one of every other, as its type, if there is one within `PAIR_WITHIN`;
-    of two as near the earlier. What is farther from all that are to come is not held.
+    of two as near the earlier. Messages are held as long as one that is to come may be near them.
     """
     waiting: deque[Recorded] = deque()
     held: dict[str, deque[Any]] = {stream: deque() for stream in others}

@@ -145,7 +145,7 @@ def _compressed_depth(format_: str, data: Any, frame: str, stamp: int) -> Compre
     if len(body) < _RVL_SIZE.size or not (rvl or body[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE):
         raise RecordingError(
             f"a compressed depth image of format {format_!r} must hold a PNG after its header of "
-            f"{_DEPTH_HEADER.size} bytes, or RVL where its format says so"
+            f"{_DEPTH_HEADER.size} bytes, or RVL where its format names it"
         )
     _, scale, offset = _DEPTH_HEADER.unpack(head)
     inverse = format_.startswith("32FC1") or (not format_.startswith("16UC1") and scale > 0)

@@ -144,7 +144,7 @@ def stored_rows(encoding: str, width: int, height: int, step: int, data: Pixels,
 
 
 def _unknown(encoding: str) -> str:
-    """What is wrong with an encoding that is not known, and what would be right."""
+    """The error text for an encoding that is not known, with those that are."""
     if found := re.fullmatch(r"(8|16|32|64)(U|S|F)C(\d+)", encoding):
         bits, kind, channels = found.groups()
         kinds = {"U": "unsigned numbers", "S": "signed numbers", "F": "floats"}

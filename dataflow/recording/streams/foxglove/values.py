@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion as QuaternionPro
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from dataflow.messages.checks import QUATERNION_TOLERANCE
 from dataflow.messages.geometry import transform_matrix
 from dataflow.recording.errors import RecordingError
 
@@ -94,4 +96,11 @@ def position_of(proto: Any) -> list[float]:
 
 
 def orientation_of(proto: Any) -> list[float]:
-    return [proto.x, proto.y, proto.z, proto.w]
+    """x, y, z, w: of one that is not set (all zeros) the identity, any other of length 1; messages of ours have it."""
+    found = [proto.x, proto.y, proto.z, proto.w]
+    norm = math.hypot(*found)
+    if norm == 0.0:
+        return [0.0, 0.0, 0.0, 1.0]
+    if not math.isfinite(norm) or abs(norm - 1.0) <= QUATERNION_TOLERANCE:
+        return found
+    return [value / norm for value in found]
