@@ -113,7 +113,9 @@ def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
     return math.sqrt(float(np.mean(np.square(errors)))), ends, text
 
 
-def driven(seed: int, seconds: int, rate: int = 100):  # type: ignore[no-untyped-def]
+def driven(  # type: ignore[no-untyped-def]
+    seed: int, seconds: int, rate: int = 100, speed: float = 0.5, bias: tuple[float, float] = (0.005, 0.05)
+):
     """Inertial samples, positions of the antenna, true poses by stamp, and extrinsics of a drive in the simulator.
 
     They are made of the true trajectory: nothing is drawn, so that many runs are cheap.
@@ -125,7 +127,7 @@ def driven(seed: int, seconds: int, rate: int = 100):  # type: ignore[no-untyped
     rng = np.random.default_rng([seed, 7])
     imu, gnss = Inertial(), Gnss()
     world = ("office", "corridor", "table_top")[seed % 3]
-    path = make_world(world, seed, speed=0.5, hold=0.0, movers=False).path
+    path = make_world(world, seed, speed=speed, hold=0.0, movers=False).path
     t = np.arange(seconds * rate) / rate
     motion = path.at(t)
     c, s = np.cos(motion.yaw), np.sin(motion.yaw)
@@ -137,11 +139,11 @@ def driven(seed: int, seconds: int, rate: int = 100):  # type: ignore[no-untyped
     force = np.column_stack([c * ax + s * ay, -s * ax + c * ay, flat + imu.gravity])
     force += np.cross(turning, lever) + np.cross(gyro, np.cross(gyro, lever))
     white = math.sqrt(rate)
-    for value, bias, noise, walk in (
-        (gyro, 0.005, imu.gyro_noise, imu.gyro_walk),
-        (force, 0.05, imu.accel_noise, imu.accel_walk),
+    for value, biased, noise, walk in (
+        (gyro, bias[0], imu.gyro_noise, imu.gyro_walk),
+        (force, bias[1], imu.accel_noise, imu.accel_walk),
     ):
-        value += rng.normal(0, bias, 3) + np.cumsum(rng.normal(0, walk / white, value.shape), axis=0)
+        value += rng.normal(0, biased, 3) + np.cumsum(rng.normal(0, walk / white, value.shape), axis=0)
         value += rng.normal(0, noise * white, value.shape)
     stamps = np.round(t * 1e9).astype(np.int64).tolist()
     C, D = np.eye(3) * (imu.gyro_noise * white) ** 2, np.eye(3) * (imu.accel_noise * white) ** 2
@@ -226,8 +228,11 @@ def simulator(
     return ends, nees, errors, expected
 
 
-def wheels_of(truth: Mapping[int, Any], every: int, rng: np.random.Generator) -> list[Any]:
-    """Returns odometry of wheels of every so many true poses (4, 4) by stamp, with noise of 1 cm/s and 0.01 rad/s."""
+def wheels_of(
+    truth: Mapping[int, Any], every: int, rng: np.random.Generator, wrong: tuple[float, float] = (0, 0), by: float = 1.0
+) -> list[Any]:
+    """Returns odometry of wheels of every so many true poses (4, 4) by stamp, with noise of 1 cm/s and 0.01 rad/s;
+    between two times (s) they turn by a factor of what they should."""
     from dataflow.messages import Odometry
     from operators.geometry import se3
 
@@ -241,7 +246,9 @@ def wheels_of(truth: Mapping[int, Any], every: int, rng: np.random.Generator) ->
                 child_frame="base_link",
                 position=np.zeros(3),
                 orientation=np.array([0.0, 0, 0, 1]),
-                linear=np.array([twist[0] + rng.normal(0, 0.01), 0, 0]),
+                linear=np.array(
+                    [(twist[0] + rng.normal(0, 0.01)) * (by if wrong[0] <= stamp * 1e-9 < wrong[1] else 1.0), 0, 0]
+                ),
                 angular=np.array([0, 0, twist[5] + rng.normal(0, 0.01)]),
                 twist_covariance=np.eye(6) * 1e-4,
             )
