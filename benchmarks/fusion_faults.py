@@ -1,4 +1,4 @@
-"""Sensors that are wrong, fused: how often the error stays within three claimed deviations, or a warning says why.
+"""Sensors that are wrong, fused: how often the error stays within three claimed deviations, or a warning is out.
 
     python benchmarks/fusion_faults.py [FAULT ...] [--seeds 1-4] [--seconds 30]
 
