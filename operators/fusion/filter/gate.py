@@ -143,7 +143,7 @@ def leap(
 
     A leap begins with the first measurement that is refused. It lasts until the sensor is nearer to where it was
     expected than to what was refused last, or has gone on for as far again, or something of another kind agrees with
-    it, or the filter's own errors have come to be as large. What one device says under several names leaps together:
+    it, or the filter's own errors have come to be as large. One device leaps under all its names:
     wheels that stand say so by a speed, a standstill and no turn, in turns. A sensor of a kind that the filter never
     yields to does not leap. `unfelt`: standard deviation (m/s²) of what the inertial sensor may fail to feel.
     """
