@@ -113,6 +113,29 @@ def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
     return math.sqrt(float(np.mean(np.square(errors)))), ends, text
 
 
+def fixes_of(stamps: Sequence[int], truth: Mapping[int, Any], lever: Any, rng: np.random.Generator) -> list[Any]:
+    """Returns positions of an antenna (3,) on the body with 2 cm of noise, 4 cm vertically, none in outages."""
+    from dataflow.messages import Pose
+
+    sigma = np.array([0.02, 0.02, 0.04])
+    covariance = np.diag([*sigma**2, 1.0, 1.0, 1.0])
+    fixes = []
+    for stamp in stamps:
+        if stamp * 1e-9 % PERIOD < PERIOD - OUTAGE:
+            place = truth[stamp][:3, :3] @ lever + truth[stamp][:3, 3] + sigma * rng.standard_normal(3)
+            fixes.append(
+                Pose(
+                    stamp=stamp,
+                    frame="world",
+                    child_frame="gnss",
+                    position=place,
+                    orientation=np.array([0.0, 0.0, 0.0, 1.0]),
+                    covariance=covariance,
+                )
+            )
+    return fixes
+
+
 def driven(  # type: ignore[no-untyped-def]
     seed: int, seconds: int, rate: int = 100, speed: float = 0.5, bias: tuple[float, float] = (0.005, 0.05)
 ):
@@ -120,7 +143,7 @@ def driven(  # type: ignore[no-untyped-def]
 
     They are made of the true trajectory: nothing is drawn, so that many runs are cheap.
     """
-    from dataflow.messages import Imu, Pose, Transforms
+    from dataflow.messages import Imu, Transforms
     from operators.simulator.settings import Gnss, Inertial
     from operators.simulator.worlds.make import make_world
 
@@ -159,22 +182,7 @@ def driven(  # type: ignore[no-untyped-def]
         for stamp, w, f in zip(stamps, gyro, force, strict=True)
     ]
     truth = dict(zip(stamps, motion.T_world_base(), strict=True))
-    sigma = np.array([0.02, 0.02, 0.04])
-    covariance = np.diag([*sigma**2, 1.0, 1.0, 1.0])
-    fixes = []
-    for stamp in stamps[:: max(rate // 20, 1)]:
-        if stamp * 1e-9 % PERIOD < PERIOD - OUTAGE:
-            place = truth[stamp][:3, :3] @ gnss.mount[:3] + truth[stamp][:3, 3] + sigma * rng.standard_normal(3)
-            fixes.append(
-                Pose(
-                    stamp=stamp,
-                    frame="world",
-                    child_frame="gnss",
-                    position=place,
-                    orientation=np.array([0.0, 0.0, 0.0, 1.0]),
-                    covariance=covariance,
-                )
-            )
+    fixes = fixes_of(stamps[:: max(rate // 20, 1)], truth, gnss.mount[:3], rng)
     extrinsics = Transforms(
         stamp=0,
         frames=("base_link", "base_link"),
