@@ -143,13 +143,14 @@ def leap(
 
     A leap begins with the first measurement that is refused. It lasts until the sensor is nearer to where it was
     expected than to what was refused last, or has gone on for as far again, or something of another kind agrees with
-    it, or the filter's own errors have come to be as large. A sensor of a kind that the filter never yields to does not
-    leap. `unfelt`: standard deviation (m/s²) of what the inertial sensor may fail to feel.
+    it, or the filter's own errors have come to be as large. One device leaps under all its names:
+    wheels that stand say so by a speed, a standstill and no turn, in turns. A sensor of a kind that the filter never
+    yields to does not leap. `unfelt`: standard deviation (m/s²) of what the inertial sensor may fail to feel.
     """
+    own, fits = health.get(sensor, Health()), normalised <= threshold(config.share, len(doubt.residual))
+    beside = 0.0 if fits or config.agreeing >= NEVER_AGREE else _beside(config, sensor, doubt, health)
     if config.agreeing >= NEVER_AGREE or doubt.kind not in (*PLACES, "Velocity"):
-        return 0.0
-    own = health.get(sensor, Health())
-    fits = normalised <= threshold(config.share, len(doubt.residual))
+        return beside
     if fits and not own.leap:
         return 0.0
     if doubt.kind == "FullPose":  # the rotation aside, of which an acceleration is no witness
@@ -166,7 +167,22 @@ def leap(
     begins = not fits and last and not recent  # what goes astray bit by bit has not leapt
     if begins and _leaps(config, doubt, state, H, unfelt, (doubt.time - last) * 1e-9):
         size = float(np.linalg.norm(doubt.residual))
+    size = size or (0.0 if recent else beside)
     return 0.0 if size and _witnessed(config, sensor, doubt, health) else size
+
+
+def _beside(config: GateConfig, sensor: str, doubt: Doubt, health: Mapping[str, Health]) -> float:
+    """Returns by how much the same device has leapt lately under another name, 0 if it has not."""
+    device = sensor.partition(" ")[0]
+    return max(
+        (
+            other.leap
+            for name, other in health.items()
+            if name != sensor and name.partition(" ")[0] == device and other.doubts
+            and doubt.time - other.doubts[-1].time <= config.lasting * 1e9
+        ),
+        default=0.0,
+    )  # fmt: skip
 
 
 def _squared(residual: Array, covariance: Array) -> float:
