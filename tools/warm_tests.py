@@ -31,7 +31,7 @@ PR_SET_CHILD_SUBREAPER = 36
 
 @dataclass
 class Outcome:
-    """What a run of tests gave: whether all passed, those that failed, seconds by test, libraries it imported."""
+    """Outcome of a run of tests: whether all passed, those that failed, seconds by test, libraries it imported."""
 
     passed: bool = False
     failed: list[str] = field(default_factory=list)

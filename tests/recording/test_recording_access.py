@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from example_messages import example
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 
 from dataflow.messages import CameraInfo, Imu, Message, Odometry
 from dataflow.messages.base import is_built_in, message_types
 from dataflow.recording import Recording, RecordingError, RecordingWriter
 from dataflow.recording.streams import access
-from dataflow.recording.streams.foxglove import file_descriptor_set
 
 
 def imu(stamp: int, **fields: object) -> Imu:
@@ -98,11 +98,12 @@ def test_columns_of_another_programs_stream_are_those_of_its_messages(tmp_path: 
     with path.open("wb") as out:
         writer = Writer(out)
         writer.start()
-        schema = writer.register_schema("foxglove.RawImage", "protobuf", file_descriptor_set(RawImage))
-        channel = writer.register_channel("/grey", "protobuf", schema)
+        schema = writer.register_schema("foxglove.RawImage", "jsonschema", b"{}")
+        channel = writer.register_channel("/grey", "json", schema)
         for k in range(3):
-            image = RawImage(width=2, height=1, encoding="mono8", step=2, data=bytes([k, k + 1]), frame_id=f"camera{k}")
-            writer.add_message(channel, log_time=k, publish_time=k, data=image.SerializeToString())
+            image = {"width": 2, "height": 1, "encoding": "mono8", "step": 2, "frame_id": f"camera{k}"}
+            data = json.dumps({**image, "data": base64.b64encode(bytes([k, k + 1])).decode()}).encode()
+            writer.add_message(channel, log_time=k, publish_time=k, data=data)
         writer.finish()
 
     with Recording(path) as recording:

@@ -12,7 +12,7 @@ from dataflow.chaos.plan import Fault
 from dataflow.recording.parts import Storage
 from dataflow.records.firing import Emission, FiringRecord
 from dataflow.supervision.core.closing import SHORTEST
-from dataflow.supervision.core.commands import Send, Signal, Spawn
+from dataflow.supervision.core.commands import Command, Send, Signal, Spawn
 from dataflow.supervision.core.events import Begin, ClockMeasured, Died, LinkChanged, NotReading, Said, Tick
 from dataflow.sync import FOREVER
 
@@ -280,6 +280,64 @@ def test_what_did_not_reach_a_consumer_is_counted_against_it() -> None:
 
     assert play.core.status.drops["sum"] == {("x", "missed"): 5}
     assert play.core.status.operators["sum"].dropped == 5
+
+
+BLOCKS = f"slow: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, {AGAIN}}}"
+SLOW = BLOCKS.replace("{restart", "{queue: newest, size: 1, restart")
+NO_POLICY = SLOW.replace(", restart: {max: 2, backoff: 100ms}", "")
+
+
+def backlog_while_at_a_call(slow: str, *, seconds: float, done: int) -> tuple[Play, list[Command]]:
+    """A source drops, since much waits for `slow`, which has done all up to a stamp and has since been at one call;
+    another operator is at stamp 100 of 1000."""
+    play = Play(LEFT, slow, OTHER, live=True).starts()
+    play.tell(play.progress("left", {"left": 1}))
+    play.tell(play.progress("slow", {"slow": done}), play.progress("other", {"other": 100}))
+    play.tell(play.progress("left", {"left": 1000}), play.beat("slow", ("slow", done + 1, seconds)))
+    return play, play.tell(Said("left", "backlog", {"messages": 50, "bytes": 2_000_000}))
+
+
+def test_an_operator_that_hangs_while_sources_drop_is_killed_and_restarted_by_its_policy() -> None:
+    play, told = backlog_while_at_a_call(SLOW, seconds=90.0, done=5)
+
+    assert killed(told) == ["slow"]
+    (note,) = [note for note in play.core.status.notes if "hangs" in note]
+    assert note == (
+        "process 'slow' hangs in 'slow': its firing at stamp 6 has taken 90.0 s, and 50 messages (2.0 MB) wait; "
+        "started again in 0.1 s"
+    )
+
+
+def test_an_operator_without_a_policy_that_hangs_ends_the_run_with_what_would_help() -> None:
+    play, _ = backlog_while_at_a_call(NO_POLICY, seconds=90.0, done=5)
+
+    assert "wait: give it a `deadline` or a restart policy" in play.failure()
+
+
+@pytest.mark.parametrize(
+    ("slow", "seconds", "done"),
+    [(SLOW, 1.0, 5), (SLOW, 90.0, 900), (BLOCKS, 90.0, 5)],
+    ids=["short", "ahead", "blocks"],
+)
+def test_a_short_call_one_that_is_not_behind_and_one_that_sources_wait_for_are_no_hang(
+    slow: str, seconds: float, done: int
+) -> None:
+    play, told = backlog_while_at_a_call(slow, seconds=seconds, done=done)
+
+    assert killed(told) == []
+    assert play.over is None
+
+
+def test_a_source_that_was_started_again_is_told_anew_how_far_its_consumers_are() -> None:
+    play = Play(f"left: {{use: runtime_operators:Counter, {AGAIN}}}", OTHER, live=True).starts()
+    play.tell(play.progress("left", {"left": 100}), play.progress("other", {"other": 100}))
+    (before, *_) = [fields for _, fields in sent(play.commands, "covered")[-1:]]
+
+    play.dies("left", -9)
+    told = play.wait(1.0)
+
+    assert spawned(told) == ["left"]
+    assert [fields for label, fields in sent(told, "covered") if label == "left"][-1:] == [before]
 
 
 def test_a_robot_at_which_nothing_happens_goes_on() -> None:

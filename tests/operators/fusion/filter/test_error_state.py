@@ -193,3 +193,9 @@ def test_rest_is_told_from_motion() -> None:
         gyro, accel = Motion().readings(t + begin)
         samples = [Sample(k, w, f, NOISE) for k, (w, f) in enumerate(zip(gyro, accel, strict=True))]
         assert rests(samples, Prior()) is expected
+
+
+def test_a_covariance_stays_symmetric_as_time_passes() -> None:
+    P = propagated(state(), np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.2, 9.7]), 0.1, NOISE, GRAVITY).covariance
+
+    np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-12)

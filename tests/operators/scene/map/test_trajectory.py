@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dataflow.messages import Path
 from operators.scene.map.cells import Cells
 from operators.scene.map.trajectory import Correction, Trajectory
 
@@ -46,3 +47,64 @@ def test_memory_of_the_way_is_bounded_however_long_it_is() -> None:
     for k in range(100):
         trajectory.add((20_000 + k) * STEP, motion(2000.0, 0, 0))
     assert trajectory.stamps[-1] <= 20_000 * STEP  # who stands adds nothing
+
+
+def keyframes(times: list[int], poses: list[np.ndarray[Any, np.dtype[np.float64]]], **more: Any) -> Path:
+    """Keyframes at these poses, which turn about z alone."""
+    yaws = [np.arctan2(T[1, 0], T[0, 0]) for T in poses]
+    return Path(
+        stamp=times[-1],
+        **{
+            "frame": "world",
+            "stamps": times,
+            "positions": np.array([T[:3, 3] for T in poses]),
+            "orientations": np.array([[0, 0, np.sin(yaw / 2), np.cos(yaw / 2)] for yaw in yaws]),
+        }
+        | more,
+    )
+
+
+def drifted() -> Trajectory:
+    """A straight way of ten poses, one metre each."""
+    trajectory = Trajectory()
+    for k in range(10):
+        trajectory.add(k * STEP, motion(float(k), 0, 0))
+    return trajectory
+
+
+def test_keyframes_move_the_poses_at_their_times_and_those_behind_them_as_the_last() -> None:
+    trajectory = drifted()
+    turned = motion(4.0, 1.0, 0.3)
+
+    correction = trajectory.corrected(
+        keyframes([2 * STEP, 5 * STEP // 2, 4 * STEP], [motion(2, 0, 0), motion(2.5, 0, 0), turned])
+    )
+
+    assert correction is not None
+    assert correction.stamps == [2 * STEP, 5 * STEP // 2, 4 * STEP]
+    np.testing.assert_allclose(correction.motions[:2], np.stack([np.eye(4)] * 2), atol=1e-9)
+    by = turned @ np.linalg.inv(motion(4, 0, 0))
+    np.testing.assert_allclose(correction.motions[2], by, atol=1e-9)
+    assert trajectory.stamps == [2 * STEP, 5 * STEP // 2, *(k * STEP for k in range(4, 10))]
+    np.testing.assert_allclose(trajectory.poses[2], turned, atol=1e-9)
+    for k in range(5, 10):
+        np.testing.assert_allclose(trajectory.poses[k - 2], by @ motion(float(k), 0, 0), atol=1e-9)
+
+
+def test_keyframes_that_agree_move_nothing_and_those_of_other_times_are_passed_over() -> None:
+    trajectory = drifted()
+    known = keyframes([-STEP, 0, 9 * STEP, 20 * STEP], [motion(x, 0, 0) for x in (-7.0, 0.0, 9.0, 50.0)])
+
+    correction = trajectory.corrected(known)
+
+    assert correction is not None
+    assert correction.stamps == [0, 9 * STEP]
+    np.testing.assert_allclose(correction.motions, np.stack([np.eye(4)] * 2), atol=1e-9)
+    assert Trajectory().corrected(known) is None
+    assert drifted().corrected(keyframes([20 * STEP], [motion(0, 0, 0)])) is None
+
+
+@pytest.mark.parametrize("lacks", ["stamps", "orientations"])
+def test_keyframes_without_times_or_directions_are_refused(lacks: str) -> None:
+    with pytest.raises(ValueError, match=f"the keyframes have no {lacks}"):
+        drifted().corrected(keyframes([0], [motion(0, 0, 0)], **{lacks: None}))
