@@ -73,8 +73,10 @@ def test_a_clock_that_compiled_code_reads_is_named(tmp_path: Path) -> None:
 def test_the_line_that_writes_into_an_input_is_named(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "Writes")
 
-    found = why(path, verify(path), "Writes")
+    shown: list[tuple[str, int, str]] = []
+    found = why(path, verify(path), "Writes", progress=lambda *told: shown.append(told))
 
+    assert shown == [("Writes", 1, "its lines are watched")]
     [cause] = found.causes
     assert cause.kind == "input written to"
     assert [LINES[site.line - 1].strip() for site in cause.sites] == ["rows += 1"]
