@@ -6,7 +6,7 @@ import pickle
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from glob import glob
@@ -17,7 +17,18 @@ from typing import Any
 
 from dataflow.causes.interventions import Interventions
 from dataflow.causes.places import Places
-from dataflow.causes.sources import COMPILED, HASHES, HEAP, INPUT, LOCALE, MODULE, THREADS
+from dataflow.causes.sources import (
+    CHANCE,
+    COMPILED,
+    HASHES,
+    HEAP,
+    INPUT,
+    LOCALE,
+    MODULE,
+    THREADS,
+    kind_of,
+    name_of,
+)
 from dataflow.causes.traps import Site, Traps
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.judge import Judge
@@ -30,6 +41,8 @@ from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.verification.workers.board import Board
 
+SHOWN = 3
+"""Sources that are listed of one re-run."""
 _PATTERN, _OTHER_PATTERN = "90", "85"
 """Of `MALLOC_PERTURB_`: glibc fills fresh memory with its complement."""
 _MOMENT, _OTHER_MOMENT = "2026-01-02 03:04:05", "2027-10-11 12:13:14.567891234"
@@ -45,6 +58,16 @@ class Setting:
     varied: frozenset[str] = frozenset()
     log: bool = False
     lines: bool = False
+
+    @property
+    def words(self) -> str:
+        """Returns what is tried, in words."""
+        if self.log or self.lines:
+            return "its reads are logged" if self.log else "its lines are watched"
+        if self.fixed:
+            free = [source for source in CHANCE if source not in self.fixed]
+            return f"free: {_listed(free)}" if free else "all sources of chance fixed"
+        return f"changed: {_listed(sorted(self.varied))}" if self.varied else "once more as it is"
 
     def environment(self) -> dict[str, str]:
         """Returns the variables of its process, besides those of every worker."""
@@ -68,6 +91,11 @@ class Setting:
     @staticmethod
     def from_wire(values: Mapping[str, Any]) -> Setting:
         return Setting(frozenset(values["fixed"]), frozenset(values["varied"]), values["log"], values["lines"])
+
+
+def _listed(sources: Sequence[str]) -> str:
+    named = [f"{kind_of(source)} {name_of(source)}".rstrip() for source in sources[:SHOWN]]
+    return ", ".join(named) + (f" and {len(sources) - SHOWN} more" if len(sources) > SHOWN else "")
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,12 @@ FROM_THE_START = 500
 SECONDS = 60.0
 """Time for the calls of one re-run."""
 SITES_SHOWN = 3
+Progress = Callable[[str, int, str], None]
+"""Is called before each re-run with the operator, the number of the re-run, from 1, and what it tries, in words."""
+
+
+def _unseen(operator: str, number: int, tried: str) -> None:
+    """Shows nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,19 +114,21 @@ def why(
     seconds: float = SECONDS,
     stall_timeout: float = 120.0,
     workers: Workers = call_workers,
+    progress: Progress = _unseen,
 ) -> Why:
     """Finds the causes for which an operator does not repeat, by at most `MOST` re-runs of it alone.
 
     `report`: that of verifying the recording (with `graph`, if it was verified against another). `seconds`: time for
-    the calls of one re-run; `stall_timeout`: seconds allowed without progress. An operator that cannot be re-run, or
-    that makes what was recorded, is refused, with the reason.
+    the calls of one re-run; `stall_timeout`: seconds allowed without progress. `progress` is told of each re-run. An
+    operator that cannot be re-run, or that makes what was recorded, is refused, with the reason.
     """
     began = time.monotonic()
     verification = next((v for v in report.operators if v.operator == operator), None)
     if refused := refusal(report, operator, verification):
         return Why(operator, refused=refused)
     assert verification is not None
-    alone = _Alone(path, graph, verification, seconds=seconds, stall_timeout=stall_timeout, workers=workers)
+    bounds = {"seconds": seconds, "stall_timeout": stall_timeout}
+    alone = _Alone(path, graph, verification, **bounds, workers=workers, progress=progress)
     changed, known = report.altered(operator), verification.code_known
     revised = bool(report.revised(operator))
     try:
@@ -202,8 +210,11 @@ class _Alone:
         seconds: float,
         stall_timeout: float,
         workers: Workers,
+        progress: Progress,
     ) -> None:
-        name, self._workers, self._stall_timeout = found.operator, workers, stall_timeout
+        name = self._operator = found.operator
+        self._workers, self._stall_timeout = workers, stall_timeout
+        self._progress, self._fired = progress, 0
         with Recording(path) as recording:
             played = graph or graph_that_is_here(recording)[0]
             log = FiringLog.read(recording)
@@ -237,6 +248,8 @@ class _Alone:
 
     def fire(self, setting: Setting) -> Rerun:
         """Re-runs the operator in a new process. Raises `RunFailed`."""
+        self._fired += 1
+        self._progress(self._operator, self._fired, setting.words)
         call = Call(
             f"{run_again.__module__}:{run_again.__name__}",
             {**self._request, "setting": setting.to_wire()},
@@ -262,6 +275,12 @@ class _Alone:
         return max(status.st_mtime, status.st_ctime) > self.recorded
 
 
-def reasons(path: Path, report: VerifyReport, operators: Sequence[str], graph: Graph | None = None) -> list[Why]:
+def reasons(
+    path: Path,
+    report: VerifyReport,
+    operators: Sequence[str],
+    graph: Graph | None = None,
+    progress: Progress = _unseen,
+) -> list[Why]:
     """Returns the answer for each of `operators`, or for the culprits where none are named."""
-    return [why(path, report, name, graph=graph) for name in operators or report.culprits]
+    return [why(path, report, name, graph=graph, progress=progress) for name in operators or report.culprits]

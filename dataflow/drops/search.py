@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import re
 import time
@@ -28,6 +29,8 @@ from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, s
 from dataflow.sync import FOREVER, NEVER
 
 SECONDS = 60.0
+FUNCTIONS: Mapping[str, Callable[..., Any]] = {f.__name__: f for f in (abs, min, max, round, sum, len, any, all)}
+"""Functions that an expression may call."""
 
 
 class DropsError(ReplayError):
@@ -35,7 +38,8 @@ class DropsError(ReplayError):
 
 
 class Worse:
-    """An expression that is true of figures that are bad, such as "ate_rmse_m > 0.05". Raises SyntaxError.
+    """An expression that is true of figures that are bad, such as "ate_rmse_m > 0.05" or "abs(end_error_m) > 1". It may
+    call `FUNCTIONS`. Raises SyntaxError.
 
     Names are those of figures, without what follows where only one begins so (of several the one that goes on with
     `rmse`), or OPERATOR.FIGURE where several operators have it; other characters than letters and digits are `_`.
@@ -44,8 +48,13 @@ class Worse:
     def __init__(self, text: str, summaries: Figures) -> None:
         self.text = text
         self._code = compile(text, "<worse>", "eval")
+        called = {
+            n.func.id for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)
+        }
+        if unknown := sorted(called - FUNCTIONS.keys()):
+            raise DropsError(f"--worse {text}: no function {', '.join(unknown)}; there are: {', '.join(FUNCTIONS)}")
         self._plain = {o: {_word(n): v for n, v in found.items()} for o, found in summaries.items()}
-        self._named = {name: self._meant(name) for name in self._code.co_names}
+        self._named = {name: self._meant(name) for name in self._code.co_names if name not in called}
         missing = [name for name, meant in self._named.items() if meant is None and not self._is_part(name)]
         if missing or not any(self._named.values()):
             known = ", ".join(sorted({n for found in self._plain.values() for n in found})) or "none"
@@ -59,7 +68,7 @@ class Worse:
     def is_true(self, figures: Figures) -> bool:
         """Returns whether it is true of figures. Raises `DropsError` where one is missing, or no number, or where it
         is not true and one is NaN."""
-        names: dict[str, Any] = {}
+        names: dict[str, Any] = {"__builtins__": FUNCTIONS}
         for name, meant in self._named.items():
             if meant is None:
                 continue

@@ -21,7 +21,7 @@ class MemoryGuard:
 
     def __init__(self, *, keeping: bool = False) -> None:
         self.keeping = keeping
-        self._taken: dict[int, tuple[str, str, Message, bytes]] = {}
+        self._taken: dict[int, tuple[dict[str, str], Message, bytes]] = {}
 
     def take(self, operator: str, firing: Firing) -> None:
         """To be called before a call, with what it is given."""
@@ -30,14 +30,17 @@ class MemoryGuard:
             for entry in entries_of(given):
                 message: Message = entry.value
                 if id(message) not in self._taken:
-                    self._taken[id(message)] = operator, name, message, message.compute_digest()
+                    self._taken[id(message)] = {}, message, message.compute_digest()
+                self._taken[id(message)][0].setdefault(operator, name)
 
     def changed(self, operator: str) -> str:
         """To be called after the call: the first message whose memory is not what it was, in words, or nothing."""
-        found = [key for key, (*_, message, digest) in self._taken.items() if message.compute_digest() != digest]
+        found = [key for key, (_, message, digest) in self._taken.items() if message.compute_digest() != digest]
         said = [self._words(operator, *self._taken.pop(key)) for key in found]
         return said[0] if said else ""
 
-    def _words(self, operator: str, owner: str, name: str, message: Message, _: bytes) -> str:
-        whose = f"its input {name!r}" if owner == operator else f"the input {name!r} of {owner}"
+    def _words(self, operator: str, names: dict[str, str], message: Message, _: bytes) -> str:
+        """`names`: of the inputs by which operators were given the message, the first of them first."""
+        owner = operator if operator in names else next(iter(names))
+        whose = f"its input {names[owner]!r}" if owner == operator else f"the input {names[owner]!r} of {owner}"
         return f"{whose} ({message.SCHEMA} at stamp {message.stamp})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,13 +23,16 @@ LOWER_IS_BETTER = frozenset({"error", "rmse", "ate", "rpe", "drift", "lost", "dr
 HIGHER_IS_BETTER = frozenset({"precision", "recall", "f1", "ap50", "iou", "miou", "accuracy"})
 FloatArray = NDArray[np.float64]
 ALPHA = 0.05
+SPREAD = 3
+"""Recordings from which an interval is taken."""
 
 
 @dataclass(frozen=True, slots=True)
 class Paired:
     """A figure by A and by B on the same recordings.
 
-    - `a`, `b`: means; `difference`: mean of B - A; `low`, `high`: its 95 % interval, by bootstrap over recordings.
+    - `a`, `b`: means; `difference`: mean of B - A; `low`, `high`: its 95 % interval, by bootstrap over recordings; None
+      for fewer than three, of which samples show no spread.
     - `p`: of Wilcoxon's signed-rank test, two-sided; `adjusted`: by Holm's method, for all figures compared.
     - `recordings`: (name, B - A), the worst for B first; the largest first where no word of the figure's name gives a
       direction (`directed`).
@@ -39,8 +43,8 @@ class Paired:
     a: float
     b: float
     difference: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
     p: float
     adjusted: float
     recordings: tuple[tuple[str, float], ...]
@@ -87,13 +91,36 @@ def compared(figures: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[P
     return adjusted
 
 
+def least_p(recordings: int, figures: int) -> float:
+    """Returns the smallest adjusted p that so many pairs can have: all differ in one direction. At least `ALPHA` means
+    that no difference can be shown."""
+    return min(1.0, 2.0 ** (1 - recordings) * figures)
+
+
+def needed(figures: int) -> int:
+    """Returns the number of recordings from which a difference can be shown among so many figures."""
+    return next(count for count in itertools.count(1) if least_p(count, figures) < ALPHA)
+
+
+def unlike(first: Sequence[Task], second: Sequence[Task]) -> tuple[list[Task], list[Task], dict[str, str]]:
+    """Returns the tasks by A and B without those of recordings that hold the same bytes as another, and these copies:
+    name → that of the recording that stands for it. A copy is no further evidence."""
+    seen: dict[str, str] = {}
+    copies = {}
+    for task in first:
+        if (name := seen.setdefault(task.source.digest, task.source.name)) != task.source.name:
+            copies[task.source.name] = name
+    a, b = ([task for task in tasks if task.source.name not in copies] for tasks in (first, second))
+    return a, b, copies
+
+
 def _paired(figure: str, given: Mapping[str, tuple[float, float]]) -> Paired:
     from scipy.stats import wilcoxon
 
     pairs = {name: pair for name, pair in given.items() if np.isfinite(pair).all()}
     values = np.array(list(pairs.values()), float)
     differences = values[:, 1] - values[:, 0]
-    low, high = np.quantile(_means(differences), (0.025, 0.975))
+    low, high = _interval(differences)
     p = float(wilcoxon(differences).pvalue) if differences.any() else 1.0
     lower, higher = bool(LOWER_IS_BETTER & words_of(figure)), bool(HIGHER_IS_BETTER & words_of(figure))
     named = list(zip(pairs, differences.tolist(), strict=True))
@@ -101,7 +128,14 @@ def _paired(figure: str, given: Mapping[str, tuple[float, float]]) -> Paired:
     a, b = values.mean(axis=0).tolist()
     left_out = tuple(name for name in given if name not in pairs)
     mean = float(differences.mean())
-    return Paired(figure, a, b, mean, float(low), float(high), p, p, tuple(named), lower or higher, left_out)
+    return Paired(figure, a, b, mean, low, high, p, p, tuple(named), lower or higher, left_out)
+
+
+def _interval(differences: FloatArray) -> tuple[float, float] | tuple[None, None]:
+    if len(differences) < SPREAD:
+        return None, None
+    low, high = np.quantile(_means(differences), (0.025, 0.975)).tolist()
+    return low, high
 
 
 def _means(differences: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from typing import Any, Literal, cast
 
 import xxhash
 
+from dataflow.recording.mcap.index import NO_END
 from dataflow.sweep.plan import Task
 from dataflow.sweep.warm import Worker
 
@@ -25,6 +26,8 @@ TRIES = 2
 """Times that a task is begun whose process was killed from outside."""
 LOG_BYTES = 1 << 16
 """Bytes kept of the end of a failed task's output."""
+EMPTY = "it holds no message for this graph"
+"""Of a recording of which nothing was replayed: its figures are of nothing."""
 PRINTED, LOG = "printed.json", "log.txt"
 WORKER_KILLED = f"was killed by {signal.SIGKILL.name}"
 """Of a worker of `dataflow verify`, as that reports it: for want of memory, as a rule."""
@@ -34,7 +37,8 @@ WORKER_KILLED = f"was killed by {signal.SIGKILL.name}"
 class Result:
     """The outcome of a task; `rows` hold one mapping for each operator, or a single one without it.
 
-    `code`: the exit code. `wall`: seconds. `log`: the end of what was printed, "" where all went well.
+    `code`: the exit code. `wall`: seconds. `log`: the end of what was printed, "" where all went well. `torn`: the
+    recording has no proper end, so the rows are of its stored part.
     """
 
     key: str
@@ -44,6 +48,7 @@ class Result:
     rows: tuple[Mapping[str, Any], ...]
     wall: float
     log: str = ""
+    torn: bool = False
 
     @property
     def final(self) -> bool:
@@ -82,7 +87,8 @@ def _once(task: Task, timeout: float, worker: Worker, stop: Event | None) -> Res
             words = [where if word is None else word for word in task.words]
             left = timeout - (time.monotonic() - began)
             code = worker.call("command", words, task.operators, output, left, stop)
-        said = output[1].read_bytes()[-LOG_BYTES:].decode(errors="replace")
+        printed = output[1].read_bytes()
+        said, torn = printed[-LOG_BYTES:].decode(errors="replace"), NO_END.encode() in printed
         report = _read(output[0])
     outcome: Outcome = (
         "done" if report is not None and (code == 0 or (task.what == "verify" and code == 1)) else "failed"
@@ -97,6 +103,8 @@ def _once(task: Task, timeout: float, worker: Worker, stop: Event | None) -> Res
         outcome = "not fetched"
     elif outcome == "failed" and WORKER_KILLED in said:
         outcome = "killed"
+    elif outcome == "done" and task.what != "verify" and report is not None and report["first_stamp"] is None:
+        outcome, last, report = "failed", EMPTY + (f", and {NO_END}" if torn else ""), None
     rows = () if report is None else verified(report) if task.what == "verify" else replayed(report)
     if task.what == "evaluate":
         rows = tuple(row for row in rows if row["figures"])
@@ -104,7 +112,9 @@ def _once(task: Task, timeout: float, worker: Worker, stop: Event | None) -> Res
             outcome, last = "failed", "no operator of the graph gives figures"
     wall, failed = time.monotonic() - began, outcome != "done"
     log = f"{said}\n{last}".strip() if failed else ""
-    return Result(task.key, outcome, -1 if code is None else code, last if failed else "", rows or ({},), wall, log)
+    return Result(
+        task.key, outcome, -1 if code is None else code, last if failed else "", rows or ({},), wall, log, torn
+    )
 
 
 def _read(printed: Path) -> dict[str, Any] | None:

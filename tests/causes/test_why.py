@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from dataflow.api.runs import run
 from dataflow.causes.ladder import Findings
-from dataflow.causes.rerun import Rerun
+from dataflow.causes.rerun import Rerun, fake_time
 from dataflow.causes.traps import Site
 from dataflow.causes.why import Cause, Why, _Alone, _answer, refusal, why
 from dataflow.cli.main import app
@@ -59,11 +59,24 @@ def test_the_command_names_two_causes_at_once_with_their_lines(tmp_path: Path) -
     assert answer["reruns"] <= 8
 
 
+@pytest.mark.long
+@pytest.mark.skipif(not fake_time(), reason="libfaketime (the [dev] extra) is not installed")
+def test_a_clock_that_compiled_code_reads_is_named(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", "Compiled")
+
+    found = why(path, verify(path), "Compiled")
+
+    assert [cause.kind for cause in found.causes] == ["clock read by compiled code"]
+    assert found.reruns <= 8
+
+
 def test_the_line_that_writes_into_an_input_is_named(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "Writes")
 
-    found = why(path, verify(path), "Writes")
+    shown: list[tuple[str, int, str]] = []
+    found = why(path, verify(path), "Writes", progress=lambda *told: shown.append(told))
 
+    assert shown == [("Writes", 1, "its lines are watched")]
     [cause] = found.causes
     assert cause.kind == "input written to"
     assert [LINES[site.line - 1].strip() for site in cause.sites] == ["rows += 1"]

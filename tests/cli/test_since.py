@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from dataflow.causes.why import Why
+from dataflow.causes.why import Cause, Why
 from dataflow.cli.commands.verification import _reasons
 from dataflow.cli.support.causes import _lines
 from dataflow.cli.support.verdicts import explain
@@ -63,9 +63,9 @@ def test_where_no_cause_was_found_and_all_is_as_recorded_nothing_is_said_to_have
 
 
 def test_files_that_have_an_effect_and_are_older_than_the_recording_are_named() -> None:
-    lines = list(_lines(Why("x", repeats=True, code_known=True, older=("file /etc/gain",), reruns=4)))
+    lines = list(_lines(Why("x", repeats=True, code_known=True, also=(Cause("file:/etc/gain"),), reruns=4)))
 
-    assert lines[1] == "x: it depends on what was not changed since the recording: file /etc/gain"
+    assert lines[1] == "x: its results also depend on file /etc/gain, older than the recording"
 
 
 def test_without_a_culprit_it_is_said_that_there_is_nothing_to_look_for(capsys: pytest.CaptureFixture[str]) -> None:

@@ -105,6 +105,29 @@ def test_a_figure_is_called_by_its_name_its_beginning_or_its_operator() -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "is_true"),
+    [
+        ("abs(end_error_m) > 1", True),
+        ("max(end_error_m, recall) > 1", False),
+        ("min(end_error_m, recall) < -1", True),
+        ("round(recall, 1) == 0.5 and sum((recall, recall)) == 1", True),
+        ("round > 2", True),  # a figure that has the name of a function
+    ],
+)
+def test_an_expression_may_call_functions(text: str, is_true: bool) -> None:
+    figures = {"track": {"end_error_m": -1.5, "recall": 0.5, "round_trip_ms": 3.0}}
+
+    assert Worse(text, figures).is_true(figures) == is_true
+
+
+def test_other_functions_are_refused_with_those_that_there_are() -> None:
+    with pytest.raises(
+        DropsError, match=r"no function open, sqrt; there are: abs, min, max, round, sum, len, any, all"
+    ):
+        Worse("sqrt(recall) > open('x')", {"track": {"recall": 0.5}})
+
+
+@pytest.mark.parametrize(
     ("worse", "problem"),
     [
         ("end_error_m > 50", "the recorded figures are not end_error_m > 50: score: end_error_m 30"),

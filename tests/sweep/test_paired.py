@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import binom, mannwhitneyu, wilcoxon
 
-from dataflow.sweep.paired import compared
+from dataflow.sweep.paired import ALPHA, compared, least_p, needed, unlike
 
 
 def worlds(rng: np.random.Generator, gain: float, count: int = 40) -> dict[str, tuple[float, float]]:
@@ -44,6 +46,8 @@ def test_p_is_that_of_scipy_and_the_interval_holds_the_difference() -> None:
     differences = np.diff(np.array(list(pairs.values()))).ravel()
     assert one.p == one.adjusted == pytest.approx(wilcoxon(differences).pvalue)
     assert one.difference == pytest.approx(differences.mean())
+    assert one.low is not None
+    assert one.high is not None
     assert one.low < one.difference < one.high
 
 
@@ -78,7 +82,36 @@ def test_the_worst_recordings_for_b_come_first() -> None:
 
 def test_figures_that_are_equal_do_not_differ() -> None:
     (one,) = compared({"x: n": {"a": (1.0, 1.0), "b": (2.0, 2.0)}})
-    assert (one.p, one.difference, one.low, one.high, one.differs) == (1.0, 0.0, 0.0, 0.0, False)
+    assert (one.p, one.difference, one.differs) == (1.0, 0.0, False)
+
+
+@pytest.mark.parametrize(("count", "has"), [(1, False), (2, False), (3, True)])
+def test_an_interval_needs_three_recordings(count: int, has: bool) -> None:
+    (one,) = compared({"x: n": {f"r{k}": (0.0, -3.5 - k) for k in range(count)}})
+    assert (one.low is not None, one.high is not None) == (has, has)
+
+
+@pytest.mark.parametrize(("figures", "recordings"), [(1, 6), (2, 7), (10, 9)])
+def test_the_least_p_that_recordings_can_have_goes_by_the_number_of_figures(figures: int, recordings: int) -> None:
+    worse = {f"x: figure {k}": {f"r{n}": (0.0, -float(1 + n)) for n in range(recordings)} for k in range(figures)}
+    assert needed(figures) == recordings
+    assert compared(worse)[0].adjusted == pytest.approx(least_p(recordings, figures))
+    assert all(one.differs for one in compared(worse))
+    assert least_p(recordings - 1, figures) >= ALPHA
+
+
+def test_copies_of_a_recording_count_once() -> None:
+    def tasks(side: str) -> list[Any]:
+        named = {"a": "1", "copy": "1", "b": "2"}
+        return [SimpleNamespace(source=SimpleNamespace(name=n, digest=d), side=side) for n, d in named.items()]
+
+    first, second, copies = unlike(tasks("A"), tasks("B"))
+
+    assert [(task.source.name, other.source.name) for task, other in zip(first, second, strict=True)] == [
+        ("a", "a"),
+        ("b", "b"),
+    ]
+    assert copies == {"copy": "a"}
 
 
 def test_recordings_without_a_number_are_left_out_and_named() -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.sweep import Again, Folder, Jobs, Patience, Ray, Recordings, work
+from dataflow.cli.commands.sweep import Again, Folder, Jobs, Patience, Ray, Recordings, print_torn, torn_of, work
 from dataflow.cli.support.again import take_environment
 from dataflow.cli.support.arguments import (
     Json,
@@ -22,7 +22,7 @@ from dataflow.cli.support.arguments import (
     graph_file,
     output_file,
 )
-from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
+from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, table
 from dataflow.cli.support.report import is_score
 from dataflow.cli.support.run_options import Quiet, Verbose
 
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 MOST_NAMED = 5
 """Recordings listed."""
-LEAST = 6
-"""Pairs that Wilcoxon's test needs for a p below 5 %."""
 EXPLAINED = 3
 """Recordings whose change is explained."""
 WHOLE = 0.9
@@ -131,9 +129,9 @@ def _prepare(graph: Path, first: Choice, explain: str | None, rerun: Path | None
 
 def _look(plan: Sweep, explain: str | None, rerun: Path | None, *, json: bool, verbose: bool) -> None:
     """Compares what is kept, and reports it."""
-    from dataflow.sweep.paired import compared, differing, figures_of
+    from dataflow.sweep.paired import compared, differing, figures_of, unlike
 
-    first, second = ([task for task in plan.tasks if task.settings == choice] for choice in plan.choices)
+    first, second, copies = unlike(*([t for t in plan.tasks if t.settings == choice] for choice in plan.choices))
     figures = compared(figures_of(first, second, plan.store))
     loaded = plan.graphs[plan.choices[0]]
     different = differing(first, second, plan.store, tuple(loaded.nodes) if loaded is not None else ())
@@ -141,7 +139,7 @@ def _look(plan: Sweep, explain: str | None, rerun: Path | None, *, json: bool, v
     shown = list(figures) if verbose or not scores else scores
     shares = None if explain is None else _explained(plan, _named(explain, figures), different)
     drawn = None if rerun is None or not figures else _drawn(plan, _named(explain, figures), rerun)
-    code = _report(plan, figures, shown, different, shares, json=json)
+    code = _report(plan, figures, shown, different, shares, copies, json=json)
     if drawn is not None and not json:
         out.print(Text(f"wrote {rerun}: A and B of {drawn} as layers"), soft_wrap=True)
     if code:
@@ -218,6 +216,7 @@ def _report(
     shown: Sequence[Paired],
     different: Sequence[Difference],
     shares: Sequence[Share] | None,
+    copies: Mapping[str, str],
     *,
     json: bool,
 ) -> int:
@@ -231,10 +230,13 @@ def _report(
                 "operators": [asdict(one) for one in different],
                 **({} if shares is None else {"explained": [asdict(one) for one in shares]}),
                 "failed": failed,
+                "copies": dict(copies),
+                "torn": torn_of(plan),
             }
         )
     else:
-        _print(shown, different)
+        _print(shown, different, len(figures))
+        _print_left_out(copies, torn_of(plan))
         if shares is not None:
             _print_shares(shares)
         for line in _failed_lines(failed):
@@ -270,7 +272,11 @@ def _failed_lines(failed: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield f"failed: {count(len(alike) - MOST_NAMED)} more: --json has all"
 
 
-def _print(shown: Sequence[Paired], different: Sequence[Difference]) -> None:
+def _print(shown: Sequence[Paired], different: Sequence[Difference], figures: int) -> None:
+    """Prints the figures `shown` of all `figures` that are compared."""
+    if not shown:
+        out.print("no figures to compare")
+        return
     columns = ("A", "B", "B - A", "95 % interval", "p", "recordings")
     made = table("figure", *columns, right=columns)
     for one in shown:
@@ -279,15 +285,14 @@ def _print(shown: Sequence[Paired], different: Sequence[Difference]) -> None:
             f"{one.a:.4g}",
             f"{one.b:.4g}",
             f"{one.difference:+.3g}",
-            f"{one.low:+.3g} to {one.high:+.3g}",
+            "–" if one.low is None else f"{one.low:+.3g} to {one.high:+.3g}",
             f"{one.adjusted:.3g}",
             count(len(one.recordings)),
         )
     out.print(made)
     real = [one for one in shown if one.differs]
-    out.print(f"{len(real)} of {len(shown)} figures differ at 5 %" if shown else "no figures to compare")
-    if shown and len(shown[0].recordings) < LEAST:
-        out.print(f"p stays above 5 % with fewer than {LEAST} recordings", soft_wrap=True)
+    out.print(f"{len(real)} of {len(shown)} figures differ at 5 %")
+    _say_least(max(len(one.recordings) for one in shown), figures)
     for one in (real or shown)[:1]:
         worst = ", ".join(f"{name} {value:+.3g}" for name, value in one.recordings[:MOST_NAMED])
         out.print(Text(f"{one.figure}, {'worst for B' if one.directed else 'the most'}: {worst}"), soft_wrap=True)
@@ -300,6 +305,25 @@ def _print(shown: Sequence[Paired], different: Sequence[Difference]) -> None:
             f"{d.operator} in {d.recordings}" + (f" (first in {d.first})" if d.first else "") for d in different
         )
         out.print(Text(f"outputs differ of: {listed}"), soft_wrap=True)
+
+
+def _say_least(recordings: int, figures: int) -> None:
+    """Notes where p cannot fall below 5 %."""
+    from dataflow.sweep.paired import ALPHA, least_p, needed
+
+    least = least_p(recordings, figures)
+    if least >= ALPHA:
+        of = f"{plural(recordings, 'recording')} and {plural(figures, 'figure')}"
+        text = f"with {of} no p is below {least:.3g}: a difference at 5 % needs {needed(figures)} recordings"
+        out.print(text, soft_wrap=True)
+
+
+def _print_left_out(copies: Mapping[str, str], torn: Sequence[str]) -> None:
+    for copy, name in list(copies.items())[:MOST_NAMED]:
+        out.print(Text(f"not counted: {copy} holds the same as {name}", style="yellow"), soft_wrap=True)
+    if len(copies) > MOST_NAMED:
+        out.print(f"not counted: {count(len(copies) - MOST_NAMED)} more copies: --json has all")
+    print_torn(torn)
 
 
 def _print_shares(shares: Sequence[Share]) -> None:

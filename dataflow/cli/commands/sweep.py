@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from dataflow.sweep.plan import What
     from dataflow.sweep.run import Sweep
 
+MOST_NAMED = 5
+"""Recordings listed."""
 Graph = Annotated[
     Path | None,
     typer.Argument(metavar="[GRAPH]", help="The graph. Default: of each recording the one that made it."),
@@ -162,14 +164,31 @@ def _report(plan: Sweep, spent: float, *, json: bool, verbose: bool) -> None:
     well = all(not set(s["outcomes"]) - {"done"} and not set(s["verdicts"]) - {"identical"} for s in summary)
     if json:
         facts = {"table": str(plan.table), "ran": len(plan.left), "known": len(plan.tasks) - len(plan.left)}
-        print_json({**facts, "wall_s": spent, "settings": summary})
+        print_json({**facts, "wall_s": spent, "settings": summary, "torn": torn_of(plan)})
     else:
         _print(summary, verbose=verbose)
+        print_torn(torn_of(plan))
         out.print(f"wrote {plan.table} in {seconds(spent)}", soft_wrap=True, markup=False)
         if any(set(s["outcomes"]) - {"done"} for s in summary):
             out.print(f"what the failed ones printed: {plan.folder / 'logs'}", soft_wrap=True, markup=False)
     if not well:
         raise typer.Exit(DIFFERENT)
+
+
+def torn_of(plan: Sweep) -> list[str]:
+    """Returns the recordings without a proper end, of which the stored part was run."""
+    results = ((task.source.name, plan.store.of(task.key)) for task in plan.tasks)
+    return list(
+        dict.fromkeys(n for n, found in results if found is not None and found.torn and found.outcome == "done")
+    )
+
+
+def print_torn(names: Sequence[str]) -> None:
+    """Names recordings that end before their run did."""
+    if names:
+        shown = ", ".join(names[:MOST_NAMED]) + (", …" if len(names) > MOST_NAMED else "")
+        text = f"without a proper end, only what is stored counts: {len(names)} ({shown}); dataflow recover mends them"
+        out.print(Text(text, style="yellow"), soft_wrap=True)
 
 
 def _print(summary: Sequence[Mapping[str, Any]], *, verbose: bool) -> None:

@@ -200,7 +200,7 @@ def verify(
             found = recordings_in(recordings)
             single = len(recordings) == 1 and recordings[0] == found[0][0]
             checked = _check(found, known, options, repeat, quiet=quiet, single=single)
-            reasons = [_reasons(one, only, loaded) for one in checked] if why else []
+            reasons = [_reasons(one, only, loaded, quiet=quiet) for one in checked] if why else []
             _report(checked, reasons, _options(graph, settings, path), single=single, json=json, junit=junit)
             if known is not None:
                 _mind_baseline(known, checked, accept=accept, whole=not single)
@@ -281,7 +281,8 @@ def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], Verif
     return verifier
 
 
-def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None) -> list[Why]:
+def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None, *, quiet: bool = False) -> list[Why]:
+    from dataflow.causes.ladder import MOST
     from dataflow.causes.why import reasons
 
     if checked.report is None:
@@ -289,8 +290,15 @@ def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None) -> l
     if not (names := only or checked.report.culprits):
         say("[dim]no causes to look for: there is no culprit[/]")
         return []
-    say(f"[dim]looking for causes in {escape(', '.join(names))}[/]")
-    return reasons(checked.path, checked.report, only or (), graph)
+    say(f"[dim]looking for causes in {escape(', '.join(names))}: at most {MOST} re-runs of each[/]")
+    if quiet or not err.is_terminal:
+        return reasons(checked.path, checked.report, only or (), graph)
+    with err.status("") as line:
+
+        def progress(operator: str, number: int, tried: str) -> None:
+            line.update(Text(f"{operator}: re-run {number}, {tried}"))
+
+        return reasons(checked.path, checked.report, only or (), graph, progress)
 
 
 def _options(graph: Path | None, settings: list[str] | None, path: list[Path] | None) -> list[str]:

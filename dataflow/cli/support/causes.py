@@ -41,7 +41,7 @@ _READS = {
     THREADS: "starts threads",
     HEAP: "takes fresh memory",
 }
-"""What an operator does with a source of chance."""
+"""The words for what an operator does with a source of chance."""
 
 
 def as_recorded(*, code_known: bool) -> str:
