@@ -162,8 +162,8 @@ def _aimed(debugger: Debugger, number: int | None, predicate: str) -> Fired:
         fired = debugger.goto(number)
         wrong = not fired.same or fired.error is not None if true is None else true.is_true(fired.names())
         if not wrong:
-            what = "as recorded, no error" if true is None else f"not {predicate}{_raised(true)}"
-            raise DebugError(f"call {number} of {name}: {what}")
+            what = "as recorded, no error" if true is None else f"it is not so: {predicate}{_raised(true)}"
+            raise DebugError(f"call {fired.number} of {name}: {what}")
         return fired
     if true is not None:
         found = debugger.until(lambda fired: true.is_true(fired.names()))

@@ -135,7 +135,7 @@ def history(
     """
     with _debugger(recording, operator, graph) as (debugger, *_):
         code = _compiled("field", field)
-        begin, end = (_number(debugger, number) for number in (first, last))
+        begin, end = (debugger.number(number) for number in (first, last))
         values: list[dict[str, Any]] = []
 
         def visit(fired: Fired) -> bool:
@@ -460,13 +460,6 @@ def _at(debugger: Debugger, origin: int, call: CallName) -> Fired:
     except (ValueError, OverflowError):
         raise ToolError(f'call={call!r}: expected a number such as 7 or -1, "@SECONDS" or "diff"') from None
     return debugger.goto(number)
-
-
-def _number(debugger: Debugger, number: int) -> int:
-    count = len(debugger.calls)
-    if not -count <= number < count:
-        raise ToolError(f"{debugger.node.name} has calls 0 to {count - 1}, there is no {number}")
-    return range(count)[number]
 
 
 def _shown(fired: Fired, debugger: Debugger, origin: int) -> dict[str, Any]:
