@@ -534,9 +534,9 @@ def test_an_expression_is_not_true_of_a_call_without_what_it_names(
 def test_an_operator_that_was_not_called_has_no_call(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     debugger = Debugger(added, "adder")
     monkeypatch.setattr(debugger, "calls", [])
-    with pytest.raises(DebugError, match="^adder was not called in this recording$"):
+    with pytest.raises(DebugError, match=r"^adder was not called in this recording$"):
         debugger.goto(0)
-    with pytest.raises(DebugError, match="^adder was not called in this recording$"):
+    with pytest.raises(DebugError, match=r"^adder was not called in this recording$"):
         debugger.number_at(0)
 
 
