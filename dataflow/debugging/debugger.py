@@ -22,6 +22,7 @@ from dataflow.debugging.ring import Held, Ring
 from dataflow.debugging.sources import Sources
 from dataflow.execution.calls import value_of
 from dataflow.execution.failure import OperatorFailure, readable
+from dataflow.execution.feeds.playable import span_of
 from dataflow.execution.ports import Emitter
 from dataflow.execution.recorded import RecordedRunner
 from dataflow.execution.threads import limit_threads
@@ -238,6 +239,11 @@ class Debugger:
             f"{self.node.name} declares no state, so what it keeps in attributes is not seen: declare it "
             "(`state: State`, a dataclass), or give it by snapshot() and restore()"
         )
+
+    @property
+    def origin(self) -> int:
+        """Returns the stamp (ns) of the recording's first message, from which seconds are counted."""
+        return (span_of(self._recording, self._recording.streams) or (0, 0))[0]
 
     @property
     def reached(self) -> int:
