@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -112,7 +113,7 @@ class Cost:
 
     - `named`: a smallest set: without them it is not worse, and with any one of them it is. `minimal`: False where the
       time was up before that was known of each.
-    - `losses`: how many there are in the `operators` between them and the figures.
+    - `losses`: how many there are in the `operators` between them and the figures; `reasons`: of each kind.
     - `figures`: as recorded; `undone`: without the named ones; `best`: without any.
     - `not_sent`: steps that sources dropped before they were numbered: these are not in the file.
     """
@@ -120,6 +121,7 @@ class Cost:
     named: Sequence[Loss]
     minimal: bool
     losses: int
+    reasons: Mapping[str, int]
     operators: Sequence[str]
     figures: Mapping[str, Any]
     undone: Mapping[str, Any]
@@ -255,6 +257,7 @@ class Drops:
             named=named,
             minimal=in_time,
             losses=len(losses),
+            reasons=dict(Counter(loss.reason for loss in losses).most_common()),
             operators=feeding.operators,
             figures=self.worse.values(before),
             undone=self.worse.values(undone),

@@ -153,9 +153,8 @@ def _print_cost(cost: Cost, worse: str, begin: int) -> None:
         text = f"{name}: {_text(value)}; without these {_text(cost.undone.get(name))}"
         out.print(Text(f"{text}, without any of the losses {_text(cost.best.get(name))}"), soft_wrap=True)
     if cost.minimal:
-        text = (
-            f"{len(cost.named)} of {count(cost.losses)} losses: a smallest set, not the only cause. Without them it is"
-        )
+        of = f"{count(cost.losses)} losses ({', '.join(f'{count(n)} {reason}' for reason, n in cost.reasons.items())})"
+        text = f"{len(cost.named)} of {of}: a smallest set, not the only cause. Without them it is"
         out.print(Text(f"{text} not {worse}; with any one of them it is. Another set may do the same."), soft_wrap=True)
     else:
         text = f"the time was up: without these {len(cost.named)} it is not {worse}, but fewer may do (--budget)"
