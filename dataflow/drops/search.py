@@ -35,6 +35,10 @@ class DropsError(ReplayError):
     """Raised where it cannot be found what losses cost; the message has the reason."""
 
 
+class NothingLost(DropsError):
+    """Raised where no message was lost, or late."""
+
+
 class Worse:
     """An expression that is true of figures that are bad, such as "ate_rmse_m > 0.05". Raises SyntaxError.
 
@@ -172,7 +176,7 @@ class Drops:
             )
         feeding, losses, sent = self._plan()
         if not losses:
-            raise DropsError("nothing was lost, or came late, between the sources and these figures")
+            raise NothingLost("nothing was lost, or came late, between the sources and these figures")
         branch = self._branch(feeding, losses)
         try:
             with limited_threads(self.graph.threads):
