@@ -143,7 +143,8 @@ def capture(
     if best is None:
         raise DebugError(
             f"call {fired.number} of {debugger.node.name} is not wrong when it is made apart from its recording: what "
-            f"it depends on is neither among its inputs nor in its state (dataflow verify {recording.path} --why)"
+            f"it depends on is neither among its inputs nor in its state, or it does not repeat (dataflow verify "
+            f"{recording.path} --only {debugger.node.name} --why finds out)"
         )
     try:
         check_repeats(best.captured)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate
+from pathlib import Path
 from types import CodeType
 from typing import Any
 
@@ -239,6 +240,11 @@ class Debugger:
             f"{self.node.name} declares no state, so what it keeps in attributes is not seen: declare it "
             "(`state: State`, a dataclass), or give it by snapshot() and restore()"
         )
+
+    @property
+    def path(self) -> Path:
+        """Returns the recording's file."""
+        return self._recording.path
 
     @property
     def origin(self) -> int:

@@ -114,7 +114,9 @@ class Shell(cmd.Cmd):
         else:
             self._show(found, self._debugger.unmade)
             if not self._json:
-                words = f"dataflow capture RECORDING --op {self._debugger.node.name} --firing {found.number}"
+                words = (
+                    f"dataflow capture {self._debugger.path} --op {self._debugger.node.name} --firing {found.number}"
+                )
                 out.print(Text(f"  as a test: {words}", style="dim"), soft_wrap=True)
 
     # ------------------------------------------------------------------------------------------------- looking
