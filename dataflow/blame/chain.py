@@ -147,11 +147,14 @@ class Blame:
         return Chain(target, (stream, record.incarnation, emission.seq), emission.stamp, value, late)
 
     def _stream(self, name: str) -> str:
-        known = [s for s in self.graph.streams if s == name or s.endswith(f"/{name}")]
-        if name not in self.graph.streams and len(known) != 1:
-            what = "is several streams" if known else "is no stream"
-            raise BlameError(f"{name!r} {what}; there are: {', '.join(known or self.graph.streams)}")
-        return name if name in self.graph.streams else known[0]
+        streams = {stream: stream for stream in self.graph.streams} | dict(self.graph.aliases)
+        if name in streams:
+            return streams[name]
+        known = [each for each in streams if each.endswith(f"/{name}")]
+        if len(found := {streams[each] for each in known}) != 1:
+            what = "is several streams" if found else "is no stream"
+            raise BlameError(f"{name!r} {what}; there are: {', '.join(known or streams)}")
+        return found.pop()
 
     def _line(self, operator: str) -> Line:
         if operator not in self._lines:
@@ -334,15 +337,16 @@ class Blame:
         """The fields of a message that change the value when they are nudged by themselves."""
         name, k = slot
         entry = entries_of(firing.inputs[name])[k]
-        _, names = nudged(entry.value)
-        if len(names) < 2:
-            return names
-        found = []
-        for each in names:
-            others = [nudged(entry.value, (each,), sign=sign) for sign in (1, -1)]
-            tries = ({call: with_messages(firing, {slot: other})} for other, fields in others if fields)
-            if any(self._changed("nudged", other) is not None for other in tries):
-                found.append(each)
+        grouped = self._messages.groups(Taken(call, name, entry))
+        if sum(map(len, grouped)) < 2:
+            return tuple(each for names in grouped for each in names)
+        found: list[str] = []
+        for names in grouped:
+            for each in () if found else names:
+                others = [nudged(entry.value, (each,), sign=sign) for sign in (1, -1)]
+                tries = ({call: with_messages(firing, {slot: other})} for other, fields in others if fields)
+                if any(self._changed("nudged", other) is not None for other in tries):
+                    found.append(each)
         return tuple(found)
 
     def _others(
@@ -406,7 +410,9 @@ class Blame:
         line, operator = self._line(call.operator), call.operator
         stamp, links = line.records[call.number].stamp, len(self._chain.links)
         with self._noting(Call(operator, begin), end - 1, ""):
-            marks = list(split([n for n in range(begin, end) if n in line.shots], lambda n: self._mark(operator, n)))
+            there = [n for n in range(begin, end) if n in line.shots]
+            cancels = not isinstance(self._value, Message) and not is_measured(self._value)
+            marks = list(split(there, lambda n: self._mark(operator, n), cancels=cancels))
         for numbers, effects in marks:
             maker, last = Call(operator, numbers[0]), numbers[-1] if len(numbers) > 1 else None
             self._chain.links.append(Link(call, stamp, "", None, 0, maker, effects, last))

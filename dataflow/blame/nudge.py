@@ -39,6 +39,17 @@ def nudged(message: M, only: Collection[str] = (), *, sign: int = 1) -> tuple[M,
     return message, tuple(names)
 
 
+def groups(message: Message, before: Message | None) -> list[tuple[str, ...]]:
+    """Returns the names of the fields with numbers in the order in which they are nudged: what is measured, then single
+    whole numbers beside it, of which those that are as in the message before (the size of an image) are none."""
+    _, names = nudged(message)
+    whole = tuple(name for name in names if type(getattr(message, name)) is int)
+    measured = tuple(name for name in names if name not in whole)
+    if measured:
+        whole = tuple(n for n in whole if getattr(before, n, None) not in (None, getattr(message, n)))
+    return [group for group in (measured, whole) if group]
+
+
 def is_finite(message: Message) -> bool:
     """Returns whether all numbers of a message are finite."""
     arrays = [np.asarray(getattr(message, field.name)) for field in type(message).FIELDS]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from dataflow.blame.again import Slot
 from dataflow.blame.line import Call
 from dataflow.blame.links import Way
-from dataflow.blame.nudge import is_finite, made_finite, nudged
+from dataflow.blame.nudge import groups, is_finite, made_finite, nudged
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
@@ -36,17 +36,22 @@ class Others:
         """Of recorded streams, some messages of the whole length."""
 
     def instead(self, taken: Sequence[Taken], *, hold: bool) -> Iterator[tuple[Way, Sequence[Message]]]:
-        """Yields other messages in place of some, where one is another indeed: nudged to either side; made finite and
-        nudged, where some are not; the one before each, or with `hold` the one before the first of its stream, since a
-        spike that lasts would only be put off."""
+        """Yields other messages in place of some, where one is another indeed: nudged to either side, what is measured
+        first; made finite and nudged, where some are not; the one before each, or with `hold` the one before the first
+        of its stream, since a spike that lasts would only be put off."""
         for way, messages in self._alternatives(taken, hold=hold):
             if any(message != each.entry.value for message, each in zip(messages, taken, strict=True)):
                 yield way, messages
 
     def _alternatives(self, taken: Sequence[Taken], *, hold: bool) -> Iterator[tuple[Way, Sequence[Message]]]:
         values = [each.entry.value for each in taken]
-        for sign in (1, -1):
-            yield "nudged", [nudged(value, sign=sign)[0] for value in values]
+        grouped = [self.groups(each) for each in taken]
+        for k in range(max(map(len, grouped), default=0)):
+            for sign in (1, -1):
+                yield (
+                    "nudged",
+                    [nudged(v, g[k], sign=sign)[0] if k < len(g) else v for v, g in zip(values, grouped, strict=True)],
+                )
         finite = [each.entry.value if is_finite(each.entry.value) else self._finite(each) for each in taken]
         if any(other is not value for other, value in zip(finite, values, strict=True)):
             for sign in (1, -1):
@@ -60,6 +65,10 @@ class Others:
             other = before[key]
             others.append(entry.value if other is None else other.replace(stamp=entry.stamp))
         yield "the one before", others
+
+    def groups(self, taken: Taken) -> list[tuple[str, ...]]:
+        """Returns the fields of a message that are nudged, in their order."""
+        return groups(taken.entry.value, self._before(*taken))
 
     def _finite(self, taken: Taken) -> Message:
         """A message with finite neighbours in place of infinities, if there are any; else itself."""

@@ -143,7 +143,8 @@ def capture(
     if best is None:
         raise DebugError(
             f"call {fired.number} of {debugger.node.name} is not wrong when it is made apart from its recording: what "
-            f"it depends on is neither among its inputs nor in its state (dataflow verify {recording.path} --why)"
+            f"it depends on is neither among its inputs nor in its state, or it does not repeat (dataflow verify "
+            f"{recording.path} --only {debugger.node.name} --why finds out)"
         )
     try:
         check_repeats(best.captured)
@@ -162,8 +163,8 @@ def _aimed(debugger: Debugger, number: int | None, predicate: str) -> Fired:
         fired = debugger.goto(number)
         wrong = not fired.same or fired.error is not None if true is None else true.is_true(fired.names())
         if not wrong:
-            what = "as recorded, no error" if true is None else f"not {predicate}{_raised(true)}"
-            raise DebugError(f"call {number} of {name}: {what}")
+            what = "as recorded, no error" if true is None else f"it is not so: {predicate}{_raised(true)}"
+            raise DebugError(f"call {fired.number} of {name}: {what}")
         return fired
     if true is not None:
         found = debugger.until(lambda fired: true.is_true(fired.names()))

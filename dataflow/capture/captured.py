@@ -243,7 +243,7 @@ class Captured:
 class Predicate:
     """An expression about a call. Raises SyntaxError for another text.
 
-    It is not true where it raises. `problem` is the last error, None once it has raised none.
+    It is not true where it raises. `problem` is the first error, None once it has raised none.
     """
 
     def __init__(self, text: str) -> None:
@@ -256,7 +256,7 @@ class Predicate:
         try:
             found = bool(eval(self._code, names))
         except Exception as error:
-            self.problem = None if self._answered else error
+            self.problem = None if self._answered else self.problem or error
             return False
         self._answered, self.problem = True, None
         return found

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate
+from pathlib import Path
 from types import CodeType
 from typing import Any
 
@@ -22,6 +23,7 @@ from dataflow.debugging.ring import Held, Ring
 from dataflow.debugging.sources import Sources
 from dataflow.execution.calls import value_of
 from dataflow.execution.failure import OperatorFailure, readable
+from dataflow.execution.feeds.playable import span_of
 from dataflow.execution.ports import Emitter
 from dataflow.execution.recorded import RecordedRunner
 from dataflow.execution.threads import limit_threads
@@ -125,9 +127,7 @@ class Debugger:
 
         Raises `DebugError` where there is none, or where it cannot be made again; `OperatorFailure`.
         """
-        number = range(len(self.calls))[number] if -len(self.calls) <= number < len(self.calls) else number
-        if not 0 <= number < len(self.calls):
-            raise DebugError(f"{self.node.name} has calls 0 to {len(self.calls) - 1}, there is no {number}")
+        number = self.number(number)
         held = self._ring.get(number)
         if held is None or held.stale or through is not None:
             held = self._made_again(number, through) or self._made_on_the_way(number, through)
@@ -242,6 +242,16 @@ class Debugger:
         )
 
     @property
+    def path(self) -> Path:
+        """Returns the recording's file."""
+        return self._recording.path
+
+    @property
+    def origin(self) -> int:
+        """Returns the stamp (ns) of the recording's first message, from which seconds are counted."""
+        return (span_of(self._recording, self._recording.streams) or (0, 0))[0]
+
+    @property
     def reached(self) -> int:
         """Returns the number of the call that was made last on a way; -1 where none was."""
         return self._reached
@@ -255,15 +265,26 @@ class Debugger:
         place = bisect.bisect_right(self._recorded, number)
         return self._recorded[place - 1] if place else -1
 
+    def number(self, number: int) -> int:
+        """The number of a call counted from 0, of one that may be counted from the end. Raises `DebugError` where there
+        is none."""
+        count = len(self.calls)
+        if not count:
+            raise DebugError(f"{self.node.name} was not called in this recording")
+        if not -count <= number < count:
+            raise DebugError(f"{self.node.name} has calls 0 to {count - 1}, there is no {number}")
+        return range(count)[number]
+
     def number_at(self, stamp: int) -> int:
-        """The number of the last call at or before a stamp (ns), of the first one where there is none.
+        """The number of the last call at or before a stamp (ns). Raises `DebugError` where there is none.
 
         Where the clock went back, of the last incarnation that has such a call.
         """
         for number in range(len(self.calls) - 1, -1, -1):
             if self.calls[number].stamp <= stamp:
                 return number
-        return 0
+        later = (self.calls[self.number(0)].stamp - stamp) * 1e-9
+        raise DebugError(f"{self.node.name} was not called by then: its first call is {later:.3f} s later")
 
     def until(
         self, condition: Callable[[Fired], bool], *, first: int | None = None, last: int | None = None
@@ -496,6 +517,7 @@ class Debugger:
             raised=raised,
             ports=tuple(self.node.outputs),
             same=held.same,
+            takes=tuple(self.node.inputs),
         )
 
     def _states(self, held: Held) -> States:

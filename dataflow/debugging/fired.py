@@ -70,6 +70,8 @@ class Fired:
     """All that the operator declares for its outputs."""
     same: bool
     """Outputs and the error are the recorded ones, as verification compares them."""
+    takes: Sequence[str] = ()
+    """All that the operator declares for its inputs."""
 
     @property
     def outputs(self) -> Mapping[str, Message | None]:
@@ -97,16 +99,24 @@ class Fired:
         return tuple(dict.fromkeys(place.partition(".")[0] for place, _, _ in changes(before, after)))
 
     def names(self) -> dict[str, Any]:
-        """Names for an expression about the call: `inp` and `out` by input and port (None where it is silent),
-        `stamp`, `number`, `same`, `error`."""
+        """Names for an expression about the call: `inp` and `out` by input and port (None where it is silent, as inputs
+        at `finish()` are), `stamp`, `number`, `same`, `error`."""
         return {
-            "inp": SimpleNamespace(**self.inputs),
+            "inp": SimpleNamespace(**dict.fromkeys(self.takes) | dict(self.inputs)),
             "out": SimpleNamespace(**dict.fromkeys(self.ports) | dict(self.outputs)),
             "stamp": self.call.stamp,
             "number": self.number,
             "same": self.same,
             "error": self.error,
         }
+
+    @property
+    def silent(self) -> bool:
+        """Returns whether an input or an output has nothing in this call."""
+        given = dict.fromkeys(self.takes) | dict(self.inputs)
+        made = dict.fromkeys(self.ports) | dict(self.outputs)
+        values = [*given.values(), *made.values()]
+        return any(value is None or (isinstance(value, tuple | Mapping) and not value) for value in values)
 
     def as_json(self, operator: str, origin: int) -> dict[str, Any]:
         """Returns the call of an operator as JSON values; the stamps of messages are counted from `origin` (ns)."""

@@ -42,6 +42,8 @@ class Lines:
         self._at_line, self._homes = at_line, homes
         self._times: Counter[tuple[str, int]] = Counter()
         self.count = 0
+        self.raised: tuple[BaseException | None, int] = None, 0
+        """The last exception that came up, and the number of the line that raised it."""
 
     def through(self, process: Process, firing: Firing) -> dict[str, Message]:
         """Makes the call. Raises what it raises, and what `at_line` does."""
@@ -66,6 +68,8 @@ class Lines:
             self.count += 1
             self._times[frame.f_code.co_filename, frame.f_lineno] += 1
             self._at_line(frame, self.count)
+        elif event == "exception" and arg[1] is not self.raised[0]:
+            self.raised = arg[1], self.count
         return self._traced
 
 

@@ -6,6 +6,7 @@ import ast
 import math
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -35,6 +36,10 @@ FUNCTIONS: Mapping[str, Callable[..., Any]] = {f.__name__: f for f in (abs, min,
 
 class DropsError(ReplayError):
     """Raised where it cannot be found what losses cost; the message has the reason."""
+
+
+class NothingLost(DropsError):
+    """Raised where no message was lost, or late."""
 
 
 class Worse:
@@ -121,7 +126,7 @@ class Cost:
 
     - `named`: a smallest set: without them it is not worse, and with any one of them it is. `minimal`: False where the
       time was up before that was known of each.
-    - `losses`: how many there are in the `operators` between them and the figures.
+    - `losses`: how many there are in the `operators` between them and the figures; `reasons`: of each kind.
     - `figures`: as recorded; `undone`: without the named ones; `best`: without any.
     - `not_sent`: steps that sources dropped before they were numbered: these are not in the file.
     """
@@ -129,6 +134,7 @@ class Cost:
     named: Sequence[Loss]
     minimal: bool
     losses: int
+    reasons: Mapping[str, int]
     operators: Sequence[str]
     figures: Mapping[str, Any]
     undone: Mapping[str, Any]
@@ -179,7 +185,7 @@ class Drops:
             )
         feeding, losses, sent = self._plan()
         if not losses:
-            raise DropsError("nothing was lost, or came late, between the sources and these figures")
+            raise NothingLost("nothing was lost, or came late, between the sources and these figures")
         branch = self._branch(feeding, losses)
         try:
             with limited_threads(self.graph.threads):
@@ -264,6 +270,7 @@ class Drops:
             named=named,
             minimal=in_time,
             losses=len(losses),
+            reasons=dict(Counter(loss.reason for loss in losses).most_common()),
             operators=feeding.operators,
             figures=self.worse.values(before),
             undone=self.worse.values(undone),

@@ -102,7 +102,7 @@ class SourceRunner:
         try:
             self._tripwire.check(self.node.name)
         except SharedGenerators as error:
-            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
+            raise OperatorFailure(self.node.name, _when(self.last), error) from error
 
     def pull(self) -> dict[str, Message] | None:
         """Reads the source's next non-empty step; for live sources called on the reader's own thread.
@@ -125,7 +125,7 @@ class SourceRunner:
                         self._check_stamps(messages)
                     return messages
         except BaseException as error:
-            raise OperatorFailure(self.node.name, f"stream() after stamp {self._read}", error) from error
+            raise OperatorFailure(self.node.name, _when(self._read), error) from error
         finally:
             if not self._live:
                 LOADS.seed = None
@@ -300,3 +300,8 @@ def step_size(step: Mapping[str, Message]) -> tuple[int, int]:
             if array is not None:
                 size += array.nbytes
     return len(step), size
+
+
+def _when(last: int) -> str:
+    """Returns in words where a source failed; `last`: the stamp that it gave before."""
+    return "stream() before its first message" if last == NEVER else f"stream() after stamp {last}"

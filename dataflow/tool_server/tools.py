@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,13 +48,22 @@ def verify(
     return _verified(_verify(_file(recording), only, _loaded(graph)))
 
 
-def why(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None) -> Any:
+def why(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None, *, say: Say) -> Any:
     """Find why a culprit of `verify` does not repeat: at most 8 re-runs of it with clocks, random numbers, threads,
     hashes, memory and files fixed in turn. Gives causes with the lines that led to them."""
+    from dataflow.causes.ladder import MOST
     from dataflow.causes.why import why as find
+    from dataflow.verification.workers.processes import call_workers
+
+    runs = count(1)
+
+    def told(*arguments: Any, **named: Any) -> Any:
+        say(f"re-run {next(runs)} of at most {MOST}")
+        return call_workers(*arguments, **named)
 
     file, loaded = _file(recording), _loaded(graph)
-    return find(file, _verify(file, [operator], loaded), operator, graph=loaded).as_json()
+    report = _verify(file, [operator], loaded)
+    return find(file, report, operator, graph=loaded, workers=told).as_json()
 
 
 def goto(recording: str, operator: str, call: CallName, graph: str | None = None, path: list[str] | None = None) -> Any:
@@ -67,8 +77,13 @@ def goto(recording: str, operator: str, call: CallName, graph: str | None = None
 
 
 def diff(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None) -> Any:
-    """Go to the first call of an operator that does not give what was recorded, and show it as `goto` does."""
-    return goto(recording, operator, "diff", graph, path)
+    """Go to the first call of an operator that does not give what was recorded, and show it as `goto` does. Where all
+    give it, `same` is true."""
+    with _debugger(recording, operator, graph) as (debugger, origin, _):
+        found = debugger.first_difference()
+        if found is None and debugger.unmade is None:
+            return {"operator": debugger.node.name, "same": True, "of": len(debugger.calls)}
+        return _shown(_at(debugger, origin, "diff") if found is None else found, debugger, origin)
 
 
 def state(
@@ -131,18 +146,21 @@ def history(
     """Give the value of a Python expression over the calls of an operator, from number `first` to `last`.
 
     It sees inp, out (by input and port: "len(out.tracks.ids)"), stamp, number, same, error. Calls that give the same
-    value as the one before are left out; at most 200 are given. Where it fails, the error is the value.
+    value as the one before are left out; at most 200 are given. Where it fails, the error is the value; it is an error
+    where it fails in all.
     """
+    from dataflow.execution.failure import readable
+
     with _debugger(recording, operator, graph) as (debugger, *_):
         code = _compiled("field", field)
-        begin, end = (_number(debugger, number) for number in (first, last))
+        begin, end = (debugger.number(number) for number in (first, last))
         values: list[dict[str, Any]] = []
 
         def visit(fired: Fired) -> bool:
             try:
-                value = _text(_evaluated(code, field, fired.names()))
-            except ToolError as error:  # such as of an output that this call did not make
-                value = {"error": str(error)}
+                value = _text(eval(code, fired.names()))
+            except Exception as error:  # such as of an output that this call did not make
+                value = {"error": readable(error)}
             if not values or value != values[-1]["value"]:
                 values.append({"call": fired.number, "stamp": fired.call.stamp, "value": value})
             return len(values) == MOST_CALLS
@@ -151,6 +169,8 @@ def history(
         reached, not_made = end if found is None else found.number, _not_made(debugger)
         if not values and debugger.unmade is not None:
             raise ToolError(f"{debugger.node.name}, calls {begin} to {end}: {debugger.unmade}")
+        if all(isinstance(each["value"], dict) for each in values):  # it fails in every call
+            _evaluated(code, field, debugger.goto(begin).names())
     rest = {} if reached == end else {"next": f"history with first={reached + 1} goes on"}
     return {"field": field, "calls": [begin, reached], "changes": values} | not_made | rest
 
@@ -249,7 +269,7 @@ def drops(
 
     `worse`: a Python expression over the figures, true where they are bad: "ate_rmse_m > 0.05"; `budget`: seconds.
     """
-    from dataflow.drops.search import Drops
+    from dataflow.drops.search import Drops, NothingLost
     from dataflow.recording import Recording
 
     def watch(replays: int, left: int) -> None:
@@ -257,7 +277,10 @@ def drops(
 
     _compiled("worse", worse)
     with Recording(_file(recording)) as opened:
-        return Drops(opened, worse, _loaded(graph), budget=budget, watch=watch).find().as_json()
+        try:
+            return Drops(opened, worse, _loaded(graph), budget=budget, watch=watch).find().as_json()
+        except NothingLost as told:
+            return {"named": [], "losses": 0, "told": str(told)}
 
 
 def prove(
@@ -460,13 +483,6 @@ def _at(debugger: Debugger, origin: int, call: CallName) -> Fired:
     except (ValueError, OverflowError):
         raise ToolError(f'call={call!r}: expected a number such as 7 or -1, "@SECONDS" or "diff"') from None
     return debugger.goto(number)
-
-
-def _number(debugger: Debugger, number: int) -> int:
-    count = len(debugger.calls)
-    if not -count <= number < count:
-        raise ToolError(f"{debugger.node.name} has calls 0 to {count - 1}, there is no {number}")
-    return range(count)[number]
 
 
 def _shown(fired: Fired, debugger: Debugger, origin: int) -> dict[str, Any]:

@@ -17,10 +17,10 @@ from dataflow.blame.chain import Blame, BlameError
 from dataflow.blame.field import Field, differ
 from dataflow.blame.line import Line
 from dataflow.blame.links import Chain
-from dataflow.blame.nudge import nudged
+from dataflow.blame.nudge import groups, nudged
 from dataflow.graph import load_text
 from dataflow.graph.model import Node
-from dataflow.messages import FeatureVector, Pose
+from dataflow.messages import Detections2D, FeatureVector, Pose
 from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
@@ -313,6 +313,25 @@ def test_numbers_differ_by_more_than_a_part_of_the_largest_and_others_at_all() -
     assert differ(before, None, 0.5)
     assert differ(np.array([np.nan]), np.array([1.0]), 0.5)
     assert not differ({"a": [1]}, {"a": [1]}, 0.0)
+
+
+def test_single_whole_numbers_are_nudged_behind_what_is_measured() -> None:
+    boxes = np.array([[1.0, 1.0, 2.0, 2.0]], np.float32)
+    scores, classes = np.ones(1, np.float32), np.zeros(1, np.int32)
+    found = Detections2D(
+        stamp=1,
+        frame="camera",
+        boxes=boxes,
+        scores=scores,
+        class_ids=classes,
+        class_names=["person"],
+        width=6,
+        height=4,
+    )
+
+    assert [{"width", "height"} & {*names} for names in groups(found, found)] == [set()]
+    assert groups(found, found.replace(width=8))[1:] == [("width",)]
+    assert "boxes" in groups(found, None)[0]
 
 
 def test_a_nudge_changes_each_number_a_little_and_keeps_the_type_content() -> None:

@@ -14,8 +14,10 @@ from typer.testing import CliRunner
 import dataflow
 from dataflow.blame.chain import Blame
 from dataflow.blame.field import Field
-from dataflow.blame.links import Chain
+from dataflow.blame.line import Call
+from dataflow.blame.links import Chain, Link
 from dataflow.blame.nudge import made_finite, nudged
+from dataflow.cli.commands.blame import _in_runs
 from dataflow.cli.main import app
 from dataflow.graph import load_text
 from dataflow.messages import FeatureVector, RangeReading
@@ -144,3 +146,9 @@ def test_numbers_that_are_not_finite_take_a_neighbour() -> None:
     assert made_finite(lost, heard).range_max == math.inf, "the neighbour's is no other"
     assert made_finite(lost, None) is lost
     assert made_finite(rows, None).vectors.tolist() == [[1.0, 1.0, 1.0, 3.0]]
+
+
+def test_messages_that_follow_each_other_are_one_run() -> None:
+    links = [Link(Call("o", 9), 0, "x", ("s", 0, n), 0, None, ()) for n in (7, 3, 2, 4)]
+
+    assert _in_runs(links) == ["s #2 to #4", "s #7"]

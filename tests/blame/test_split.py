@@ -37,6 +37,13 @@ def test_what_decides_alone_is_found_the_last_first_else_the_shortest_run_that_d
     assert all(effects == shows(items) for items, effects in answers)
 
 
+def test_items_that_cancel_each_other_are_found_where_they_are_split() -> None:
+    odd = shown_by(lambda items: len(items & {1, 2, 4, 5, 6, 7, 8, 9}) % 2 == 1)
+
+    assert [list(items) for items, _ in split(ITEMS, odd, cancels=True)] == [[9], [8], [7], [6], [5], [4], [2], [1]]
+    assert list(split(ITEMS, odd)) == []
+
+
 def test_nothing_is_asked_of_no_items() -> None:
     def asked(items: Sequence[int]) -> tuple[Effect, ...]:
         raise AssertionError(items)

@@ -207,6 +207,8 @@ def test_a_call_that_raises_now_is_not_mended(late: Path, monkeypatch: pytest.Mo
 def test_an_expression_that_raises_for_every_call_is_reported(changed: Path) -> None:
     with pytest.raises(DebugError, match=r"none for which out\.outt\.value > 3, which raises AttributeError: .*outt"):
         captured(changed, "rare", predicate="out.outt.value > 3")
+    with pytest.raises(DebugError, match=r"call 3 of rare: it is not so: not out\.out$"):
+        captured(changed, "rare", 3, "not out.out")
     # raises for one call alone
     with pytest.raises(DebugError, match=r"none for which out\.out\.vectors\[0, 0\] > 999$"):
         captured(changed, "rare", predicate="out.out.vectors[0, 0] > 999")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import held_runs
@@ -25,6 +26,7 @@ def test_the_loss_is_named_with_what_it_cost_and_what_is_not_known(dataflow, run
     assert "1.000 s" in told
     assert "held/drive/step" in told
     assert "overflow" in told
+    assert re.search(r"1 of \d+ losses \((\d+ \w+, )*\d+ \w+\): a smallest set", " ".join(told.split()))
     assert "a smallest set, not the only cause" in told
     assert "are not in the file" in told
 

@@ -658,3 +658,48 @@ def test_a_first_call_that_cannot_be_made_is_said_and_ends_the_session(
     debugger.close()
     assert "call 10 of adder cannot be made again" in client.told[-1]
     assert len(failures) == 1
+
+
+@pytest.fixture
+def edited(recorded: tuple[Recording, Path]) -> Iterator[Path]:
+    """The file of the operator, which may be edited."""
+    yield recorded[1]
+    recorded[1].write_text(SOURCE)
+    module = sys.modules["stepped_adder"]
+    exec(compile(SOURCE, str(recorded[1]), "exec"), vars(module))
+
+
+def test_a_call_that_raises_is_stopped_at_where_it_raises_once(recorded: tuple[Recording, Path], edited: Path) -> None:
+    with editing(recorded, 5) as client:
+        assert client.ask("setExceptionBreakpoints", filters=["uncaught"]) == {}
+        client.ask("configurationDone")
+        assert client.stopped()[0] == "entry"
+        raises = "value = most if most != value - 14 else [][7]"
+        edited.write_text(SOURCE.replace("value = most\n", f"{raises}\n"))
+        client.go("restart")
+
+        reason, line = client.go("continue")
+        assert (reason, line, client.call()) == ("exception", CLIPS, 8)
+        assert client.variables() == {"value": "64.0", "most": "50.0"}
+        assert client.go("stepBack") == ("step", CLIPS - 1)
+        client.ask("continue")
+        assert client.stopped()[0] == "end of the recording"
+        assert any("IndexError: list index out of range" in text for text in client.told)
+
+
+def test_a_call_with_other_lines_each_time_is_stopped_at_in_the_end(
+    recorded: tuple[Recording, Path], edited: Path
+) -> None:
+    with editing(recorded, 11) as client:
+        client.ask("configurationDone")
+        client.stopped()
+        less = (
+            "LEFT = [90]\n\n\ndef clipped(value, most):\n    LEFT[0] -= 1\n    for _ in range(LEFT[0]):\n        pass\n"
+        )
+        edited.write_text(SOURCE.replace("def clipped(value, most):\n", less))
+        client.go("restart")
+
+        assert client.go("continue")[0] == "entry"  # each time the call is made, it runs fewer lines
+
+        assert client.call() == 11
+        assert sum("it does not repeat (dataflow verify --why" in text for text in client.told) == 2

@@ -131,7 +131,8 @@ def test_a_call_is_found_by_its_time(kept: Recording) -> None:
         stamp = debugger.calls[number].stamp
         found = debugger.calls[debugger.number_at(stamp)]
         assert found.stamp <= stamp
-    assert debugger.number_at(0) == 0
+    with pytest.raises(DebugError, match=r"busy was not called by then: its first call is \d+\.\d{3} s later"):
+        debugger.number_at(0)
     assert debugger.goto(-1).number == len(debugger.calls) - 1
 
 
@@ -515,6 +516,28 @@ def test_a_recording_without_calls_names_what_would_have_some(repository: Path) 
         pytest.raises(DebugError, match="nor of any other operator: the recording holds what sources gave"),
     ):
         Debugger(recording, "odometry")
+
+
+def test_an_expression_is_not_true_of_a_call_without_what_it_names(
+    added: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shell = Shell(Debugger(added, "adder"), 0)
+
+    shell.onecmd("until inp.x.stamp < 0")  # the last call is finish(), which is given nothing
+    assert not shell.failed
+    assert "no call after this one is so: inp.x.stamp < 0" in capsys.readouterr().out
+    shell.onecmd("until inp.x.stampp < 0")
+    assert shell.failed
+    assert "inp.x.stampp < 0 at call 0: AttributeError" in capsys.readouterr().out
+
+
+def test_an_operator_that_was_not_called_has_no_call(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    debugger = Debugger(added, "adder")
+    monkeypatch.setattr(debugger, "calls", [])
+    with pytest.raises(DebugError, match=r"^adder was not called in this recording$"):
+        debugger.goto(0)
+    with pytest.raises(DebugError, match=r"^adder was not called in this recording$"):
+        debugger.number_at(0)
 
 
 def test_an_error_is_shown_with_its_line(added: Recording, tmp_path: Path) -> None:

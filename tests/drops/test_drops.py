@@ -48,6 +48,8 @@ def test_the_drop_and_the_late_message_that_cost_the_estimate_are_named(run: Pat
     ]
     assert found.minimal
     assert found.losses > 20
+    assert sum(found.reasons.values()) == found.losses
+    assert {"overflow", "waited"} <= found.reasons.keys()
     assert found.figures["score: end_error_m"] == pytest.approx(30.0, abs=0.5)
     assert found.undone["score: end_error_m"] < 0.5
     assert found.best["score: end_error_m"] == 0.0

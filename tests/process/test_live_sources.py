@@ -132,7 +132,7 @@ def test_a_source_that_raises_is_restarted_and_its_streams_begin_a_new_incarnati
 
 
 def test_without_a_policy_a_source_that_raises_fails_the_run() -> None:
-    with pytest.raises(OperatorFailure, match="'camera' failed in stream"):
+    with pytest.raises(OperatorFailure, match=r"'camera' failed in stream\(\) before its first message: "):
         Sources("Count", fails_at=0).run()
 
 

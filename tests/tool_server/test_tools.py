@@ -134,9 +134,25 @@ def test_the_history_of_a_field_leaves_out_what_stays(bugs: dict[str, str]) -> N
     assert [each["call"] for each in told["changes"][:3]] == [SKIPPED - 2, SKIPPED - 1, SKIPPED + 1]
     part = ask("history", bugs["wrong"], operator="sum", field="number")
     assert (part["calls"], part["next"]) == ([0, 199], "history with first=200 goes on")
-    wrong = ask("history", bugs["wrong"], operator="sum", field="out.none", last=3)
-    assert len(wrong["changes"]) == 4
-    assert "there are: inp.x, out.out" in wrong["changes"][0]["value"]["error"]
+    with pytest.raises(ToolError, match=r"out\.none at call 0: AttributeError.*; there are: inp\.x, out\.out"):
+        ask("history", bugs["wrong"], operator="sum", field="out.none", last=3)
+    ends = ask("history", bugs["wrong"], operator="sum", field="inp.x.stamp > 0 and number > 500", first=500)
+    assert [each["call"] for each in ends["changes"]] == [500, 501, 700]
+    assert ends["changes"][-1]["value"] == {"error": "AttributeError: 'NoneType' object has no attribute 'stamp'"}
+
+
+def test_that_nothing_differs_or_was_lost_is_an_answer(bugs: dict[str, str], tmp_path: Path) -> None:
+    assert ask("diff", bugs["wrong"], operator="sum") == {"operator": "sum", "same": True, "of": 701}
+    text = (
+        "graph: held\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 5}}\n"
+        "  score: {use: 'zoo.tuned:Counted', inputs: {x: src/x}}\n"
+    )
+    dataflow.run(load_text(text), record=tmp_path / "run.mcap")
+
+    told = ask("drops", str(tmp_path / "run.mcap"), worse="calls > 3")
+
+    assert (told["losses"], told["named"]) == (0, [])
+    assert told["told"].startswith("nothing was lost")
 
 
 def test_what_if_the_code_or_a_parameter_were_another(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -378,8 +394,11 @@ def test_drops_refuses_with_the_figures_that_there_are(bugs: dict[str, str]) -> 
 
 @pytest.mark.long
 def test_why_finds_that_code_repeats_and_differs_from_the_recorded(bugs: dict[str, str]) -> None:
-    told = ask("why", bugs["right"], operator="sine")
+    said: list[str] = []
+    told = answer("why", {"recording": bugs["right"], "operator": "sine"}, said.append)
 
+    assert said[0] == "re-run 1 of at most 8"
+    assert 1 <= len(said) <= 8
     assert told["repeats"]
     assert told["operator"] == "sine"
 

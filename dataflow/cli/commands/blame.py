@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -155,9 +155,8 @@ def _print_cost(cost: Cost, worse: str, begin: int) -> None:
         text = f"{name}: {_text(value)}; without these {_text(cost.undone.get(name))}"
         out.print(Text(f"{text}, without any of the losses {_text(cost.best.get(name))}"), soft_wrap=True)
     if cost.minimal:
-        text = (
-            f"{len(cost.named)} of {count(cost.losses)} losses: a smallest set, not the only cause. Without them it is"
-        )
+        of = f"{count(cost.losses)} losses ({', '.join(f'{count(n)} {reason}' for reason, n in cost.reasons.items())})"
+        text = f"{len(cost.named)} of {of}: a smallest set, not the only cause. Without them it is"
         out.print(Text(f"{text} not {worse}; with any one of them it is. Another set may do the same."), soft_wrap=True)
     else:
         text = f"the time was up: without these {len(cost.named)} it is not {worse}, but fewer may do (--budget)"
@@ -229,7 +228,7 @@ def _print(chain: Chain, field: str, begin: int) -> None:
 
 def _print_ends(chain: Chain) -> None:
     """Prints what the chain leads to, where it leads to nothing, and what could not be tried."""
-    sensed = list(dict.fromkeys(_origin(link) for link in chain.sensed))
+    sensed = _in_runs(chain.sensed)
     more = f" and {count(len(sensed) - MOST_ROWS)} more" if len(sensed) > MOST_ROWS else ""
     given = [f"the state given to {_call(link.call)}" for link in chain.links if not link.input and link.maker is None]
     if sensed or given:
@@ -237,7 +236,10 @@ def _print_ends(chain: Chain) -> None:
     tried = ", ".join(f"{count(n)} {way}" for way, n in chain.tried.items())
     if chain.loose:
         names = ", ".join(map(_call, chain.loose[:5])) + (", …" if len(chain.loose) > 5 else "")
-        text = f"not known what decided {names}: nothing that was tried there changes the value"
+        text = (
+            f"not known what decided {names}: nothing that was tried there changes the value, so it may be made by the"
+        )
+        text += " code or the call's time alone"
         what = f"{plural(chain.tried.total(), 'change')} tried in all: {tried}"
         out.print(Text(f"{text} ({what})", style="yellow"), soft_wrap=True)
     for each in chain.untried:
@@ -253,6 +255,20 @@ def _print_ends(chain: Chain) -> None:
             f"{count(chain.raised.total())} of {plural(chain.tried.total(), 'change')} made a call raise, which shows"
         )
         out.print(Text(f"{text} nothing", style="yellow"), soft_wrap=True)
+
+
+def _in_runs(links: Sequence[Link]) -> list[str]:
+    """The messages of links in words: those that follow each other on a stream as one, in the order of the first."""
+    streams: dict[tuple[str, int], set[int]] = {}
+    for link in links:
+        for stream, incarnation, place in link.messages:
+            streams.setdefault((stream, incarnation), set()).add(place)
+    runs: list[str] = []
+    for (stream, _), places in streams.items():
+        ends = [each for each in sorted(places) if each + 1 not in places]
+        begins = [each for each in sorted(places) if each - 1 not in places]
+        runs += [_calls((stream, begin), end) for begin, end in zip(begins, ends, strict=True)]
+    return runs
 
 
 def _rows(chain: Chain) -> list[tuple[str, str, str, str]]:

@@ -73,14 +73,26 @@ class Shell(cmd.Cmd):
     def do_until(self, line: str) -> None:
         """until EXPRESSION      on to the next call for which a Python expression is true
 
-        It sees inp and out (by input and output: out.boxes), stamp (ns), number, same (as recorded), error.
+        It sees inp and out (by input and output: out.boxes), stamp (ns), number, same (as recorded), error. An input or
+        output without a message is None; where the expression raises because of that, it is not true.
         Example: until len(out.detections.boxes) > 3
         """
         try:
             code = compile(line, "<until>", "eval")
         except SyntaxError as error:
             raise WrongCommand(f"until {line}: no Python expression: {error.msg}") from None
-        found = self._debugger.until(lambda fired: bool(_evaluated(code, line, fired.names())))
+        raised: list[str] = []
+
+        def is_so(fired: Fired) -> bool:
+            try:
+                return bool(_evaluated(code, f"{line} at call {fired.number}", fired.names()))
+            except WrongCommand as error:
+                if not fired.silent:
+                    raise
+                raised.extend([str(error)] if fired.call.kind != "finish" else [])
+                return False
+
+        found = self._debugger.until(is_so)
         unmade = self._debugger.unmade
         if found is not None:
             self._show(found, unmade)
@@ -88,6 +100,9 @@ class Shell(cmd.Cmd):
             raise WrongCommand(f"no call after this one that can be made is so: {line}; {unmade}")
         else:
             out.print(f"no call after this one is so: {escape(line)}")
+        if raised and not self._json:
+            how = f"  in {plural(len(raised), 'call')} without a message it raises: {raised[0]}"
+            out.print(Text(how, style="yellow"), soft_wrap=True)
 
     def do_diff(self, line: str) -> None:
         """diff      to the first call of all that does not give what was recorded"""
@@ -99,7 +114,9 @@ class Shell(cmd.Cmd):
         else:
             self._show(found, self._debugger.unmade)
             if not self._json:
-                words = f"dataflow capture RECORDING --op {self._debugger.node.name} --firing {found.number}"
+                words = (
+                    f"dataflow capture {self._debugger.path} --op {self._debugger.node.name} --firing {found.number}"
+                )
                 out.print(Text(f"  as a test: {words}", style="dim"), soft_wrap=True)
 
     # ------------------------------------------------------------------------------------------------- looking

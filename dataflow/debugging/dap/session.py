@@ -29,6 +29,7 @@ from dataflow.sync import Firing
 
 LOOPBACK = "127.0.0.1"
 THREAD = 1
+AS_RECORDED = "as recorded, digest by digest"
 CAPABILITIES = (
     "supportsConfigurationDoneRequest",
     "supportsConditionalBreakpoints",
@@ -36,6 +37,8 @@ CAPABILITIES = (
     "supportsRestartRequest",
     "supportsStepBack",
 )
+UNCAUGHT = "uncaught"
+"""The filter of exceptions that is offered."""
 GREETS = 60.0
 """Seconds that an editor that has connected may take for its first request."""
 LOOKS = 256
@@ -56,10 +59,11 @@ class Breakpoint:
 
 @dataclass(frozen=True, slots=True)
 class Going:
-    """The next call to be made, and where in it to stop."""
+    """The next call to be made, and where in it to stop; `line`: the number of the line event there, if it is known."""
 
     call: int
     stops: Stops
+    line: int = 0
 
 
 class Session:
@@ -81,10 +85,18 @@ class Session:
         self._away: Callable[[], Going] | None = None
         """Leads on once the call under way is abandoned."""
         self._done = self._over = self._pauses = False
+        self._missing = -1
+        """The call that has last missed the line event at which it was to stop."""
         self._left = ""
         """Why the editor is taken for gone, where that was seen within a call."""
         self._checked: list[int] = []
-        """Calls that gave what was recorded, since this was last said."""
+        """Calls with one verdict, since this was last said."""
+        self._verdict = AS_RECORDED
+        self._origin = debugger.origin
+        self._stops_raised = False
+        """Whether calls that raise are stopped at."""
+        self._raises, self._error = -1, ""
+        """The call that was stopped at as it raises, and its error."""
         self._handlers: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any] | None]] = {
             "initialize": self._initialize,
             "launch": self._launch,
@@ -139,6 +151,12 @@ class Session:
             return
         self._check(fired)
         going = self._going  # a stop has changed what it stops at
+        if going.line:
+            self._going = self._missed(going)
+            return
+        if (raises := self._raised(fired)) is not None:
+            self._going = raises
+            return
         stops = self._breaks if going.stops == self._breaks else self._first_line
         if going.call + 1 < len(self._debugger.calls):
             self._going = Going(going.call + 1, stops)
@@ -146,6 +164,34 @@ class Session:
             self._say("this was the last call; at its last line again")
             self._away = partial(self._end, going.call + 1)
             self._going = self._led()
+
+    def _missed(self, going: Going) -> Going:
+        """Finds where to stop in a call that has not come to the line event at which it was to: the last one that it
+        had this time, then its first one."""
+        ran = self._lines.count
+        self._say(
+            f"call {going.call} ran {ran} lines this time, {going.line} before: it does not repeat "
+            "(dataflow verify --why finds the cause)",
+            "stderr",
+        )
+        if ran == 0:
+            self._over = going.call + 1 == len(self._debugger.calls)
+            return Going(going.call if self._over else going.call + 1, self._first_line)
+        if self._missing == going.call:
+            return Going(going.call, self._first_line)
+        self._missing = going.call
+        return Going(going.call, _at(ran, "step"), ran)
+
+    def _raised(self, fired: Fired) -> Going | None:
+        """Leads back to the line that has raised what the call raises, once; None where nothing is to be stopped at."""
+        error, line = self._lines.raised
+        if not self._stops_raised or fired.raised is None or fired.raised is not error:
+            return None
+        if self._raises == fired.number:
+            self._raises = -1
+            return None
+        self._raises, self._error = fired.number, readable(error)
+        return Going(fired.number, _at(line, "exception"), line)
 
     def _before(self, error: DebugError) -> Going:
         """Goes back to the last line event in front of a call that cannot be made. Raises `DebugError` where no call
@@ -216,13 +262,14 @@ class Session:
 
     def _check(self, fired: Fired) -> None:
         """Compares the outputs of a call with the recorded ones, and prints a difference."""
-        if fired.same:
-            self._checked.append(fired.number)
-            return
-        self._say_checked()
         ports = ", ".join(made.port for made in fired.made if not made.same)
-        self._say(f"call {fired.number}: not as recorded{f', differs in {ports}' if ports else ''}", "stderr")
-        if fired.error is not None:
+        verdict = AS_RECORDED if fired.same else f"not as recorded{f', differs in {ports}' if ports else ''}"
+        if verdict != self._verdict:
+            self._say_checked()
+        self._verdict = verdict
+        self._checked.append(fired.number)
+        if not fired.same and fired.error is not None:
+            self._say_checked()
             self._say(fired.error, "stderr")
 
     def _at_line(self, frame: FrameType, count: int) -> None:
@@ -287,7 +334,8 @@ class Session:
             first = self._debugger.begins(max(0, call - width))
             found = self._last(first, call - 1, wanted)
             call, width = first, 2 * width
-        return Going(call, self._first_line) if found is None else Going(found[0], _at(found[1], why))
+        self._missing = -1
+        return Going(call, self._first_line) if found is None else Going(found[0], _at(found[1], why), found[1])
 
     def _end(self, calls: int) -> Going:
         """The last line event of the recording. Ends the session where no call has any."""
@@ -315,7 +363,10 @@ class Session:
         """Answers requests until one goes on, or away."""
         self._frames, self._variables, self._pauses = list(own_frames(frame, self._homes)), Variables(), False
         self._say_checked()
-        self._wire.event("stopped", reason=why, threadId=THREAD, allThreadsStopped=True, description=self._where())
+        more = {"text": self._error} if why == "exception" else {}
+        self._wire.event(
+            "stopped", reason=why, threadId=THREAD, allThreadsStopped=True, description=self._where(), **more
+        )
         while not self._answer(self._wire.request(wait=True), frame):
             pass
         self._frames = []
@@ -371,7 +422,8 @@ class Session:
 
     def _initialize(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         self._connection.settimeout(None)
-        return dict.fromkeys(CAPABILITIES, True)
+        offered = {"filter": UNCAUGHT, "label": "Exceptions that leave process()", "default": True}
+        return dict.fromkeys(CAPABILITIES, True) | {"exceptionBreakpointFilters": [offered]}
 
     def _launch(self, arguments: Mapping[str, Any]) -> None:
         if not arguments.get("stopOnEntry", True):
@@ -405,7 +457,7 @@ class Session:
         return {"breakpoints": told}
 
     def _set_exceptions(self, arguments: Mapping[str, Any]) -> None:
-        """None are offered."""
+        self._stops_raised = UNCAUGHT in arguments.get("filters", ())
 
     def _threads(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"threads": [{"id": THREAD, "name": self._where()}]}
@@ -466,12 +518,9 @@ class Session:
         return self._frames[number - 1]
 
     def _where(self) -> str:
-        call = self._debugger.calls[self._going.call]
-        first = self._debugger.calls[0].stamp
-        return (
-            f"{self._debugger.node.name} call {self._going.call} of {len(self._debugger.calls)}, "
-            f"{(call.stamp - first) * 1e-9:.3f} s after its first"
-        )
+        calls, number = self._debugger.calls, self._going.call
+        at = (calls[number].stamp - self._origin) * 1e-9
+        return f"{self._debugger.node.name} call {number} of {len(calls)}, at {at:.3f} s"
 
     def _say(self, text: str, category: str = "console") -> None:
         self._wire.event("output", category=category, output=f"{text}\n")
@@ -480,7 +529,7 @@ class Session:
         if self._checked:
             first, last = min(self._checked), max(self._checked)
             calls = f"call {first}" if first == last else f"{len(self._checked)} calls, {first} to {last}"
-            self._say(f"{calls}: as recorded, digest by digest")
+            self._say(f"{calls}: {self._verdict}", "console" if self._verdict == AS_RECORDED else "stderr")
             self._checked.clear()
 
 

@@ -48,6 +48,19 @@ class Rare(Operator):
         return None if x.vectors[0, 0] == 5 else vector(x.stamp, *x.vectors[0])
 
 
+class Counted(Operator):
+    """Counts its calls, for the summary."""
+
+    x: In[FeatureVector]
+    state: Sum
+
+    def process(self, x: FeatureVector) -> None:
+        self.state.total += 1
+
+    def summary(self) -> dict[str, float]:
+        return {"calls": self.state.total}
+
+
 def recorded(path: Path) -> Path:
     """Records numbers at 100 Hz by right code; before `CHANGED` the factor becomes 3."""
     os.environ["ZOO_FIXED"] = "1"
