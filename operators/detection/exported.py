@@ -79,7 +79,7 @@ class ExportedFinder:
         )
 
     def _open_input(self, side: int, provider: Provider) -> None:
-        """Lets the network take images of another side than its file says. Raises ModelError where it cannot."""
+        """Lets the network take images of another side than its file names. Raises ModelError where it cannot."""
         exported = self._input
         extents = (2, 3) if exported.layout == "nchw" else (1, 2)
         self._session = open_content(opened(self._file.read_bytes(), exported.name, extents), str(self._file), provider)

@@ -23,6 +23,7 @@ Indices = NDArray[np.intp]
 
 _FEWEST = 5  # points of a part
 _WHOLE = 0.6  # overlap from which points without a gap in range are not divided
+_AS_WELL = 0.8  # share of the best overlap, from which a part fills a box as well
 _MIDDLE = 0.5  # what holding all points in the middle of a box counts, beside the overlap
 _SAME = 0.5  # overlap from which two boxes are around the same thing
 _SAME_BODY = 0.2  # that overlap where most of the points are in both
@@ -93,6 +94,15 @@ class _Part:
         low, high = np.minimum(self.bounds[0], other.bounds[0]), np.maximum(self.bounds[1], other.bounds[1])
         image = (min(a, e), min(b, f), max(c, g), max(d, h))
         return _Part(np.concatenate([self.rows, other.rows]), image, np.stack([low, high]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Grown:
+    """A part grown by others, the overlap of its image with the box, and how likely it is the object."""
+
+    part: _Part
+    value: float
+    rank: float
 
 
 def lift(
@@ -272,19 +282,49 @@ def _object(
     parts = [_part(seen, rows[labels == c]) for c in np.flatnonzero(np.bincount(labels) >= _FEWEST)]
     if not parts:
         return None
-    values = [_overlap(part.image, box) for part in parts]
-    central = [_central(seen, part.rows, box) for part in parts]
-    ranks = [v + _MIDDLE * n / max(sum(central), _FEWEST) for v, n in zip(values, central, strict=True)]
-    order = sorted(range(len(parts)), key=lambda c: (-ranks[c], c))
-    chosen, value = parts[order[0]], values[order[0]]
-    for c in order[1:]:
-        both = chosen.joined(parts[c])
-        better = _overlap(both.image, box)
-        if better > value + 0.01 and _apart(chosen.bounds, parts[c].bounds) <= s.gap:
-            chosen, value = both, better
+    chosen, value = _best(seen, parts, box, s)
     if value < s.min_overlap or len(chosen.rows) < s.min_points:
         return None
     return np.sort(chosen.rows), value
+
+
+def _best(
+    seen: Seen, parts: Sequence[_Part], box: tuple[float, float, float, float], s: LiftSettings
+) -> tuple[_Part, float]:
+    """Returns the part, grown by others near it, that is the object of a box, and the overlap of its image with it.
+
+    It fills the box best and holds most points in its middle. What shows through a thing (a chair's back of slats)
+    fills the box as the thing does: of those that fill it about as well the nearest is the object.
+    """
+    grown = _grown(seen, parts, box, s)
+    filling = [each for each in grown if each.value >= _AS_WELL * max(other.value for other in grown)]
+    if len(filling) > 1:
+        ranges = [_median(np.linalg.norm(seen.points[each.part.rows], axis=1)) for each in filling]
+        grown = [each for each, away in zip(filling, ranges, strict=True) if away <= min(ranges) + s.gap]
+    best = max(grown, key=lambda each: each.rank)
+    return best.part, best.value
+
+
+def _grown(
+    seen: Seen, parts: Sequence[_Part], box: tuple[float, float, float, float], s: LiftSettings
+) -> list[_Grown]:
+    """Returns each part together with others near it that make it fill the box better; those are not begun with."""
+    values = [_overlap(part.image, box) for part in parts]
+    central = [_central(seen, part.rows, box) for part in parts]
+    most = max(sum(central), _FEWEST)
+    order = sorted(range(len(parts)), key=lambda c: (-values[c] - _MIDDLE * central[c] / most, c))
+    grown, left = [], order
+    while left:
+        first, *left = left
+        chosen, value, middle = parts[first], values[first], central[first]
+        for c in order:
+            both = chosen.joined(parts[c])
+            better = _overlap(both.image, box)
+            if c != first and better > value + 0.01 and _apart(chosen.bounds, parts[c].bounds) <= s.gap:
+                chosen, value, middle = both, better, middle + central[c]
+                left = [each for each in left if each != c]
+        grown.append(_Grown(chosen, value, value + _MIDDLE * middle / most))
+    return grown
 
 
 def _among(values: NDArray[np.integer[Any]], chosen: NDArray[np.int64]) -> Mask:
