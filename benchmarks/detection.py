@@ -126,7 +126,8 @@ def main() -> None:
     parser.add_argument("data", type=Path, help="folder with images/ and labels/")
     parser.add_argument("--score-threshold", type=float, default=0.001)
     parser.add_argument("--nms-iou", type=float, default=0.45)
-    parser.add_argument("--fit", default="default", help="stretch or letterbox instead of the decoder's own")
+    parser.add_argument("--fit", help="stretch, letterbox or corner instead of the decoder's own")
+    parser.add_argument("--input-size", type=int, help="side of the input instead of the registry's")
     parser.add_argument("--outside", action="store_true", help="FastestDet without code of the project, too")
     controls = parser.add_argument_group("controls, which must all lower AP if the decoding is right")
     controls.add_argument("--swap-colors", action="store_true", help="exchange red and blue")
@@ -141,6 +142,7 @@ def main() -> None:
         score_threshold=arguments.score_threshold,
         nms_iou=arguments.nms_iou,
         fit=arguments.fit,
+        input_size=arguments.input_size,
     )
     detector.setup()
     peer = outside(arguments.model, arguments.score_threshold, arguments.nms_iou) if arguments.outside else None

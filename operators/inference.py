@@ -50,12 +50,12 @@ def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] =
     return _opened(file.read_bytes() + _outputs(reveal) if reveal else str(file), str(file), provider)
 
 
-def open_content(content: bytes, told: str) -> onnxruntime.InferenceSession:
-    """Opens an ONNX model that is a part of a file, for one thread on the CPU.
+def open_content(content: bytes, told: str, provider: Provider = "cpu") -> onnxruntime.InferenceSession:
+    """Opens an ONNX model that is a part of a file, or was changed, for one thread on the CPU.
 
     Raises ModelError with its place (`told`) for one that is no model.
     """
-    return _opened(content, told, "cpu")
+    return _opened(content, told, provider)
 
 
 def _opened(model: bytes | str, told: str, provider: Provider) -> onnxruntime.InferenceSession:

@@ -14,13 +14,15 @@ from operators.detection.coco import COCO_CLASSES
 from operators.detection.decode import Candidates, Layout, Outputs
 from operators.detection.decoders import LAYOUTS, DecoderName
 from operators.detection.nms import class_wise_nms
+from operators.detection.open_input import opened
 from operators.image.letterbox import Fit, FitMode
-from operators.inference import ModelError, Provider, open_session
+from operators.inference import ModelError, Provider, open_content, open_session
 from operators.language.bpe import Tokenizer
 from operators.model_metadata import told
-from operators.network_input import image_input
+from operators.network_input import ImageInput, image_input
 
 _PROMPT = "a photo of a {}"
+_SIDE = 640  # pixels, where the model leaves it open
 
 
 class ExportedFinder:
@@ -38,22 +40,16 @@ class ExportedFinder:
         *,
         provider: Provider = "cpu",
         fit: FitMode | None = None,
-        free_side: int = 640,
+        side: int | None = None,
         masks: bool = True,
         tokenizer: Path | None = None,
     ) -> None:
         self._file, self._decoder = file, decoder
         self._layout: Layout = LAYOUTS[decoder]
         self._session = open_session(file, provider)
-        self._input = image_input(
-            file,
-            self._session,
-            (free_side, free_side),
-            bgr=self._layout.bgr,
-            mean=self._layout.mean,
-            scale=self._layout.scale,
-            others=2 if self._layout.words else int(self._layout.sized),
-        )
+        self._input = self._image_input(side)
+        if side is not None and self._input.size != (side, side):
+            self._open_input(side, provider)
         self._feed = self._size_input() if self._layout.sized else {}
         self._batch = next(each.shape[0] for each in self._session.get_inputs() if each.name == self._input.name)
         self._fit: FitMode = self._layout.fit if fit is None else fit
@@ -70,6 +66,34 @@ class ExportedFinder:
                 )
             self._tokenizer = Tokenizer(tokenizer)
             self.find_also(())
+
+    def _image_input(self, side: int | None) -> ImageInput:
+        return image_input(
+            self._file,
+            self._session,
+            (side or _SIDE, side or _SIDE),
+            bgr=self._layout.bgr,
+            mean=self._layout.mean,
+            scale=self._layout.scale,
+            others=2 if self._layout.words else int(self._layout.sized),
+        )
+
+    def _open_input(self, side: int, provider: Provider) -> None:
+        """Lets the network take images of another side than its file names. Raises ModelError where it cannot."""
+        exported = self._input
+        extents = (2, 3) if exported.layout == "nchw" else (1, 2)
+        self._session = open_content(opened(self._file.read_bytes(), exported.name, extents), str(self._file), provider)
+        self._input = self._image_input(side)
+        try:
+            feed = self._size_input() if self._layout.sized else {}
+            nothing = self._input.tensor(np.zeros((side, side, 3), np.uint8))
+            outputs = self._session.run(None, {exported.name: nothing, **feed})
+            self._layout.decode(outputs, self._input.size, 1.0)
+        except Exception as error:  # onnxruntime's exception classes share no public base
+            raise ModelError(
+                f"{self._file} was exported for images of {exported.size[0]}x{exported.size[1]} and takes none of "
+                f"{side}x{side}, which only a network of convolutions does: leave out OnnxDetector.input_size ({error})"
+            ) from error
 
     @property
     def is_open(self) -> bool:

@@ -21,7 +21,7 @@ from operators.models.use import Used, names_a_model, use_model, use_part
 from operators.network_input import read_labels, three_channels
 from operators.weights import kind_of, trained_in_simulation
 
-_SCORE, _GRID_IOU, _SIDE = 0.3, 0.5, 640
+_SCORE, _GRID_IOU = 0.3, 0.5
 
 
 class _OnnxDetection(Operator, abstract=True):
@@ -60,7 +60,8 @@ class _OnnxDetection(Operator, abstract=True):
     input_size: int | None = Param(
         None,
         ge=32,
-        doc="side of the input where the model leaves it open; none takes the registry's, or 640",
+        doc="side of the input; none takes the registry's, the model's own, or 640 where that is open. A network of "
+        "convolutions (YOLOX) takes others than it was exported for: a larger one finds smaller things, in more time",
         unit="px",
     )
     masks: bool = Param(True, doc="give instance masks where the model has them")
@@ -133,7 +134,7 @@ class _OnnxDetection(Operator, abstract=True):
             names_of(used.model) if self.classes is None else self._names(self.classes),
             provider=self.provider,
             fit=used.setting(self, "fit", None),
-            free_side=used.setting(self, "input_size", _SIDE),
+            side=used.setting(self, "input_size", None),
             masks=self.masks,
             tokenizer=None if used.model is None or not used.model.parts else use_part(self, used.model, "tokenizer"),
         )

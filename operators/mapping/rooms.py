@@ -88,14 +88,17 @@ def _walls(taken: Mask, resolution: float, island: float) -> Mask:
 
 
 def _widths(walls: Mask, resolution: float) -> NDArray[np.float32]:
-    """Returns how wide a circle around each cell meets no wall; beyond the grid there is none."""
+    """Returns how wide a circle around each cell meets no wall; beyond the grid there is none.
+
+    Walls begin in the middle of the taken cells at their edge: a surface lies anywhere in the cell that it takes.
+    """
     if not walls.any():
         return np.full(walls.shape, np.inf, np.float32)
     height, width = walls.shape
     halves = np.repeat(np.repeat(~walls, 2, axis=0), 2, axis=1)  # the middle of an even number of cells is between two
     away = cv2.distanceTransform(halves.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     most = away.reshape(height, 2, width, 2).max(axis=(1, 3))
-    return np.asarray(most * np.float32(resolution), np.float32)
+    return np.asarray((most + 1) * np.float32(resolution), np.float32)
 
 
 def _bridged(floor: Mask, walls: Mask, cells: float) -> Mask:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,6 +23,7 @@ Indices = NDArray[np.intp]
 
 _FEWEST = 5  # points of a part
 _WHOLE = 0.6  # overlap from which points without a gap in range are not divided
+_AS_WELL = 0.8  # share of the best overlap, from which a part fills a box as well
 _MIDDLE = 0.5  # what holding all points in the middle of a box counts, beside the overlap
 _SAME = 0.5  # overlap from which two boxes are around the same thing
 _SAME_BODY = 0.2  # that overlap where most of the points are in both
@@ -95,6 +96,15 @@ class _Part:
         return _Part(np.concatenate([self.rows, other.rows]), image, np.stack([low, high]))
 
 
+@dataclass(frozen=True, eq=False)
+class _Grown:
+    """A part grown by others, the overlap of its image with the box, and how likely it is the object."""
+
+    part: _Part
+    value: float
+    rank: float
+
+
 def lift(
     seen: Seen,
     boxes: Array,
@@ -107,9 +117,10 @@ def lift(
     """Finds the object of each image box (M, 4) among a cloud's points; boxes without one are left out.
 
     Points in a box are divided into clusters; the one whose image overlaps the box best is the object, with those near
-    it that make the overlap better. `mask_classes` (M,) is the mask's class of each box, -1 for none. Where the box
-    holds enough of it, only such points count. Otherwise points of `background` classes and on level surfaces that
-    reach beyond the box do not. Points go to the box that they fit best, once.
+    it that make the overlap better; without masks the nearest of those that overlap it about as well. `mask_classes`
+    (M,) is the mask's class of each box, -1 for none. Where the box holds enough of it, only such points count.
+    Otherwise points of `background` classes and on level surfaces that reach beyond the box do not. Points go to the
+    box that they fit best, once.
 
     `instances` (M) are masks (H, W) of the objects themselves; where they are known, only points on them count.
 
@@ -142,7 +153,7 @@ def lift(
             body = _body(seen, columns, lines, classes == mask_classes[k], order, box, s)
             candidates += [] if body is None else [(k, *body)]
             continue
-        found = _object(seen, np.sort(rows), box, s)
+        found = _object(seen, np.sort(rows), box, s, masked=instances is not None or classes is not None)
         if found is not None:
             candidates.append((k, *found))
     owned = _divided(seen.places[:2], boxes, candidates, bodies)
@@ -256,7 +267,7 @@ def _off_support(seen: Seen, rows: Indices, ring: Indices, s: LiftSettings) -> I
 
 
 def _object(
-    seen: Seen, rows: Indices, box: tuple[float, float, float, float], s: LiftSettings
+    seen: Seen, rows: Indices, box: tuple[float, float, float, float], s: LiftSettings, *, masked: bool
 ) -> tuple[Indices, float] | None:
     """Returns the points of the object in a box and the overlap of their image with it."""
     if len(rows) < s.min_points:
@@ -272,19 +283,59 @@ def _object(
     parts = [_part(seen, rows[labels == c]) for c in np.flatnonzero(np.bincount(labels) >= _FEWEST)]
     if not parts:
         return None
-    values = [_overlap(part.image, box) for part in parts]
-    central = [_central(seen, part.rows, box) for part in parts]
-    ranks = [v + _MIDDLE * n / max(sum(central), _FEWEST) for v, n in zip(values, central, strict=True)]
-    order = sorted(range(len(parts)), key=lambda c: (-ranks[c], c))
-    chosen, value = parts[order[0]], values[order[0]]
-    for c in order[1:]:
-        both = chosen.joined(parts[c])
-        better = _overlap(both.image, box)
-        if better > value + 0.01 and _apart(chosen.bounds, parts[c].bounds) <= s.gap:
-            chosen, value = both, better
+    chosen, value = _best(seen, parts, box, s, masked=masked)
     if value < s.min_overlap or len(chosen.rows) < s.min_points:
         return None
     return np.sort(chosen.rows), value
+
+
+def _best(
+    seen: Seen,
+    parts: Sequence[_Part],
+    box: tuple[float, float, float, float],
+    s: LiftSettings,
+    *,
+    masked: bool,
+) -> tuple[_Part, float]:
+    """Returns the part, grown by others near it, that is the object of a box, and the overlap of its image with it.
+
+    It fills the box best and holds most points in its middle. What shows through a thing (a chair's back of slats)
+    fills the box as the thing does: where no masks leave it out, the nearest of what fills it about as well counts.
+    """
+    grown = _grown(seen, parts, box, s)
+    if masked:
+        first = next(grown)
+        return first.part, first.value
+    every = list(grown)
+    filling = [each for each in every if each.value >= _AS_WELL * max(other.value for other in every)]
+    ranges = [_median(np.linalg.norm(seen.points[each.part.rows], axis=1)) for each in filling]
+    near = [each for each, away in zip(filling, ranges, strict=True) if away <= min(ranges) + s.gap]
+    best = max(near, key=lambda each: each.rank)
+    return best.part, best.value
+
+
+def _grown(
+    seen: Seen, parts: Sequence[_Part], box: tuple[float, float, float, float], s: LiftSettings
+) -> Iterator[_Grown]:
+    """Gives each part together with those near it that make it fill the box better, which are not begun with then.
+
+    It begins with the part that fills the box best and holds most points in its middle.
+    """
+    values = [_overlap(part.image, box) for part in parts]
+    central = [_central(seen, part.rows, box) for part in parts]
+    most = max(sum(central), _FEWEST)
+    order = sorted(range(len(parts)), key=lambda c: (-values[c] - _MIDDLE * central[c] / most, c))
+    left = order
+    while left:
+        first, *left = left
+        chosen, value, middle = parts[first], values[first], central[first]
+        for c in order:
+            both = chosen.joined(parts[c])
+            better = _overlap(both.image, box)
+            if c != first and better > value + 0.01 and _apart(chosen.bounds, parts[c].bounds) <= s.gap:
+                chosen, value, middle = both, better, middle + central[c]
+                left = [each for each in left if each != c]
+        yield _Grown(chosen, value, value + _MIDDLE * middle / most)
 
 
 def _among(values: NDArray[np.integer[Any]], chosen: NDArray[np.int64]) -> Mask:

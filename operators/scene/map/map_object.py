@@ -180,6 +180,17 @@ class MapObject:
             box = completed(box, self.view / max(self.views, 1), usually)
         self.center, self.size, self.yaw = box
 
+    def keep(self, box: tuple[Array, Array, float]) -> None:
+        """Keeps a box from before a view that the image cuts off, moved and grown as little as what is seen needs."""
+        center, size, yaw = box
+        c, s = math.cos(yaw), math.sin(yaw)
+        axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        own = (self.cells.points - center) @ axes
+        low, high = own.min(axis=0), own.max(axis=0)
+        larger = np.maximum(size, high - low)
+        shift = np.clip(0.0, high - larger / 2, low + larger / 2)
+        self.center, self.size, self.yaw = center + axes @ shift, larger, yaw
+
     def stand_on(self, floor: float, foot: float) -> None:
         """Lets the box reach down to a floor that is not farther below it than a `foot` may be hidden, metres."""
         bottom, top = float(self.center[2] - self.size[2] / 2), float(self.center[2] + self.size[2] / 2)

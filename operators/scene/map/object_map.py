@@ -194,8 +194,11 @@ class ObjectMap:
             known = np.isfinite(object.color).all()
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
         if mover:
+            earlier = object.box
             object.cells, object.most = cells, len(cells)
             self._fit(object)
+            if each.image is not None and not each.image.edges.all() and not moved:
+                object.keep(earlier)
             speed = (object.center - before) / since
             share = min(1.0, since / 0.5)
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)

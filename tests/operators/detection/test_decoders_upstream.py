@@ -292,7 +292,7 @@ def test_yolox_nano_is_known_by_its_digest_and_equal_to_the_model_outside(data_d
     import onnxruntime
 
     file = data_dir / "models" / "yolox_nano.onnx"
-    detector = OnnxDetector(model=str(file), score_threshold=0.25)
+    detector = OnnxDetector(model=str(file), score_threshold=0.25, input_size=416)  # as its demo
     detector.setup()
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     total = 0

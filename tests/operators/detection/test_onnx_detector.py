@@ -224,3 +224,45 @@ def test_fastestdet_finds_what_is_in_real_photographs(data_dir: Path) -> None:
             right += bool((inner / union > 0.5).any())
     assert total >= 20
     assert right / total > 0.45
+
+
+def save_convolution(file: Path, side: int, *, fixed: bool) -> str:
+    """A network of one convolution, exported for images of one side: the share of red in each 8x8 pixels is objectness
+    and score of its cell. One that is `fixed` reshapes to the cells of that side."""
+    make, cells = onnx.helper, side // 8
+    weights = np.zeros((6, 3, 8, 8), np.float32)
+    weights[[0, 5], 2] = 1 / 64  # BGR in [0, 1]
+    shape = [1, 6, cells, cells] if fixed else [0, 0, 0, -1]
+    nodes = [
+        make.make_node("Conv", ["x", "weights"], ["grid"], kernel_shape=[8, 8], strides=[8, 8]),
+        make.make_node("Reshape", ["grid", "shape"], ["y"]),
+    ]
+    graph = make.make_graph(
+        nodes,
+        "convolution",
+        [make.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 3, side, side])],
+        [make.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1, 6, cells, cells])],
+        [onnx.numpy_helper.from_array(weights, "weights"), onnx.numpy_helper.from_array(np.array(shape), "shape")],
+        value_info=[make.make_tensor_value_info("grid", onnx.TensorProto.FLOAT, [1, 6, cells, cells])],
+    )
+    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
+    return str(file)
+
+
+def test_a_network_of_convolutions_takes_a_larger_input_than_it_was_exported_for(tmp_path: Path) -> None:
+    data = np.zeros((64, 64, 3), np.uint8)
+    data[16:24, 40:48, 0] = 255  # a cell of the input at 64, a quarter of one at 32
+    image = Image(stamp=1, frame="camera", data=data)
+    model = save_convolution(tmp_path / "m.onnx", 32, fixed=False)
+    options = {"model": model, "decoder": "fastestdet", "classes": names(tmp_path, "mug"), "score_threshold": 0.2}
+    as_exported, larger = detector(**options), detector(**options, input_size=64)
+    np.testing.assert_allclose(as_exported.process(image).scores, [0.25], atol=1e-5)
+    found = larger.process(image)
+    np.testing.assert_allclose(found.scores, [1.0], atol=1e-5)
+    np.testing.assert_allclose(found.boxes, [[24, 0, 56, 32]], atol=1e-3)  # around the corner of cell (5, 2)
+
+
+def test_an_input_size_that_a_network_cannot_take_is_refused(tmp_path: Path) -> None:
+    model = save_convolution(tmp_path / "m.onnx", 32, fixed=True)
+    with pytest.raises(ModelError, match=r"exported for images of 32x32 and takes none of 64x64.*input_size"):
+        detector(model=model, decoder="fastestdet", classes=names(tmp_path, "mug"), input_size=64)

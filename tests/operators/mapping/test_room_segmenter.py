@@ -197,3 +197,19 @@ def test_two_plays_are_equal_and_a_restored_segmenter_goes_on_the_same() -> None
     assert snapshot is not None
     second.restore(snapshot)
     assert [second.process(m)["rooms"] for m in maps[1:]] == whole["rooms"][1:]
+
+
+@pytest.mark.parametrize("clear", [0.7, 0.83, 1.0])
+def test_the_width_of_a_door_is_that_between_its_jambs_wherever_they_lie_in_their_cells(clear: float) -> None:
+    """A cell is taken where a jamb lies in it: in the mean over places the width is neither too small nor too large."""
+    widths = []
+    for start in np.arange(1.5, 1.5 + SIDE, SIDE / 10):
+        plan = flat()
+        plan.fill((LEFT[0], 1.9, LEFT[2], 2.0), 100)
+        first, last = int(np.floor(start / SIDE + 1e-9)) + 1, int(np.floor((start + clear) / SIDE + 1e-9))
+        plan.cells[38:40, first:last] = 0
+        (rooms,) = segmented([plan.at(0.0)])
+        away = np.abs(rooms.door_positions[:, :2] - [start + clear / 2, 1.95]).sum(axis=1)
+        door = int(np.argmin(away))
+        widths.append(float(rooms.door_widths[door]))
+    assert abs(np.mean(widths) - clear) < 0.01

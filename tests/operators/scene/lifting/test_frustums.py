@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from operators.scene.lifting.frustums import _DENSE, Seen, _divided, _image, _linked
+from operators.scene.lifting.frustums import _DENSE, LiftSettings, Seen, _divided, _image, _linked, lift
 
 REACH = 0.1
 
@@ -45,3 +45,28 @@ def test_points_in_two_boxes_go_to_the_one_whose_middle_is_nearer_by_its_sides()
     second = np.concatenate([np.setdiff1d(inside[1], both), both[away[1][both] < away[0][both]]])
     np.testing.assert_array_equal(kept[1], np.sort(second))
     np.testing.assert_array_equal(kept[0], np.setdiff1d(inside[0], second))
+
+
+def behind_slats(slats: int) -> Seen:
+    """A chair's back of slats 2 m away, before a wall at 3 m, which shows between them and around it; f = 500."""
+    u, v = (grid.ravel() for grid in np.meshgrid(np.arange(200.0, 440, 4), np.arange(140.0, 340, 4)))
+    back = (np.abs(u - 320) <= 50) & (np.abs(v - 240) <= 50)
+    depth = np.where(back & ((v - 190) % (100 / slats) < 8), 2.0, 3.0)
+    points = np.column_stack([(u - 320) / 500, (v - 240) / 500, np.ones(len(u))]) * depth[:, None]
+    return Seen(points, np.column_stack([u, v]), np.ones(len(u), bool), np.array([0.0, -1, 0]), grain=2.0)
+
+
+@pytest.mark.parametrize("slats", [4, 5])
+def test_a_wall_that_shows_through_a_chairs_back_is_not_the_chair(slats: int) -> None:
+    seen = behind_slats(slats)
+    (found,) = lift(seen, np.array([[268.0, 188, 372, 292]]), [-1], [], LiftSettings())
+    assert set(seen.points[found.points, 2]) == {2.0}
+
+
+def test_a_cup_before_what_a_box_is_around_is_not_the_box_thing() -> None:
+    seen = behind_slats(4)
+    seen.points[:] *= 3.0 / seen.points[:, 2:]
+    cup = (np.abs(seen.pixels - [320, 240]) <= 15).all(axis=1)
+    seen.points[cup] *= 2 / 3
+    (found,) = lift(seen, np.array([[268.0, 188, 372, 292]]), [-1], [], LiftSettings())
+    assert set(seen.points[found.points, 2]) == {3.0}

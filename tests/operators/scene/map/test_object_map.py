@@ -99,6 +99,26 @@ def test_a_person_whose_feet_are_hidden_stands_on_the_floor(bottom: float, reach
     assert (abs(float(center[2] - box[2] / 2) + 0.4) < 1e-9) == reaches_down
 
 
+@pytest.mark.parametrize("along", [0.0, 0.4])
+def test_a_person_whom_the_image_cuts_off_keeps_the_size_and_goes_on(along: float) -> None:
+    known = ObjectMap(3, Kinds([BOX], {BOX: (SizePrior((0.5, 0.59, 1.6), (0.2, 0.2, 0.2)),)}), MapSettings())
+    T = looking(0.0)
+    for k in range(6):
+        y = along * k / 5
+        cut = k >= 3  # the image ends at the chest
+        low, high = -0.4, 0.4 if cut else 1.0
+        person: Solid = ((2.0, y, (low + high) / 2), (0.5, 0.5, high - low))
+        seen = observation(person, BOX, T)
+        assert seen.image is not None
+        edges = np.array([True, not cut, True, True])
+        seen = replace(seen, image=replace(seen.image, edges=edges))
+        known.update((k + 1) * SECOND // 4, [seen], RangeView(np.zeros((0, 3)), T, 0.012))
+    center, size, _ = only(known).box
+    assert abs(size[2] - 1.4) < 0.2
+    assert abs(center[2] - 0.3) < 0.1
+    assert abs(center[1] - along) < 0.1
+
+
 def test_a_part_that_is_never_seen_beside_its_whole_is_no_object_of_its_own() -> None:
     """The foot of a thing, detected as something else where its top is hidden."""
     foot: Solid = ((2.0, 0.0, 0.07), (0.12, 0.12, 0.06))
