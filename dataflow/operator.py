@@ -174,9 +174,10 @@ class Operator:
         it; re-execution gives the recorded answer, without the call.
 
         For `process()` and `finish()`. An answer holds numbers, strings, bytes, None, arrays, and lists and mappings of
-        these, at most 16 MiB a firing. The key is the name of `call`, the digest of each argument, and what
-        it closes over or is bound to; `call` gets nothing else that varies, and changes nothing of the operator. Raises what `call` raises, recorded too;
-        `EffectError` for what cannot be recorded; in a re-execution `EffectMiss` where no such call was recorded.
+        these, at most 16 MiB a firing. The key is the name of `call`, the digest of each argument, and what it closes
+        over or is bound to; `call` gets nothing else that varies, and changes nothing of the operator. Raises what
+        `call` raises, recorded too; `EffectError` for what cannot be recorded; in a re-execution `EffectMiss` where no
+        such call was recorded.
         """
         return call(*args, **kwargs) if self.__effects is None else self.__effects(call, args, kwargs)
 

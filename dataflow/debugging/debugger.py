@@ -47,7 +47,7 @@ REACH = 3 * 10**9
 NEAR = 16
 """Calls to a state further on, beyond which an operator is set up anew and begins there."""
 RESTORE = "restore()"
-"""Where an operator fails that is given a state of another version of its class."""
+"""The call in which an operator fails that is given a state of another version of its class."""
 MOST_BYTES = 2**28
 """Of the states that are kept; beyond it every other one is let go."""
 

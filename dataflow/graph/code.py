@@ -38,7 +38,7 @@ _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|
 _FOR_TYPES = re.compile(r"^if (?:\w+\.)?TYPE_CHECKING:.*\n(?:[ \t]+.*\n|[ \t]*\n)*", re.M)
 """Imports that a type checker makes, and no program."""
 _WORD = re.compile(r"""["'](?!/)([^"'\n]{1,255})["']""")
-"""What may name a file in a module's text."""
+"""Strings of a module that may name a file."""
 _texts: WeakKeyDictionary[ModuleType, bytes] = WeakKeyDictionary()
 """The source of modules as they were loaded, from the first look at them on."""
 

@@ -109,6 +109,8 @@ REFUSED: tuple[tuple[str, str], ...] = (
         "no authority.pem",
     ),
     ("run GRAPH --live --listen tls/127.0.0.1:1 --keys HERE", "place one there by `machine: NAME`"),
+    ("new service GRAPH --listen tls/127.0.0.1:1 --keys HERE", "place one there by `machine: NAME`"),
+    ("new agent robot --connect tls/127.0.0.1:1 --keys HERE --user robot --to OUT --json", "no authority.pem"),
     ("debug RECORDING smooth --dap TAKEN", "Address already in use"),
     ("metrics --port TAKEN --folder HERE", "cannot listen on port"),
     ("metrics --port 0 --connect tls/127.0.0.1:1 --keys HERE", "no authority.pem"),

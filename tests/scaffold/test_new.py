@@ -136,7 +136,7 @@ def test_the_services_of_a_graph_over_two_machines_join(tmp_path: Path, monkeypa
     Path("patrol.yaml").write_text(two)
     given = ("--listen", "tls/192.168.1.2:7447", "--keys", "laptop")
 
-    assert "operators run on robot: --listen says where" in call("new", "service", "patrol.yaml", code=2).stderr
+    assert "operators run on robot: give --listen" in call("new", "service", "patrol.yaml", code=2).stderr
     call("new", "service", "patrol.yaml", *given)
     call("new", "agent", "robot", "--connect", "tls/192.168.1.2:7447", "--keys", "robot", "--user", "root")
 

@@ -146,7 +146,7 @@ def service(
         machines_of(loaded, listen, keys, here=False)
     away = sorted({node.machine for node in loaded.nodes.values() if node.machine is not None})
     if away and listen is None:
-        raise fail(f"operators run on {', '.join(away)}: --listen says where they join, --keys with which keys")
+        raise fail(f"operators run on {', '.join(away)}: give --listen, where they join, and --keys")
     flight, folder = loaded.record.flight, Path.cwd()
     command = [str(Path(sys.executable).with_name("dataflow")), "run", str(file.resolve()), "--live", "--quiet"]
     command += [] if listen is None else ["--listen", listen]

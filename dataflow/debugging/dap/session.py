@@ -94,7 +94,7 @@ class Session:
         self._verdict = AS_RECORDED
         self._origin = debugger.origin
         self._stops_raised = False
-        """Whether calls that raise are stopped at."""
+        """True where it stops at calls that raise."""
         self._raises, self._error = -1, ""
         """The call that was stopped at as it raises, and its error."""
         self._handlers: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any] | None]] = {

@@ -92,7 +92,7 @@ def test_what_is_followed_comes_back_from_a_snapshot() -> None:
     assert other.mean is not None
     np.testing.assert_array_equal(other.mean, rival.mean)
     assert (other.lead, other.decided) == (rival.lead, False)
-    with pytest.raises(StateError, match="CompetingHypothesis lacks"):
+    with pytest.raises(StateError, match="the state of CompetingHypothesis has no _expected"):
         other.restore({})
 
 
