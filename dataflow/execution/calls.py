@@ -6,8 +6,10 @@ arguments and the operator's state alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from threading import get_ident
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -78,7 +80,7 @@ class Calls:
             seed = FiringSeed(self._seeded_by, firing.stamp)
             seed_generators(seed, self.version)
             self.operator.seed_rng(seed)
-            self._firing, self._thread, self.effects.asked = firing.stamp, get_ident(), 0
+            self._firing, self._thread, self.effects.asked = firing.stamp, threading.get_ident(), 0
             outputs = outputs_of(self.operator, _call(self.operator, firing))
             if self.effects.missed is not None:  # the operator has caught it
                 raise self.effects.missed
@@ -152,7 +154,7 @@ class Calls:
         stamp = self._firing
         if stamp is None:
             problem = "effect() is for process() and finish(): an answer is recorded with a firing"
-        elif get_ident() != self._thread:
+        elif threading.get_ident() != self._thread:
             problem = "effect() on another thread than process(): use the threads inside the call"
         elif self._asking:
             problem = "effect() inside an effect: its answer is part of the outer one's"
@@ -209,3 +211,23 @@ def value_of(given: InputValue) -> Any:
             return {stream: entry.value for stream, entry in given.items()}
         case _:
             return tuple(entry.value for entry in given)
+
+
+@contextlib.contextmanager
+def interrupted_after(seconds: float) -> Iterator[None]:
+    """Raises `TimeoutError` in the block when its time is up, between two steps of Python or in a call of the system:
+    in the main thread, where signals come; in any other nothing bounds it. Compiled code is not interrupted."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def late(number: int, frame: object) -> None:
+        raise TimeoutError(f"not over within {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)

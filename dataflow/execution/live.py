@@ -15,14 +15,14 @@ from typing import Any
 
 from dataflow.execution.absent import without_absent
 from dataflow.execution.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
-from dataflow.execution.calls import Calls
+from dataflow.execution.calls import Calls, interrupted_after
 from dataflow.execution.earlier import EarlierCounts
 from dataflow.execution.event_time import EventTime
 from dataflow.execution.failure import RAISED, OperatorFailure
 from dataflow.execution.log import FiringLog, unlisted
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
-from dataflow.execution.restarts import Restarts, close_quietly, interrupted_after
+from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.code import ReloadError, Replaced, code_now
 from dataflow.graph.model import Node, OperatorImportError

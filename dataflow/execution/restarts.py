@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from dataflow.graph.model import Restart
 from dataflow.operator import Operator
@@ -60,23 +57,3 @@ def close_quietly(operator: Operator) -> None:
         operator.close()
     except Exception as error:
         print(f"{type(operator).__name__}.close(): {type(error).__name__}: {error}", file=sys.stderr)
-
-
-@contextlib.contextmanager
-def interrupted_after(seconds: float) -> Iterator[None]:
-    """Raises `TimeoutError` in the block when its time is up, between two steps of Python or in a call of the system:
-    in the main thread, where signals come; in any other nothing bounds it. Compiled code is not interrupted."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def late(number: int, frame: object) -> None:
-        raise TimeoutError(f"not over within {seconds:g} s")
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)

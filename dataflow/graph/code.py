@@ -85,11 +85,11 @@ def files_of(home: str) -> dict[str, Path]:
         file = Path(origin)
         above = file.parents[name.count(".") + (file.name == "__init__.py")]
         named = {file, *(file.parent / word for word in _WORD.findall(text.decode(errors="replace")))}
-        found |= {os.path.relpath(each, above): each for each in named if _is_file(each)}
+        found |= {os.path.relpath(each, above): each for each in named if is_file(each)}
     return found
 
 
-def _is_file(path: Path) -> bool:
+def is_file(path: Path) -> bool:
     """Returns whether a file is there; what no file can be called, as any long text, is none."""
     try:
         return path.is_file()

@@ -7,7 +7,6 @@ named by an absolute path must lie there already, with the same content.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.graph.code import files_of as files_of_code
+from dataflow.graph.code import is_file
 from dataflow.graph.model import current_path
 
 MOST_SENT = 4 << 30
@@ -100,16 +100,6 @@ def lacking(wanted: Mapping[str, str], folder: Path) -> tuple[list[str], list[st
         else:
             sent.append(text)
     return sent, wrong
-
-
-def is_file(path: Path) -> bool:
-    """Returns whether a file is there; what no file can be called, as any long text, is none."""
-    try:
-        return path.is_file()
-    except OSError as error:
-        if error.errno == errno.ENAMETOOLONG:
-            return False
-        raise
 
 
 def inside(folder: Path, text: str) -> Path:
