@@ -1,6 +1,6 @@
 """Sweeps: one core against two, a second sweep against the first, many short recordings, killed workers, Ray.
 
-usage: python benchmarks/sweep.py parts [--parts 10]             # the bundled recording in parts, by graphs/cloud.yaml
+usage: python benchmarks/sweep.py parts [--parts 10] [--strides 2,3]  # the bundled recording in parts, by graphs/cloud.yaml
        python benchmarks/sweep.py many [--recordings 1000]       # of 2 s each, by light operators
        python benchmarks/sweep.py many --recordings 60 --ray     # the same by a Ray cluster of this machine, too
 """
@@ -143,7 +143,7 @@ class Swept:
         return [row | {"recording": n[len(below) :]} for row in kept if (n := row["recording"]).startswith(below)]
 
 
-def parts(number: int, folder: Path) -> None:
+def parts(number: int, folder: Path, strides: str) -> None:
     """One core, two cores, and two cores again."""
     runs, pieces = folder / "runs", folder / "pieces"
     call("split", "recordings/demo.mcap", "--every", f"{21 / number}s", "--out", pieces)
@@ -151,7 +151,7 @@ def parts(number: int, folder: Path) -> None:
     print("| sweep | runs | s | CPU s a run |\n| --- | ---: | ---: | ---: |")
     swept = {}
     for name, jobs, out in (("one core", 1, "one"), ("two cores", 2, "two"), ("two cores, again", 2, "two")):
-        swept[name] = Swept("graphs/cloud.yaml", runs, folder / out, "--jobs", jobs)
+        swept[name] = Swept("graphs/cloud.yaml", runs, folder / out, "--jobs", jobs, "--set", f"cloud.stride={strides}")
         print(f"| {name} | {swept[name].row}")
     one, two, again = (each.took for each in swept.values())
     print(f"\ntwo cores are {one / two:.2f} times as quick as one")
@@ -188,13 +188,14 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("which", choices=("parts", "many"))
     options.add_argument("--parts", type=int, default=10)
+    options.add_argument("--strides", default="2", help="values of cloud.stride for `parts`, such as 2,3")
     options.add_argument("--recordings", type=int, default=1000)
     options.add_argument("--ray", action="store_true")
     chosen = options.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     with tempfile.TemporaryDirectory() as folder:
         if chosen.which == "parts":
-            parts(chosen.parts, Path(folder))
+            parts(chosen.parts, Path(folder), chosen.strides)
         else:
             many(chosen.recordings, Path(folder), ray=chosen.ray)
 
