@@ -1,6 +1,6 @@
 """Sweeps: one core against two, a second sweep against the first, many short recordings, killed workers, Ray.
 
-usage: python benchmarks/sweep.py parts [--parts 10] [--strides 2,3]  # the bundled recording in parts, by graphs/cloud.yaml
+usage: python benchmarks/sweep.py parts [--parts 10] [--strides 2,3]  # the bundled recording, by graphs/cloud.yaml
        python benchmarks/sweep.py many [--recordings 1000]       # of 2 s each, by light operators
        python benchmarks/sweep.py many --recordings 60 --ray     # the same by a Ray cluster of this machine, too
 """
