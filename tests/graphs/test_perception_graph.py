@@ -70,6 +70,18 @@ def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path:
     assert "on floor" in asked.output
 
 
+@pytest.mark.parametrize(("slam", "tracker"), [(False, "odometry"), (True, "slam")])
+def test_a_correction_of_the_extrinsics_does_not_reach_the_trackers_which_refuse_another_calibration(
+    slam: bool, tracker: str
+) -> None:
+    words = ["perception.calibrate=true", f"perception.slam={slam}"]
+    graph = load_graph(REPOSITORY / "graphs" / "perception.yaml", settings=words)
+
+    corrected = {name for name, node in graph.nodes.items() if any("calibration/corrected" in s for s in node.taken)}
+    assert f"perception/{tracker}" not in corrected
+    assert {"perception/cloud", "perception/lifter"} <= corrected
+
+
 @pytest.mark.parametrize(("adapt", "source"), [(False, "image_watch/checked"), (True, "adapter/adapted")])
 def test_the_networks_see_adapted_images_where_that_is_asked_for(adapt: bool, source: str) -> None:
     graph = load_graph(REPOSITORY / "graphs" / "perception.yaml", settings=[f"perception.adapt={adapt}"])
