@@ -154,7 +154,7 @@ class Captured:
             with of_another_version():
                 calls.restore(state, (0, self.shots[0].firing.stamp - 1))
         except OperatorFailure as failure:
-            if "StateError" not in failure.summary:
+            if not isinstance(failure.__cause__, StateError):
                 raise
             raise StateError(
                 f"{self.setting.name}: the captured state does not fit the class as it is now: {failure.summary}; "
