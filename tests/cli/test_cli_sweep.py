@@ -321,10 +321,17 @@ def test_settings_that_cannot_be_compared_are_refused(dataflow, folder: Path, tm
 
 @pytest.mark.long
 def test_two_settings_are_compared_pair_by_pair(dataflow, folder: Path, tmp_path: Path) -> None:
-    given = ("--recordings", folder / "runs", "--path", folder, "--out", tmp_path, "-q", "--json")
+    runs = tmp_path / "runs"
+    (runs / "deep").mkdir(parents=True)
+    shutil.copy(folder / "runs" / "first.mcap", runs)
+    another = runs / "deep" / "second.mcap"  # with times of its own: a copy counts once
+    dataflow("run", folder / "graph.yaml", "--record", another, "--path", folder, "--one-process", "-q")
+    shutil.copy(another, runs / "third.mcap")
+    given = ("--recordings", runs, "--path", folder, "--out", tmp_path / "out", "-q", "--json")
     told = json.loads(dataflow("compare", folder / "graph.yaml", *given, "--set", "b:scaled.by=3").stdout)
 
     (figure,) = told["figures"]
+    assert told["copies"] == {"third.mcap": "deep/second.mcap"}
     assert (figure["figure"], figure["a"], figure["b"]) == ("scaled: total error", 132.0, 198.0)
     assert dict(figure["recordings"]) == {"first.mcap": 66.0, "deep/second.mcap": 66.0}
     assert told["operators"] == [{"operator": "scaled", "recordings": 2, "first": 2}]
@@ -338,6 +345,7 @@ def test_two_settings_are_compared_pair_by_pair(dataflow, folder: Path, tmp_path
     assert [(one["side"], one["recording"], one["outcome"]) for one in failed["failed"]] == [
         ("a", "deep/second.mcap", "failed"),
         ("a", "first.mcap", "failed"),
+        ("a", "third.mcap", "failed"),
     ]
     assert all("operator 'scaled'" in one["error"] for one in failed["failed"])
 
