@@ -18,7 +18,7 @@ def drawn(count: int, seed: int = 0) -> Bytes:
 
 def near(descriptors: Bytes, by: int) -> Bytes:
     """The descriptors a little later: each byte is off by no more than so much."""
-    noise = np.random.default_rng(9).integers(-by, by + 1, descriptors.shape)
+    noise = np.random.default_rng(by).integers(-by, by + 1, descriptors.shape)
     return np.clip(descriptors.astype(int) + noise, 0, 255).astype(np.uint8)
 
 
