@@ -116,6 +116,8 @@ def test_where_returns_are_sparse_patches_are_larger_so_that_each_has_some() -> 
     assert sparse.coverage > 0.95
     np.testing.assert_allclose(sparse.points() @ NORMAL, DISTANCE, atol=0.06)
     assert dense.inverse_depth.shape == (HEIGHT // 2, WIDTH // 2)
+    few = Surface.from_depth(np.where(drawn < 1 / 150, wall(), np.float32(0)), K, 0.3, 6.0, 2)
+    assert few.inverse_depth.shape == (HEIGHT // 16, WIDTH // 16)  # the largest
 
 
 def test_depth_noise_grows_with_the_square_of_the_depth() -> None:
