@@ -190,7 +190,9 @@ def test_a_point_is_seen_where_the_rig_projects_it_and_found_again_from_there() 
 
 
 def test_sightings_are_kept_by_point_and_go_with_their_frame() -> None:
-    two = Sightings.none().also(0, np.array([0, 2]), np.full((2, 3), 1.0)).also(1, np.array([1, 2]), np.full((2, 3), 2.0))
+    two = (
+        Sightings.none().also(0, np.array([0, 2]), np.full((2, 3), 1.0)).also(1, np.array([1, 2]), np.full((2, 3), 2.0))
+    )
     some = two.of_points(np.array([2, 0]))
     assert (some.frames.tolist(), some.points.tolist()) == ([0, 0, 1], [1, 0, 0])
     assert some.pixels[:, 0].tolist() == [1.0, 1.0, 2.0]
