@@ -116,9 +116,8 @@ def test_the_covariance_is_that_of_many_drives_along_three_arcs() -> None:
         left, right = (np.array(arc) * scale + slip).T
         turn, radius = (right - left) / track, track * (left + right) / (2 * (right - left))
         yaw = pose[2]
-        pose = pose + [
-            radius * (np.sin(yaw + turn) - np.sin(yaw)), radius * (np.cos(yaw) - np.cos(yaw + turn)), turn
-        ]  # fmt: skip
+        east, north = np.sin(yaw + turn) - np.sin(yaw), np.cos(yaw) - np.cos(yaw + turn)
+        pose = pose + np.array([radius * east, radius * north, turn])
     spread = np.sqrt(np.diag(np.cov(pose)))
     np.testing.assert_allclose(drive.pose, pose.mean(axis=1), atol=5e-4)
     np.testing.assert_allclose(drive.covariance() / np.outer(spread, spread), np.corrcoef(pose), atol=0.03)
