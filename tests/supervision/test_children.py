@@ -105,10 +105,10 @@ def test_messages_and_lines_become_events_of_their_process(scene: Scene) -> None
 
 def test_what_a_process_said_and_printed_comes_before_its_end(scene: Scene) -> None:
     scene.said.send("closed", facts={})
-    os.write(scene.printed, b"last words\nand no end of line")
+    os.write(scene.printed, b"last words\nand no end")
     found = scene.hears(End(scene.a, -9))
     assert found == [
-        Said("a", "closed", {"facts": {}}), Printed("a", "last words"), Printed("a", "and no end of line"), Died("a", -9)
+        Said("a", "closed", {"facts": {}}), Printed("a", "last words"), Printed("a", "and no end"), Died("a", -9)
     ]  # fmt: skip
     scene.children.send("a", "go", {})  # news that cross its end go nowhere
     scene.children.signal("a", 9)
