@@ -188,6 +188,23 @@ def test_a_bare_corridor_tells_nothing_of_the_way_along_it_and_the_covariance_sa
     assert np.abs(off[1:3]).max() < 0.03
 
 
+def test_a_robot_that_nods_on_a_field_is_not_carried_away_by_it() -> None:
+    """The ground holds height, roll and pitch. Of the rest nothing is known but that it began at rest, or not."""
+    field = [(2, -1.0, (-60, 60), (-60, 60))]
+
+    def nodding(t: float) -> Array:
+        return along(t) @ se3.exp(np.array([0, 0, 0, 0.02 * np.sin(5 * t), 0.02 * (np.sin(3 * t + 1) - np.sin(1)), 0]))
+
+    played = play(LidarOdometry(), {"cloud": [scan(field, nodding, k) for k in range(9)]})
+    off, last = errors(played, nodding), played["odometry"][-1]
+    assert isinstance(last, Odometry)
+    assert last.pose_covariance is not None
+    assert np.abs(off[:, 2:5]).max() < 0.05
+    assert np.abs(off[:, 5]).max() < 0.05
+    assert np.linalg.norm(off[:, :2], axis=1).max() < 0.9  # it went 0.8 m
+    assert np.sqrt(last.pose_covariance[0, 0]) > 1.0
+
+
 def test_bad_scans_are_bridged_and_named() -> None:
     clouds = [scan(ROOM, circling, k) for k in range(12)]
     clouds[6] = clouds[6].replace(points=np.zeros((0, 3), np.float32))
