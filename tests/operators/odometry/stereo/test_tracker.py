@@ -20,7 +20,7 @@ from operators.geometry.pinhole import Points, project
 from operators.odometry import StereoVisualOdometry
 from operators.odometry.stereo.adjustment import Offset, Past, Sightings, StereoRig, adjust
 from operators.odometry.stereo.odometry import rig_of
-from operators.odometry.stereo.relocalizer import FoundAgain, StereoRelocalizer
+from operators.odometry.stereo.relocalizer import FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.stereo.tracker import StereoOdometry
 from operators.odometry.tracking import Status, TrackResult
@@ -285,6 +285,24 @@ def test_a_new_map_begins_after_a_gap_and_goes_where_the_view_is_found(
     truth = {i * 100_000_000: T for i, T in enumerate(poses[:17])} | {later: poses[17], later + 100_000_000: poses[18]}
     for k in kept:
         assert np.linalg.norm((k.T_world_camera - truth[k.stamp])[:3, 3]) < 0.1
+
+
+def test_a_view_is_found_among_pairs_that_were_kept_and_believed_where_they_show_the_same() -> None:
+    pairs, poses = sequence(25)
+
+    def kept(k: int, T: Matrix, segment: int = 0) -> StereoKeyframe:
+        return kept_pair(*pairs[k], k, T, 1e-4 * np.eye(6), 0.0, segment)
+
+    known, relocalizer = [kept(k, poses[k]) for k in (0, 4, 8)], StereoRelocalizer(RIG)
+    ahead = se3.exp(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
+    assert relocalizer.believed(kept(6, poses[6]), known, 4.0)
+    assert not relocalizer.believed(kept(6, poses[6] @ ahead), known, 4.0)
+    assert not relocalizer.believed(kept(6, poses[6], segment=1), known, 4.0)  # of which no pair was kept
+    (found,) = relocalizer.found(kept(6, np.eye(4)), known, known, 4.0)
+    assert np.linalg.norm((invert(poses[6]) @ found.T_world_camera)[:3, 3]) < 0.1
+    assert any(found.keyframe is each for each in known)
+    assert found.features >= 15
+    assert 1e-3 < np.sqrt(np.trace(found.covariance[:3, :3])) < 0.2
 
 
 def test_blank_images_give_no_pose() -> None:
