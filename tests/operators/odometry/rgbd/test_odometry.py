@@ -883,6 +883,43 @@ def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_re
         play(VisualOdometry(), each)
 
 
+def test_a_clock_that_begins_anew_begins_a_new_path() -> None:
+    frames, _ = sequence(25, 3.0)
+    operator = VisualOdometry()
+    operator.setup()
+
+    def step(i: int, stamp: int) -> dict[str, Any]:
+        image, depth = (
+            Image(stamp=stamp, frame="c", data=frames[i][0]),
+            DepthImage(stamp=stamp, frame="c", data=frames[i][1]),
+        )
+        return operator.process(image, depth, info("c", K_COLOR), info("c", K_DEPTH))
+
+    for i in range(4):
+        sent = step(i, (i + 7) * TENTH)
+    assert np.linalg.norm(sent["odometry"].position) > 0.02
+    assert operator.summary() == {"tracking": 4}
+    operator.on_reset("image")
+    sent = step(4, TENTH)
+    np.testing.assert_array_equal(sent["odometry"].matrix(), np.eye(4))
+    assert sent["status"].messages == ("tracking: the first view",)
+
+
+def test_images_that_repeat_the_last_ones_are_named_and_not_used() -> None:
+    frames, poses = sequence(25, 3.0)
+    (image, depth), (_, later) = frames[1:3]
+    shown = [frames[0], (image, depth), (image, later), (image, later), frames[4], (frames[5][0], frames[4][1])]
+    results = follow(shown, rate=10.0)
+    assert [r.reason.split("; ", 1)[-1] for r in results[2:4]] == [
+        "image repeats the last one",
+        "depth repeats the last one",
+    ]
+    assert [r.status for r in results[2:4]] == [Status.TRACKING, Status.PREDICTED]
+    assert results[5].reason.endswith("; depth repeats the last one")
+    assert errors(results[4:], poses[4:6])[0] < 0.02
+    assert np.linalg.norm((results[2].T_world_camera - poses[2])[:3, 3]) < 0.01
+
+
 def test_operator_refuses_an_image_that_its_calibration_does_not_describe() -> None:
     frames, _ = sequence(40)
     image, depth = frames[0]
