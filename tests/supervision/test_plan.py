@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from dataflow.environments import EnvError
 from dataflow.graph import Graph, load_text
+from dataflow.messages import FeatureVector
+from dataflow.recording.streams.cutting import CUT
+from dataflow.reexecution.recorded_run import ENDS, ReplayError
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.plan import (
     FLIGHT_SETTLES,
@@ -20,6 +25,7 @@ from dataflow.supervision.plan import (
     replaced_in,
     taken_keys,
 )
+from dataflow.supervision.replay import plan_replay
 from dataflow.transport import NetworkError
 
 GRAPH = """\
@@ -178,3 +184,59 @@ def test_a_replay_from_the_middle_begins_warm() -> None:
     assert configs(log=LOG)["smooth"]["warm"] is None
     foreign = LogPlan(Path("run.bag"), (FAST,), start=40, bag={"format": "bag1"})
     assert configs(log=foreign)["smooth"]["warm"] is None
+
+
+# -- what a recording plays --------------------------------------------------------------------------------------------
+
+
+def recorded(*streams: str, cut: int | None = None) -> Any:
+    """A recording of streams that begin at 5 s, the static one at 0, and what of each is known."""
+    infos = {
+        s: SimpleNamespace(
+            first=0 if s == CONSTANT else 5_000_000_000, static=s == CONSTANT, schema=FeatureVector.SCHEMA,
+            message_type=FeatureVector, declaration=None,
+        )
+        for s in streams
+    }  # fmt: skip
+    metadata = {ENDS: {FAST: json.dumps({"final": 99})}}
+    if cut is not None:
+        metadata[CUT] = {"of": "x", "start": str(cut)}
+    return SimpleNamespace(path=Path("run.mcap"), streams=infos, metadata=metadata, opening=lambda: None)
+
+
+def test_recorded_streams_take_the_place_of_the_sources_from_so_many_seconds_on() -> None:
+    plan = plan_replay(recorded(FAST, SLOW, CONSTANT, MEAN), graph(), start=1.5, end=3.0)
+    assert plan == LogPlan(
+        Path("run.mcap"),
+        (CONSTANT, FAST, SLOW),
+        {FAST: 99},
+        first=5_000_000_000,
+        start=6_500_000_000,
+        end=8_000_000_000,
+    )
+    whole = plan_replay(recorded(FAST), graph())
+    assert (whole.first, whole.start, whole.end) == (5_000_000_000, None, None)
+    middle = plan_replay(recorded(FAST, MEAN), graph(), replaced=["smooth"])
+    assert middle.streams == (MEAN,)
+
+
+def test_a_part_of_a_recording_begins_where_it_was_cut() -> None:
+    part = plan_replay(recorded(FAST, cut=7_000_000_000), graph(), end=1.0)
+    assert (part.first, part.start, part.end) == (7_000_000_000, 7_000_000_000, 8_000_000_000)
+    assert plan_replay(recorded(FAST, cut=7_000_000_000), graph(), start=0.5).start == 7_500_000_000
+
+
+def test_a_stream_that_is_lacking_and_taken_is_named_with_who_takes_it() -> None:
+    with pytest.raises(
+        ReplayError, match=r"no stream of 'left' is in the recording \(looked for .*; it holds test/smooth"
+    ):
+        plan_replay(recorded(MEAN), graph())
+    with pytest.raises(ReplayError, match="'test/left/fast' of 'left' was not recorded, but 'smooth' takes it"):
+        plan_replay(recorded(SLOW), graph())
+    assert plan_replay(recorded(SLOW), graph(), resting=["smooth", "other"]).streams == (SLOW,)
+    with pytest.raises(ReplayError, match=r"nothing of run\.mcap can be played into graph 'robot'"):
+        plan_replay(recorded(FAST), graph(), replaced=[])
+    wrong = recorded(FAST)
+    wrong.streams[FAST].message_type = None
+    with pytest.raises(ReplayError, match=r"stream 'test/left/fast' holds .*, the graph's 'left' emits"):
+        plan_replay(wrong, graph())
