@@ -32,12 +32,12 @@ def walls(count: int, axes: tuple[int, ...], seed: int) -> Array:
     return np.concatenate(found)
 
 
-def laid(axes: tuple[int, ...], T: Array, start: Array, offsets: Array | None = None) -> Fit:
+def laid(axes: tuple[int, ...], T: Array, start: Array) -> Fit:
     """The fit of a scan from a pose, begun at another, in a map of walls."""
     planes = PlaneMap(2.0, 2)
     planes.add(walls(6000, axes, 1), birth=0)
     points = transform_points(invert(T), walls(150, axes, 2))
-    scan = Scan(points, offsets, np.arange(len(points)), 0)
+    scan = Scan(points, None, np.arange(len(points)), 0)
     prior = Prior(start, np.diag([1.0] * 3 + [4.0] * 3))
     return fit(scan, planes, prior, lambda T: np.zeros(6), 0.02)
 
