@@ -5,10 +5,24 @@ from __future__ import annotations
 import re
 
 import pytest
-from plays import Play, asked_where, killed, sent, spawned
+from plays import LEFT, SUM, Play, asked_where, killed, sent, spawned
 
 from dataflow.supervision.core.commands import Announce, Over, Withdraw
-from dataflow.supervision.core.events import Aborted, Begin, Died, HungUp, LeftBehind, Paused, Printed, Said, Tick
+from dataflow.supervision.core.events import (
+    Aborted,
+    Begin,
+    Died,
+    HungUp,
+    LeftBehind,
+    Paused,
+    PlaybackAsked,
+    Printed,
+    Said,
+    Tick,
+)
+from dataflow.supervision.core.report import OperatorCounts
+from dataflow.supervision.core.watchers.quiescence import MAX_WINDOW_DOUBLINGS, Proof, Verdict
+from dataflow.supervision.core.wording import how_it_ended, how_long
 from dataflow.sync import FOREVER
 
 
@@ -358,3 +372,160 @@ def test_after_the_end_nothing_is_commanded() -> None:
 
     assert play.tell(Tick(), Said("sum", "progress", {"done": {}, "counts": {}}), Died("sum", 0)) == []
     assert [c for c in play.commands if isinstance(c, Over)] == [play.over]
+
+
+def test_what_moves_between_two_rounds_of_questions_takes_the_proof_back() -> None:
+    """Everybody is idle, and as much was received as sent, in every round."""
+    play = Play().starts()
+    play.state = {"sent": 5, "received": 5}
+    for k in range(3):
+        play.now += 0.31
+        play.tell(Tick())
+        play.tell(Tick())
+        play.tell(play.progress("sum", {"sum": k}))
+    assert play.over is None
+
+    play.now += 0.31
+    for _ in range(3):
+        play.tell(Tick())
+    assert play.failure() == "the graph is stuck: nothing is on its way and no operator can fire"
+
+
+@pytest.mark.parametrize("lost_after", [None, 5.0])
+def test_what_was_sent_and_not_received_counts_as_lost_only_after_a_while_in_which_nothing_moves(
+    lost_after: float | None,
+) -> None:
+    proof, under_way = (
+        Proof(lost_after),
+        [{"idle": True, "sent": 5, "received": 2}, {"idle": True, "sent": 1, "received": 3}],
+    )
+    assert proof.judge([{**under_way[0], "idle": False}], 0.0) is Verdict.MOVING
+    assert [proof.judge(under_way, now) for now in (1.0, 5.9)] == [Verdict.SETTLED] * 2
+    assert proof.judge(under_way, 6.0) is (Verdict.SETTLED if lost_after is None else Verdict.PROVEN)
+    more = [under_way[0], {**under_way[1], "received": 4}]
+    assert [proof.judge(more, now) for now in (7.0, 7.1)] == [
+        Verdict.SETTLED,
+        Verdict.PROVEN,
+    ]
+
+
+def test_a_window_is_doubled_only_so_often() -> None:
+    play = Play(window=(8, 1 << 20)).starts()
+    play.state = {"full": True}
+    play.wait(60.0)
+    assert play.failure().startswith("the graph is stuck")
+    assert play.core.status.notes[-1].endswith(f"doubled to {8 << MAX_WINDOW_DOUBLINGS} messages")
+    assert len(sent(play.commands, "grow")) == 2 * MAX_WINDOW_DOUBLINGS
+
+
+def test_first_stamps_and_steps_are_those_of_all_sources() -> None:
+    play = Play(LEFT, "right: {use: runtime_operators:Counter}", SUM)
+    play.deaf |= {"left", "right"}
+    play.begins()
+    for label, first, steps in (("left", 9, 3), ("right", 7, 5)):
+        play.tell(Said(label, "joined", {}), Said(label, "ready", {"first": first, "steps": steps}))
+    assert (play.core.status.first, play.core.status.steps) == (7, 5)
+    play.deaf.clear()
+    play.wait(0.2)
+    for label, first in (("left", 12), ("right", 11), ("left", 13)):
+        play.tell(play.progress(label, {}, first=first))
+    assert play.core.status.began == 11
+
+
+def test_pauses_steps_and_speeds_go_to_all_and_what_processes_say_of_them_is_shown() -> None:
+    play = Play()
+    asked = PlaybackAsked("pause", 1, None)
+    play.deaf.add("sum")
+    play.begins()
+    assert sent(play.tell(asked), "playback") == []  # nothing is paused that has not begun
+    play = Play(record="run.mcap").starts()
+    assert sent(play.tell(PlaybackAsked("step", 3, 0.5)), "playback") == [
+        (label, {"action": "step", "steps": 3, "speed": 0.5}) for label in ("left", "sum", "@recorder")
+    ]
+    play.tell(
+        Said("left", "progress", {"done": {}, "counts": {}, "paused": True}), Said("left", "playback", {"speed": 2.0})
+    )
+    assert (play.core.status.paused, play.core.status.speed) == (True, 2.0)
+    play.tell(Said("left", "progress", {"done": {}, "counts": {}, "paused": False}))
+    assert not play.core.status.paused
+
+
+def test_a_run_that_is_paused_is_not_stuck() -> None:
+    play = Play(stall_timeout=10.0).starts()
+    play.state = {"idle": False}
+    for _ in range(5):
+        play.wait(8.0)
+        play.tell(Said("left", "playback", {"paused": True, "speed": None}))
+    assert play.over is None
+    play.wait(11.0)
+    assert "no progress for 10 s" in play.failure()
+
+
+def test_event_time_goes_by_the_rate_from_the_first_stamp() -> None:
+    play = Play(record="run.mcap", rate=2.0)
+    play.deaf.add("left")
+    play.begins()
+    play.tell(Said("left", "joined", {}), Said("left", "ready", {"first": 5_000_000_000, "steps": None}))
+    play.deaf.clear()
+    play.tell(
+        *(Said(label, "seen", {"stream": s}) for label in play.processes for s in play.core.run.processes[label].unseen)
+    )
+    play.tell(Tick())
+    play.now += 1.5
+    ((_, event),) = sent(play.tell(Paused(6.0)), "event")
+    assert event["stamp"] == pytest.approx(8_000_000_000, abs=1e3)
+
+
+def test_a_report_has_what_processes_handed_in() -> None:
+    play = Play(record="run.mcap").starts()
+    play.tell(play.progress("left", {"left": 70}, drops={"sum": [["x", "full", 2]]}))
+    play.now += 2.5
+    counts = {"left": {"left": [3, 6, 0, 9, 90, 12]}, "sum": {"sum": [2, 0, 0, 5, 80, 7]}, "@recorder": {}}
+    more = {
+        "left": {"streams": {"test/left/fast": [3, "abc"]}},
+        "sum": {"summaries": {"sum": {"mean": 4.5}}, "waits": {"sum": [["x", "late", 1]]}},
+    }
+    for label, each in counts.items():
+        handed_in = {"counts": each, "streams": {}, "transport": {"sent": 1}, "expected": 0, **more.get(label, {})}
+        play.tell(Said(label, "ended", {"report": handed_in}))
+    assert play.over is not None
+    report = play.over.report
+    assert report is not None
+    assert report.digests() == {"test/left/fast": "abc"}
+    assert report.operators["left"] == OperatorCounts(3, 6, 0, 9, 90, 12)
+    assert (report.drops, report.waits) == ({"sum": (("x", "full", 2),)}, {"sum": (("x", "late", 1),)})
+    assert report.summaries == {"sum": {"mean": 4.5}}
+    assert (report.last, report.sources, report.interrupted) == (90, ("left",), False)
+    assert report.wall == pytest.approx(2.5, abs=0.2)
+    assert set(report.files) == {"@recorder"}
+    leave = dict(sent(play.commands, "leave"))
+    assert leave["@recorder"]["summaries"] == {"sum": {"mean": 4.5}}
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (0, "exited with code 0"),
+        (3, "exited with code 3"),
+        (-11, "was killed by SIGSEGV"),
+        (-99, "was killed by signal 99"),
+        (None, "ended in a way that is not known"),
+    ],
+)
+def test_how_a_process_ended_is_said_in_words(code: int | None, text: str) -> None:
+    assert how_it_ended(code) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (119.6, "120 s"),
+        (7199, "7199 s"),
+        (7200, "2 hours"),
+        (86400, "24 hours"),
+        (172800, "2 days"),
+        (1e9, "31.7 years"),
+    ],
+)
+def test_a_span_is_said_in_words(seconds: float, text: str) -> None:
+    assert how_long(seconds) == text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from pathlib import Path
 
@@ -10,10 +11,22 @@ from plays import LEFT, STEP, Play, asked_where, killed, sent, spawned
 
 from dataflow.chaos.plan import Fault
 from dataflow.recording.parts import Storage
-from dataflow.records.firing import Emission, FiringRecord
+from dataflow.records.firing import Emission, FiringRecord, encode_batch
 from dataflow.supervision.core.closing import SHORTEST
 from dataflow.supervision.core.commands import Command, Send, Signal, Spawn
-from dataflow.supervision.core.events import Begin, ClockMeasured, Died, LinkChanged, NotReading, Said, Tick
+from dataflow.supervision.core.events import (
+    Begin,
+    ClockMeasured,
+    Died,
+    LinkChanged,
+    NotReading,
+    Said,
+    Tick,
+    TriggerAsked,
+)
+from dataflow.supervision.core.report import OperatorCounts
+from dataflow.supervision.core.watchers.lateness import held_up_by
+from dataflow.supervision.core.watchers.leftover_records import HANDED_OVER
 from dataflow.sync import FOREVER
 
 AGAIN = "live: {restart: {max: 2, backoff: 100ms}}"
@@ -583,3 +596,205 @@ def test_the_clock_of_another_machine_is_stored_now_and_then_and_shown_once() ->
     text = "the clock of machine 'robot' is +2.500 ms ahead, ± 0.200 ms"
     assert stored == [{"text": text, "machine": "robot", "offset": 2_500_000, "delay": 400_000}] * 3
     assert play.core.status.notes.count(text) == 1
+
+
+# -- what is counted and told of --------------------------------------------------------------------------------------
+
+
+def told(firings: int, dropped: int, timeouts: int) -> Said:
+    """How far `smooth` is by its own count, which begins anew with its process."""
+    counts = {"smooth": [firings, 2 * firings, dropped, 10 * firings, 5, 20 * firings]}
+    drops, waits = {"smooth": [["x", "full", dropped]]}, {"smooth": [["x", "timeout", timeouts]]}
+    return Said("smooth", "progress", {"done": {}, "counts": counts, "drops": drops, "waits": waits})
+
+
+def test_what_an_operator_did_before_its_restarts_counts_with_what_it_does_now() -> None:
+    play = robot().starts()
+    play.tell(told(2, 1, 1), told(5, 4, 2))
+    for _ in range(2):
+        play.dies("smooth", -9)
+        play.wait(1.0)
+        play.tell(told(1, 0, 0), told(2, 1, 3))
+
+    status = play.core.status
+    assert status.operators["smooth"] == OperatorCounts(9, 18, 6, 90, 5, 180)
+    assert status.drops["smooth"] == {("x", "full"): 6}
+    assert status.waits["smooth"] == {("x", "timeout"): 8}
+
+
+def test_operators_that_are_made_anew_within_their_process_are_counted() -> None:
+    play = robot().starts()
+    failed = {"when": "fire at stamp 5", "summary": "x", "pause": 0.5, "where": "", "traceback": ""}
+    for name in ("smooth", "after", "smooth"):
+        play.tell(Said(name, "restarting", {"operator": name, **failed}))
+    assert play.core.status.restarts == {"smooth": 2, "after": 1}
+
+
+def test_health_is_judged_once_a_second_and_recorded() -> None:
+    play = robot(record="run.mcap").starts()
+    for k in range(1, 71):
+        play.tell(told(k, max(0, k - 60), 0), play.progress("left", {"left": k}))
+        play.wait(STEP)
+
+    found = [fields for _, fields in sent(play.commands, "diagnostics")]
+    assert len(found) == 4
+    states = dict(zip(found[-1]["names"], (v["state"] for v in found[-1]["values"]), strict=True))
+    assert states == {"left": "running", "smooth": "dropping", "after": "starting"}
+    assert [h.operator for h in play.core.status.health] == found[-1]["names"]
+
+
+@pytest.mark.parametrize(
+    ("others", "late", "load", "wall", "expected"),
+    [
+        (["sum", "mix"], (0.4, 2.0), 0.9, 0.9, "its process is busy with sum, mix"),
+        ([], (0.4, 2.0), 0.9, 0.9, "its process is busy with sending"),
+        (["sum"], (2.0, 2.0), 0.8, 0.9, "reading it takes longer than real time"),
+        ([], (2.0, 2.0), 0.01, 0.9, "reading it waits, for a device or a file, and computes next to nothing"),
+        ([], (2.0, 2.0), 0.0, 0.0, "reading it waits, for a device or a file, and computes next to nothing"),
+        (
+            ["sum"],
+            (2.0, 2.0),
+            0.4,
+            0.8,
+            "computes for 50% of the time that it takes, .* with sum, its process's others",
+        ),
+        (
+            [],
+            (2.0, 2.0),
+            0.4,
+            0.8,
+            "computes for 50% of the time that it takes, .* which it shares with other processes",
+        ),
+    ],
+    ids=["busy process", "sending", "slow reading", "a device", "nothing read", "others beside it", "other processes"],
+)
+def test_who_holds_a_source_up_follows_from_its_times(
+    others: list[str], late: tuple[float, float], load: float, wall: float, expected: str
+) -> None:
+    assert re.search(expected, held_up_by(others, *late, load, wall))
+
+
+def test_a_source_that_falls_behind_again_is_named_again() -> None:
+    play = Play(LEFT, SUM, live=True).starts()
+    for late in (0.9, 1.1, 0.6, 1.2, 0.4, 1.3):
+        play.tell(Said("left", "progress", {"done": {}, "counts": {}, "behind": {"left": [late, late]}}))
+    assert len(play.core.status.notes) == 2
+    assert play.core.status.behind == {"left": 1.3}
+
+
+# -- rules that a process may break -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", ["restart: {max: 2, backoff: 100ms}, ", ""], ids=["with a policy", "without"])
+@pytest.mark.parametrize("rule", ["memory", "deadline"])
+def test_an_operator_that_takes_too_much_is_started_again_or_ends_the_run(policy: str, rule: str) -> None:
+    limits = f"live: {{{policy}memory: 100MB, deadline: 2s}}"
+    play = Play(LEFT, SUM[:-1] + f", {limits}}}", live=True).starts()
+    modest = Said("sum", "beat", {"memory": 100_000_000, "work": None})
+    assert killed(play.tell(modest)) == []
+    broken = {
+        "memory": Said("sum", "beat", {"memory": 101_000_000, "work": None}),
+        "deadline": Said("sum", "overdue", {"operator": "sum", "stamp": 7, "seconds": 2.25}),
+    }[rule]
+    what = {
+        "memory": "took 101 MB of memory (limit 100 MB)",
+        "deadline": "missed the deadline of 'sum': its firing at stamp 7 has taken 2.25 s (deadline 2 s)",
+    }[rule]
+    play.tell(broken)
+    play.wait(1.0)
+    if policy:
+        assert play.core.status.notes[0] == f"process 'sum' {what}; started again in 0.1 s"
+        assert play.core.status.restarts == {"sum": 1}
+    else:
+        assert play.failure() == f"process 'sum' {what}"
+
+
+def test_the_strictest_policy_of_a_process_is_that_of_all_its_operators() -> None:
+    """One may be restarted twice after 100 ms, the other once after 400 ms."""
+    other = AFTER[:-1] + ", live: {restart: {max: 1, backoff: 400ms}}}"
+    play = Play(LEFT, SMOOTH, other, live=True, placement={"smooth": "both", "after": "both"}).starts()
+    play.dies("both", -9)
+    assert spawned(play.wait(0.3)) == []
+    assert spawned(play.wait(0.3)) == ["both"]
+    assert play.core.status.restarts == {"smooth": 1, "after": 1}
+    play.dies("both", -9)
+    play.wait(1.0)
+    assert play.failure().startswith("process 'both' (operators smooth, after) was killed by SIGKILL")
+
+
+def test_the_time_before_a_restart_doubles() -> None:
+    play = robot().starts()
+    for pause in (0.1, 0.2):
+        play.dies("smooth", -9)
+        play.tell()
+        assert play.core.status.notes[-1].endswith(f"started again in {pause} s")
+        play.wait(1.0)
+
+
+def test_one_that_is_back_hears_which_of_its_streams_have_ended_meanwhile() -> None:
+    play = robot(record="run.mcap").starts()
+    play.dies("smooth", -9)
+    play.tell(Said("left", "stream_ended", {"stream": "test/left/fast", "reason": "end of source"}))
+    play.tell(Said("left", "stream_ended", {"stream": "test/left/slow", "reason": "end of source"}))
+    given = play.wait(0.3)
+    over = {"streams": ["test/left/fast"], "reason": "end of source"}
+    assert sent(given, "ended_elsewhere") == [("smooth", over)]
+
+
+def test_one_whose_messages_are_not_seen_to_arrive_goes_on_without_in_the_end() -> None:
+    play = robot(AFTER.replace("after", "other")).starts()
+    play.dies("smooth", -9)
+    play.deaf.add("after")  # it sees no probe, and lives
+    for _ in range(100):
+        play.tell(play.beat("after"))
+        play.wait(STEP)
+    assert not [note for note in play.core.status.notes if "goes on without" in note]
+    play.tell(play.beat("after"))
+    play.wait(0.5)
+    assert play.core.status.notes[-2:] == [
+        "process 'smooth' goes on without: test/smooth/mean",
+        "process 'smooth' is back",
+    ]
+
+
+def test_one_that_is_not_ready_again_in_time_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    play = robot(start_timeout=3.0).starts()
+    play.dies("smooth", -9)
+    monkeypatch.setattr(play, "_answer", lambda *_: [])
+    assert killed(play.wait(2.9)) == []
+    assert killed(play.wait(0.5)) == ["smooth"]
+    assert any("was not ready again within 3 s" in note for note in play.core.status.notes)
+
+
+def test_a_process_that_comes_back_is_progress() -> None:
+    """Another one is at one call meanwhile, which alone would end the run after 20 s."""
+    play = robot(stall_timeout=20.0).starts()
+    play.beating = False
+    for k in range(60):
+        if k == 30:
+            play.dies("smooth", -9)
+        play.tell(play.beat("left"), play.beat("smooth"), play.beat("after", ("after", 5, 0.5 * k)))
+        play.wait(0.5)
+    assert play.over is None
+    for k in range(60, 75):
+        play.tell(play.beat("left"), play.beat("smooth"), play.beat("after", ("after", 5, 0.5 * k)))
+        play.wait(0.5)
+    assert play.failure().startswith("no progress for 20 s; still busy: process 'after', after at stamp 5")
+
+
+def test_only_the_last_records_of_the_dead_are_handed_over() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(*(record("smooth", k, k) for k in range(HANDED_OVER + 3)))
+    play.dies("smooth", -9)
+    ((label, fields),) = sent(play.tell(), "records")
+    assert (label, len(fields["batches"])) == ("@recorder", HANDED_OVER)
+    assert fields["batches"][-1] == encode_batch([record("smooth", HANDED_OVER + 2, HANDED_OVER + 2)])
+
+
+def test_the_flight_recorder_is_triggered_once_by_what_every_process_hands_on() -> None:
+    play = robot(record="run.mcap").starts()
+    for label, number in (("left", "a"), ("smooth", "a"), ("smooth", "b"), ("after", "a")):
+        play.tell(Said(label, "trigger", {"id": number, "text": f"bump {number}"}))
+    play.tell(TriggerAsked("button"))
+    given = [fields["data"]["text"] for _, fields in sent(play.commands, "event") if fields["name"] == "trigger"]
+    assert given == ["bump a", "bump b", "button"]

@@ -76,22 +76,9 @@ def fit(scan: Scan, planes: PlaneMap, prior: Prior, motion: Motion, noise: float
     support are constrained by planes that lean out of them: Tuna et al., "X-ICP", 2023; there the prediction stands.
     """
     points, offsets = scan.points[scan.sample], None if scan.offsets is None else scan.offsets[scan.sample]
-    T = prior.T
-    blind = np.zeros((0, 6))
-    for iteration in range(ITERATIONS):
-        width = _KERNEL * max(1.0, _WIDER * _NARROWS**iteration)
-        sensor = deskewed(points, offsets, motion(T))
-        system = _equations(sensor, planes, T, width, noise)
-        if iteration == 0:
-            blind = _blind(system, sensor)
-        H = _without(system.H, blind)
-        off = se3.log(invert(prior.T) @ T)
-        seeing = _seeing(blind)
-        gradient = seeing @ seeing @ system.b + prior.information @ off
-        step = gauss_newton_step(H + prior.information, gradient)
-        T = np.asarray(T @ se3.exp(step), np.float64)
-        if np.linalg.norm(step[:3]) < _STILL[0] and np.linalg.norm(step[3:]) < _STILL[1]:
-            break
+    T, settled = _descended(points, offsets, planes, prior, motion, noise, _LITTLE)
+    if not settled:  # the little that is kept of blind directions may carry a pose away
+        T, _ = _descended(points, offsets, planes, prior, motion, noise, 0.0)
     sensor = deskewed(points, offsets, motion(T))
     system = _equations(sensor, planes, T, _KERNEL, noise)
     blind = _blind(system, sensor)
@@ -108,6 +95,26 @@ def fit(scan: Scan, planes: PlaneMap, prior: Prior, motion: Motion, noise: float
         births=system.pairs.births,
         weights=system.weights,
     )
+
+
+def _descended(
+    points: Array, offsets: Array | None, planes: PlaneMap, prior: Prior, motion: Motion, noise: float, little: float
+) -> tuple[Matrix, bool]:
+    """Returns the pose after the iterations, with a share kept of blind directions, and whether it settled."""
+    T, seeing = prior.T, np.eye(6)
+    for iteration in range(ITERATIONS):
+        width = _KERNEL * max(1.0, _WIDER * _NARROWS**iteration)
+        sensor = deskewed(points, offsets, motion(T))
+        system = _equations(sensor, planes, T, width, noise)
+        if iteration == 0:
+            seeing = _seeing(_blind(system, sensor), little)
+        off = se3.log(invert(prior.T) @ T)
+        gradient = seeing @ seeing @ system.b + prior.information @ off
+        step = gauss_newton_step(seeing @ system.H @ seeing + prior.information, gradient)
+        T = np.asarray(T @ se3.exp(step), np.float64)
+        if np.linalg.norm(step[:3]) < _STILL[0] and np.linalg.norm(step[3:]) < _STILL[1]:
+            return T, True
+    return T, False
 
 
 def agreements(points: Array, planes: PlaneMap, T: Array, noise: float, width: float) -> Array:
@@ -159,9 +166,9 @@ def _blind(system: _Equations, points: Array) -> Array:
     return np.array(found).reshape(-1, 6)
 
 
-def _seeing(blind: Array) -> Matrix:
-    """Returns the matrix (6, 6) that leaves little of the blind directions."""
-    seeing: Matrix = np.eye(6) - (1 - np.sqrt(_LITTLE)) * (blind.T @ blind)
+def _seeing(blind: Array, little: float = _LITTLE) -> Matrix:
+    """Returns the matrix (6, 6) that leaves a share of the information on the blind directions."""
+    seeing: Matrix = np.eye(6) - (1 - np.sqrt(little)) * (blind.T @ blind)
     return seeing
 
 

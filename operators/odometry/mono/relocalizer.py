@@ -27,7 +27,7 @@ def described(gray: Gray, pixels: Pixels) -> tuple[Description, NDArray[np.int64
     """Returns the descriptors of corners (N, 2), and which of them have one."""
     keypoints = [cv2.KeyPoint(float(x), float(y), PATCH, 0.0, 0, 0, i) for i, (x, y) in enumerate(pixels.tolist())]
     kept, descriptors = cv2.SIFT.create().compute(gray, keypoints)
-    if descriptors is None or not len(kept):
+    if descriptors is None:
         return Description(np.zeros((0, 2)), np.zeros((0, 128), np.uint8)), np.zeros(0, np.int64)
     rows = np.array([k.class_id for k in kept], np.int64)
     return Description(pixels[rows], descriptors.astype(np.uint8)), rows

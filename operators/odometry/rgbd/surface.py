@@ -48,7 +48,7 @@ class Surface:
         found = density[density > 0.02]
         per_pixel = float(found.mean()) if found.size else 1.0
         fewest = 0.25
-        while per_pixel * block * block < 2.5 and block < 16:
+        while per_pixel * block * block < 2.5:
             block, fewest = 2 * block, 0.02
         h, w = depth.shape[0] // block, depth.shape[1] // block
         whole = np.s_[: h * block, : w * block]

@@ -14,7 +14,9 @@ from dataflow.operator import Context
 from dataflow.testing import Played, play
 from operators.fusion import EkfFusion
 from operators.fusion.sensors.settings import SensorSettings
+from operators.geometry import se3
 from operators.odometry import MonoVisualOdometry
+from operators.odometry.mono.settings import MonoOdometryConfig
 
 STATIC = ("image_info", "extrinsics")
 # The camera looks along the robot's x axis, half a metre above it.
@@ -70,6 +72,26 @@ def test_wheels_give_metres_and_a_covariance() -> None:
     true = np.linalg.norm((truth[poses[-1].stamp] - truth[poses[0].stamp])[:3, 3])
     assert way == pytest.approx(float(true), rel=0.03)
     assert "scale known to" in words(played)[-1]
+
+
+def test_an_odometry_of_another_stamp_is_carried_to_the_image_by_its_velocity() -> None:
+    given, twist = streams(1, wheels=True), np.array([0.5, -0.1, 0.0, 0.0, 0.2, 0.6])
+    image, T = given["image"][0], se3.exp(np.array([3.0, 1.0, 0.0, 0.0, 0.0, 0.5]))
+    then = Odometry.from_matrix(
+        T, stamp=image.stamp - 40_000_000, frame="wheel_odom", child_frame="base_link", linear=twist[:3],
+        angular=twist[3:],
+    )  # fmt: skip
+    operator = MonoVisualOdometry()
+    operator.setup()
+    operator.process(image, given["image_info"][0], then, given["extrinsics"][0])
+    np.testing.assert_allclose(operator.state.odometry.T_reference, T @ se3.exp(0.04 * twist) @ MOUNT, atol=1e-9)
+    lost = then.replace(position=[np.nan, 0.0, 0.0])
+    operator.process(image.replace(stamp=image.stamp + 1), given["image_info"][0], lost, given["extrinsics"][0])
+    assert operator.state.odometry.T_reference is None
+
+
+def test_parameters_are_by_default_what_settings_are() -> None:
+    assert MonoVisualOdometry()._config() == MonoOdometryConfig()
 
 
 def test_a_scale_without_a_place_for_the_camera_is_refused() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,26 @@ from numpy.typing import NDArray
 
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image, Transforms
+from dataflow.messages.geometry import transform_points
 from dataflow.testing import Played, play
 from operators.evaluation.trajectory import align
+from operators.geometry import se3
+from operators.geometry.pinhole import unproject
 from operators.odometry import MonoVisualOdometry
-from operators.odometry.mono.ranging import PERSISTENT, RangingUse
+from operators.odometry.mono.ranging import (
+    PERSISTENT,
+    MetricDepth,
+    Ranged,
+    RangingMemory,
+    RangingUse,
+    pose_at,
+    ranged,
+)
 from operators.odometry.mono.scale import Scale
+from operators.odometry.mono.settings import RangingConfig
+from operators.odometry.motion import Motion
+from operators.odometry.rgbd.camera import RgbdCamera
+from operators.odometry.tracking import Status, TrackResult
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -230,3 +246,80 @@ def test_two_sources_of_metres_make_a_scale_no_less_sure() -> None:
     assert 1.0 < factor < 1.02
     assert better.sigma <= 0.01
     assert Scale().weighed(3.0, 0.05, 0.02) == (3.0, Scale(0.05))
+
+
+# -- one depth image ---------------------------------------------------------------------------------------------------
+
+
+UNITS = 2.5  # metres by each unit of the map
+CONFIG = RangingConfig()
+SEEN = np.random.default_rng(1).uniform([60, 60], [300, 180], (40, 2))
+
+
+def given(factor: float = 1.0, at: int = 1) -> MetricDepth:
+    """The depth of the corner of walls from the first pose, or what a camera that errs by a factor has."""
+    depth = (factor * depth_from(aside(1)[0])).astype(np.float32)
+    depth[at] = 0.0  # each image is another
+    return MetricDepth(at, depth, RgbdCamera(K, K))
+
+
+def mapped(count: int = 40) -> Array:
+    """Points (N, 3) of the walls that the camera sees, in units of the map."""
+    u, v = np.rint(SEEN[:count]).astype(int).T
+    z = depth_from(aside(1)[0])[v, u].astype(float)
+    rays = unproject(np.column_stack([u, v]).astype(float), K)
+    return np.asarray(rays * z[:, None] / UNITS)
+
+
+def use(
+    image: MetricDepth, points: Array, scale: Scale, memory: RangingMemory | None = None, T: Array | None = None
+) -> Ranged:
+    return ranged(image, points, np.eye(4) if T is None else T, scale, memory or RangingMemory(), CONFIG)
+
+
+def test_a_depth_image_gives_an_unknown_scale_by_the_points_that_most_agree_on() -> None:
+    points = mapped()
+    points[:15] *= np.random.default_rng(2).uniform(1.3, 3.0, (15, 1))
+    told = use(given(), points, Scale())
+    assert (told.use, told.factor) == (RangingUse.FOUND, pytest.approx(UNITS, rel=0.01))
+    assert told.scale.sigma == pytest.approx(CONFIG.sigma, abs=0.01)
+    assert told.text == "depth of 25 points gives the scale"
+    moved = se3.exp(np.array([0.4, -0.2, 0.3, 0.1, 0.5, 0.2]))
+    assert use(given(), transform_points(moved, points), Scale(), T=moved).factor == pytest.approx(told.factor)
+
+
+@pytest.mark.parametrize(("count", "found"), [(14, False), (15, True)])
+def test_a_scale_rests_on_so_many_points_and_no_fewer(count: int, found: bool) -> None:
+    told = use(given(), mapped(count), Scale())
+    assert (told.use is RangingUse.FOUND) == found
+    assert found or told.text == "depth has too few points of the map (14)"
+    behind = use(given(), np.concatenate([mapped(14), -mapped(10)]), Scale())
+    assert behind.use is RangingUse.FEW
+
+
+def test_depth_that_contradicts_a_known_scale_alike_five_times_is_believed_and_the_way_so_far_doubted() -> None:
+    scale, memory, told = Scale(0.02), RangingMemory(), []
+    for at, factor in enumerate((1.4, 1.4, 0.6, 0.6, 0.6, 0.6, 0.6)):
+        told.append(use(given(factor, at), UNITS * mapped(), scale, memory))
+        memory = told[-1].memory
+    assert [t.use for t in told] == [RangingUse.CONTRARY] * (1 + PERSISTENT) + [RangingUse.ANEW]
+    assert {t.factor for t in told[:-1]} == {1.0}
+    assert {t.scale for t in told[:-1]} == {scale}
+    assert told[-1].factor == pytest.approx(0.6, rel=0.01)
+    assert told[-1].scale.past == pytest.approx(-np.log(0.6), rel=0.02)
+    assert told[-1].memory.contrary == 0
+    between = use(given(1.0, 9), UNITS * mapped(), scale, told[3].memory)
+    assert (between.use, between.memory.contrary) == (RangingUse.TAKEN, 0)
+    assert between.scale.sigma < scale.sigma
+
+
+def test_depth_is_of_the_pose_at_its_stamp_if_that_was_measured() -> None:
+    before, after = Motion(0, aside(9)[0], np.zeros(6)), aside(9)[8]
+    result = TrackResult(80, after, np.eye(6), np.zeros(6), Status.TRACKING, "", 9, 0.0, False)
+    np.testing.assert_array_equal(pose_at(80, result, None), after)
+    way = pose_at(20, result, before)
+    assert way is not None
+    np.testing.assert_allclose(way[:3, 3], after[:3, 3] / 4, atol=2e-3)
+    for stamp, last in ((90, before), (0, before), (20, None), (20, replace(before, blind_s=0.1))):
+        assert pose_at(stamp, result, last) is None
+    assert pose_at(80, replace(result, status=Status.PREDICTED), before) is None

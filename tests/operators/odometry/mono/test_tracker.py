@@ -53,7 +53,7 @@ def test_the_path_is_followed_up_to_its_scale() -> None:
     assert set(said[begun:]) == {"tracking"}
     assert errors(results, truth, scaled=True).max() < 0.02
     assert not results[-1].scale.known
-    assert sum(r.track.keyframe for r in results) >= 4
+    assert 4 <= sum(r.track.keyframe for r in results) <= 8  # one for every tenth of a metre or two, 3 m away
 
 
 def test_a_reference_in_metres_gives_the_scale() -> None:

@@ -11,7 +11,7 @@ from operators.geometry import se3
 from operators.geometry.pinhole import project
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fitter, Sighting
-from operators.odometry.rgbd.movers import TILE, Movers
+from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 
@@ -91,14 +91,22 @@ def test_few_corners_far_away_contest_nothing(count: int) -> None:
     assert not len(found.contrary)
 
 
-def test_tiles_around_what_moves_are_known_to_move() -> None:
+@pytest.mark.parametrize(
+    ("column", "row", "tile"),
+    [(100, 60, (7, 12)), (63.4, 79.4, (9, 7)), (63.6, 79.6, (10, 8)), (-30, 300, (29, 0))],
+    ids=["within", "the last pixels of a tile", "the first of the next", "outside"],
+)
+def test_tiles_around_what_moves_are_known_to_move(column: float, row: float, tile: tuple[int, int]) -> None:
     still = Movers.none(K, (240, 320))
     assert still.around(np.zeros((0, 3))) is still
-    point = np.array([[(100 - K[0, 2]) / 260.0, (60 - K[1, 2]) / 260.0, 1.0]])
+    point = np.array([[(column - K[0, 2]) / 260.0, (row - K[1, 2]) / 260.0, 1.0]]) * 1.5
 
     moving = still.around(point)
 
-    row, column = 60 // TILE, 100 // TILE
-    assert moving.tiles[row - 1 : row + 2, column - 1 : column + 2].all()
-    assert np.count_nonzero(moving.tiles) == 9
-    assert moving.also(still).tiles.sum() == still.also(moving).tiles.sum() == 9
+    expected = np.zeros((30, 40), bool)
+    expected[max(tile[0] - 1, 0) : tile[0] + 2, max(tile[1] - 1, 0) : tile[1] + 2] = True
+    np.testing.assert_array_equal(moving.tiles, expected)
+    assert moving.hold(point).tolist() == [True]
+    assert not still.hold(point).any()
+    for both in (moving.also(still), still.also(moving)):
+        np.testing.assert_array_equal(both.tiles, expected)

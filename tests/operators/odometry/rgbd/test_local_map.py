@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from operators.geometry import se3
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import DRIFTED, RECENT, LocalMap
 from operators.odometry.rgbd.surface import Surface
@@ -114,3 +116,77 @@ def test_a_camera_found_elsewhere_goes_on_in_the_segment_that_it_was_found_in() 
     known = of_segments(0, 1, 2)
     known.drop_newest_segment(known.keyframes[0])
     assert [k.segment for k in known.keyframes] == [1, 0]
+
+
+def test_a_segment_whose_place_is_found_is_moved_there_as_a_whole() -> None:
+    """Its three keyframes are a step apart in the world of the loss; where the first of them is, is known now."""
+    known, T_there = of_segments(0, 0, 1, 1, 1), se3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.4, -0.3]))
+    unsure, sunk = 1e-4 * np.eye(6), np.arange(6.0)
+    placed = replace(known.keyframes[1], covariance=unsure, sunk=sunk)
+
+    known.join(placed, T_there)
+
+    assert [k.segment for k in known.keyframes] == [0] * 5
+    np.testing.assert_array_equal(known.keyframes[1].T_world_camera, keyframe(1).T_world_camera)
+    for k in known.keyframes[2:]:
+        np.testing.assert_allclose(k.T_world_camera, T_there @ keyframe(k.stamp).T_world_camera, atol=1e-12)
+        np.testing.assert_array_equal(k.covariance, unsure)
+        np.testing.assert_array_equal(k.sunk, sunk)
+
+
+def test_keyframes_that_rest_on_a_wrong_place_go_back_and_those_before_it_stay() -> None:
+    known, T_wrong = of_segments(1, 0, 0, 0), se3.exp(np.array([2.0, 0.0, -1.0, 0.0, 0.5, 0.0]))
+    truth = [k.T_world_camera for k in known.keyframes]
+    known.keyframes[2:] = [replace(k, T_world_camera=T_wrong @ k.T_world_camera) for k in known.keyframes[2:]]
+    trial = Trial.of(2, 2, truth[2], 1e-2 * np.eye(6), T_wrong @ truth[2])
+
+    known.part([trial], known.unused_segment)
+
+    assert [k.segment for k in known.keyframes] == [1, 0, 2, 2]
+    for k, T in zip(known.keyframes, truth, strict=True):
+        np.testing.assert_allclose(k.T_world_camera, T, atol=1e-12)
+    assert [float(k.place_variance) for k in known.keyframes[:3]] == [0.0, 0.0, pytest.approx(3e-2)]
+
+
+def test_a_view_is_laid_on_the_newest_keyframe_and_then_on_those_that_see_most_nearly_what_it_sees() -> None:
+    """Of a wall 2 m away, at steps of 0.2 m; what is more than 1.4 m aside shares too little."""
+    known, view = of_segments(*[0] * 14, 1), np.eye(4)
+    view[0, 3] = 0.63
+    assert [k.stamp for k in known.nearby(view, 4, 0)] == [13, 3, 4, 2]
+    assert [k.stamp for k in known.nearby(view, 1, 0)] == [13]
+    assert sorted(k.stamp for k in known.nearby(view, 20, 0)) == [*range(11), 13]
+    assert [k.stamp for k in known.nearby(view, 4, 1)] == [14]
+
+
+def test_surfaces_are_compared_with_keyframes_that_have_one() -> None:
+    known, nothing = of_segments(*[0] * 6), Surface(np.zeros((120, 160), np.float32), K)
+    known.keyframes[5] = replace(known.keyframes[5], surface=nothing)
+    assert [k.stamp for k in known.references(keyframe(5).T_world_camera, 2, 0)] == [4, 3]
+
+
+def test_what_has_moved_is_told_by_the_oldest_of_the_last_keyframes_that_shares_the_view() -> None:
+    known = of_segments(*[0] * 10)
+    assert [k.stamp for k in known.earlier(keyframe(9).T_world_camera, 0)] == [6]
+    assert [k.stamp for k in known.earlier(keyframe(6).T_world_camera, 0)] == [4]
+    assert known.earlier(keyframe(60).T_world_camera, 0) == []
+
+
+def test_a_map_that_is_full_forgets_what_others_make_up_for_and_keeps_the_newest() -> None:
+    known = LocalMap(8)
+    for number in (0, 4, 8, 12, 13, 14, 15, 16, 17, 18):
+        known.add(keyframe(number))
+    assert [k.stamp for k in known.keyframes] == [0, 4, 8, 14, 15, 16, 17, 18]
+
+
+def test_the_map_expects_the_wall_where_a_camera_would_see_it() -> None:
+    """From 0.5 m nearer and 0.1 m aside, though no keyframe was there; it is 2 m away, or a little more."""
+    known, T = of_segments(0, 0, 0), np.eye(4)
+    T[:3, 3] = 0.1, 0.0, 0.5
+    seen = known.rendered(T, keyframe(0).surface)
+    assert seen.coverage > 0.85
+    depth = seen.depth[seen.inverse_depth > 0]
+    assert depth.min() > 1.5 - 1e-3
+    assert depth.max() < 1.6 + 1e-3
+    far = np.eye(4)
+    far[2, 3] = 5.0  # behind the wall
+    assert known.rendered(far, keyframe(0).surface).coverage == 0.0

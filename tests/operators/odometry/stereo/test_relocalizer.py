@@ -14,6 +14,7 @@ from dataflow.messages.geometry import invert
 from dataflow.state import StateError, plain, typed
 from operators.geometry import se3
 from operators.odometry import StereoVisualOdometry
+from operators.odometry.stereo.adjustment import StereoRig
 from operators.odometry.stereo.map import StereoMap
 from operators.odometry.stereo.relocalizer import StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
@@ -165,6 +166,47 @@ def test_a_segment_is_numbered_anew_and_one_that_was_found_again_is_gone_on_with
     assert [k.segment for k in joined.keyframes] == [1, 0, 0]
     assert joined.unused_segment == 2
     assert known.placed(known.keyframes[0], None).segment == 0
+
+
+def test_a_new_segment_moves_as_a_whole_to_where_one_of_its_views_was_found() -> None:
+    poses, T_there = driving(5), se3.exp(np.array([0.4, -0.1, 2.0, 0.0, 0.3, 0.0]))
+    known = StereoMap(tuple(kept(T, k, segment=int(k > 1)) for k, T in enumerate(poses)), apart_since=3, recalls=7)
+    sure = replace(known.keyframes[0], covariance=1e-4 * np.eye(6))
+    assert [k.stamp for k in known.elsewhere] == [0, 1]
+    assert known.unused_segment == 2
+
+    joined = known.placed(sure, T_there)
+
+    assert [k.segment for k in joined.keyframes] == [0] * 5
+    assert (joined.apart_since, joined.recalls) == (None, 0)
+    for k, T in zip(joined.keyframes, [*poses[:2], *(T_there @ T for T in poses[2:])], strict=True):
+        np.testing.assert_allclose(k.T_world_camera, T, atol=1e-12)
+    np.testing.assert_array_equal(joined.keyframes[-1].covariance, sure.covariance)
+    here = known.placed(known.keyframes[-1], T_there)
+    assert (here.keyframes, here.apart_since, here.recalls) == (known.keyframes, 3, 0)
+
+
+def test_a_pair_is_due_when_the_view_has_changed_as_seen_at_the_depth_of_the_scene() -> None:
+    """Things are 2 units of 5 m away, so 1 m aside is a tenth of a radian."""
+    known = StereoMap(unit=5.0)
+    assert known.due(np.eye(4), 0.1)
+    known = known.with_keyframe(kept(np.eye(4), 0), 8)
+    assert [known.due(se3.exp(np.array([x, 0, 0, 0, 0, 0])), 0.1) for x in (0.0, 0.9, 1.1)] == [False, False, True]
+    assert [known.due(se3.exp(np.array([0, 0, 0, 0, a, 0])), 0.1) for a in (0.09, 0.11)] == [False, True]
+
+
+@pytest.mark.parametrize("shift", [0, 6])
+def test_the_depth_of_a_pair_allows_for_what_its_right_columns_are_off_by(shift: int) -> None:
+    """A wall across the way, 5 m from the camera; units are 2 m. The images are kept at a third of their size."""
+    wall = np.repeat(np.repeat(np.random.default_rng(0).integers(0, 255, (100, 420)).astype(np.uint8), 4, 0), 4, 1)
+    disparity = round(2 * RIG.K[0, 0] * RIG.baseline / 5.0)
+    left, right = (np.ascontiguousarray(wall[:, x : x + 960]) for x in (200, 200 + disparity - shift))
+    large = StereoRig(RIG.K * np.array([[2.0], [2.0], [1.0]]), RIG.baseline)
+    pair = kept_pair(left, right, 0, np.eye(4), np.zeros((6, 6)), float(shift), 0)
+    assert (pair.factor, pair.left.shape) == (3, (133, 320))
+    surface = StereoRelocalizer(large)._surface(pair, 2.0)
+    assert surface.coverage > 0.5
+    assert np.median(surface.points()[:, 2]) == pytest.approx(2.5, rel=0.02)
 
 
 @pytest.mark.long

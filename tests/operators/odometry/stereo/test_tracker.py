@@ -16,10 +16,11 @@ from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, Image
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
-from operators.geometry.pinhole import Points
+from operators.geometry.pinhole import Points, project
 from operators.odometry import StereoVisualOdometry
 from operators.odometry.stereo.adjustment import Offset, Past, Sightings, StereoRig, adjust
 from operators.odometry.stereo.odometry import rig_of
+from operators.odometry.stereo.relocalizer import FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.stereo.tracker import StereoOdometry
 from operators.odometry.tracking import Status, TrackResult
@@ -177,6 +178,46 @@ def test_what_is_known_of_poses_stays_when_the_first_of_them_goes() -> None:
     np.testing.assert_allclose(np.linalg.inv(rest.H[6:, 6:]), expected, rtol=0.02, atol=1e-7)
 
 
+def test_a_point_is_seen_where_the_rig_projects_it_and_found_again_from_there() -> None:
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(-2, 2, (20, 2)), rng.uniform(3, 30, 20)])
+    left, right = project(points, K), project(points - [RIG.baseline, 0.0, 0.0], K)
+    np.testing.assert_allclose(RIG.project(points), np.column_stack([left, right[:, 0]]))
+    np.testing.assert_allclose(RIG.triangulate(RIG.project(points)), points)
+    steps = 1e-6 * np.eye(3)
+    expected = np.stack([(RIG.project(points + d) - RIG.project(points - d)) / 2e-6 for d in steps], axis=-1)
+    np.testing.assert_allclose(RIG.jacobian(points), expected, atol=1e-6, rtol=1e-6)
+
+
+def test_sightings_are_kept_by_point_and_go_with_their_frame() -> None:
+    two = (
+        Sightings.none().also(0, np.array([0, 2]), np.full((2, 3), 1.0)).also(1, np.array([1, 2]), np.full((2, 3), 2.0))
+    )
+    some = two.of_points(np.array([2, 0]))
+    assert (some.frames.tolist(), some.points.tolist()) == ([0, 0, 1], [1, 0, 0])
+    assert some.pixels[:, 0].tolist() == [1.0, 1.0, 2.0]
+    later = two.without_first()
+    assert (later.frames.tolist(), later.points.tolist(), later.pixels[:, 0].tolist()) == ([0, 0], [1, 2], [2.0, 2.0])
+    squared = np.array([3.0, 14.0, 14.0, 9.0])  # of points 0, 2, 1, 2
+    assert two.fitting(squared, 4).tolist() == [True, False, True, False]
+
+
+def test_what_is_known_of_poses_is_the_same_about_others_nearby() -> None:
+    """The gradient of a sum of squares at another place, to first order; a pose that is new is free."""
+    poses, rng = np.array(driving(2)), np.random.default_rng(4)
+    H = rng.normal(size=(13, 13))
+    known = replace(Past.none(poses, 0.1), H=H @ H.T)
+    x = rng.normal(0, 1e-3, 13)
+    moved = np.array([T @ se3.exp(d) for T, d in zip(poses, x[:12].reshape(2, 6), strict=True)])
+    there = known.at(moved, 0.1 + x[12])
+    np.testing.assert_allclose(there.gradient, H @ H.T @ x, atol=1e-9)
+    more = there.with_pose(np.eye(4))
+    free = np.r_[0:12, 18]
+    assert (len(more.poses), np.count_nonzero(more.H[12:18])) == (3, 0)
+    np.testing.assert_array_equal(more.H[np.ix_(free, free)], there.H)
+    np.testing.assert_array_equal(more.gradient[free], there.gradient)
+
+
 # -- failures ------------------------------------------------------------------------------------------------
 
 
@@ -203,6 +244,65 @@ def test_long_darkness_is_a_loss_that_the_covariance_tells_of() -> None:
     assert all(b > a for a, b in pairwise(sigmas))
     last = invert(results[18].T_world_camera) @ results[24].T_world_camera
     assert np.linalg.norm(se3.log(invert(invert(poses[18]) @ poses[24]) @ last)[:3]) < 0.05
+
+
+@pytest.mark.parametrize("tracked", [True, False], ids=["while it is tracked", "while it is dark"])
+def test_a_new_map_begins_after_a_gap_and_goes_where_the_view_is_found(
+    tracked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is found is given here: nothing for three frames, and then the place."""
+    pairs, poses = sequence(25)
+    dark, found = (np.zeros_like(pairs[0][0]),) * 2, list[FoundAgain]()
+    monkeypatch.setattr(StereoRelocalizer, "found", lambda *_: iter(found))
+    monkeypatch.setattr(StereoRelocalizer, "believed", lambda *_: False)
+    odometry = StereoOdometry(RIG)
+    for i in range(4):
+        assert odometry.track(*pairs[i], i * 100_000_000).status is Status.TRACKING
+    assert odometry.track(*dark, 1_200_000_000).status is Status.LOST
+    apart = [odometry.track(*pairs[i], i * 100_000_000) for i in (14, 15, 16)]
+    assert {r.status for r in apart} == {Status.LOST}
+    assert apart[0].reason.endswith(": a new map begins")
+    assert apart[2].reason.endswith("corners; a new map, its place in the old one unknown")
+    assert {k.segment for k in odometry.state.map.keyframes} == {0, 1}
+    assert np.linalg.norm((apart[2].T_world_camera - poses[16])[:3, 3]) > 0.5
+    if not tracked:
+        odometry.track(*dark, 2_400_000_000)
+
+    later = 1_700_000_000 if tracked else 2_500_000_000
+    known = odometry.state.map.keyframes[0]
+    found.append(FoundAgain(poses[17], 1e-4 * np.eye(6), 999, known))
+    back = odometry.track(*pairs[17], later)
+    found.clear()
+    after = odometry.track(*pairs[18], later + 100_000_000)
+
+    assert (back.status, back.reason) == (Status.RELOCALISED, "the map found again by 999 features")
+    assert (after.status, odometry.state.map.apart_since) == (Status.TRACKING, None)
+    assert errors([back, after], poses[17:19])[0] < 0.1
+    assert np.sqrt(np.trace(after.covariance[:3, :3])) < 0.2 < np.sqrt(np.trace(apart[0].covariance[:3, :3]))
+    kept = odometry.state.map.keyframes
+    assert {k.segment for k in kept} == {0}
+    assert (14 in [k.stamp // 100_000_000 for k in kept]) == tracked
+    truth = {i * 100_000_000: T for i, T in enumerate(poses[:17])} | {later: poses[17], later + 100_000_000: poses[18]}
+    for k in kept:
+        assert np.linalg.norm((k.T_world_camera - truth[k.stamp])[:3, 3]) < 0.1
+
+
+def test_a_view_is_found_among_pairs_that_were_kept_and_believed_where_they_show_the_same() -> None:
+    pairs, poses = sequence(25)
+
+    def kept(k: int, T: Matrix, segment: int = 0) -> StereoKeyframe:
+        return kept_pair(*pairs[k], k, T, 1e-4 * np.eye(6), 0.0, segment)
+
+    known, relocalizer = [kept(k, poses[k]) for k in (0, 4, 8)], StereoRelocalizer(RIG)
+    ahead = se3.exp(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
+    assert relocalizer.believed(kept(6, poses[6]), known, 4.0)
+    assert not relocalizer.believed(kept(6, poses[6] @ ahead), known, 4.0)
+    assert not relocalizer.believed(kept(6, poses[6], segment=1), known, 4.0)  # of which no pair was kept
+    (found,) = relocalizer.found(kept(6, np.eye(4)), known, known, 4.0)
+    assert np.linalg.norm((invert(poses[6]) @ found.T_world_camera)[:3, 3]) < 0.1
+    assert any(found.keyframe is each for each in known)
+    assert found.features >= 15
+    assert 1e-3 < np.sqrt(np.trace(found.covariance[:3, :3])) < 0.2
 
 
 def test_blank_images_give_no_pose() -> None:

@@ -104,6 +104,40 @@ def test_the_covariance_is_that_of_drives_with_drawn_errors(steps: list[tuple[fl
     assert np.diag(own) + floor == pytest.approx(np.diag(drawn) + floor, rel=0.5)
 
 
+def test_the_covariance_is_that_of_many_drives_along_three_arcs() -> None:
+    """Drawn at once: fresh slip at every arc, and radii and a track that stay wrong."""
+    noise, count, arcs = DriveNoise(slip=0.004, scale=0.005, track=0.004), 40_000, [(0.4, 0.6), (0.5, 0.2), (0.3, -0.1)]
+    rng, drive = np.random.default_rng(0), DifferentialDrive(TRACK, noise)
+    scale, track = 1 + rng.normal(0, noise.scale, (count, 2)), TRACK * (1 + rng.normal(0, noise.track, count))
+    pose = np.zeros((3, count))
+    for arc in arcs:
+        drive.roll(*arc, doubt=0.002)
+        slip = rng.normal(0, noise.slip, (count, 2)) * np.sqrt(np.abs(arc)) + rng.normal(0, 0.002, (count, 2))
+        left, right = (np.array(arc) * scale + slip).T
+        turn, radius = (right - left) / track, track * (left + right) / (2 * (right - left))
+        yaw = pose[2]
+        east, north = np.sin(yaw + turn) - np.sin(yaw), np.cos(yaw) - np.cos(yaw + turn)
+        pose = pose + np.array([radius * east, radius * north, turn])
+    spread = np.sqrt(np.diag(np.cov(pose)))
+    np.testing.assert_allclose(drive.pose, pose.mean(axis=1), atol=5e-4)
+    np.testing.assert_allclose(drive.covariance() / np.outer(spread, spread), np.corrcoef(pose), atol=0.03)
+
+
+def test_the_covariance_of_the_velocity_is_that_of_drawn_steps() -> None:
+    """Two counts are rounded at each end of a step, and wheels, radii and track err."""
+    noise, count, rolled, seconds = DriveNoise(0.004, 0.02, 0.03), 40_000, np.array([0.02, 0.05]), 0.1
+    drive, rng = DifferentialDrive(TRACK, noise), np.random.default_rng(1)
+    drive.step = 0.003
+    read = rolled * (1 + rng.normal(0, noise.scale, (count, 2))) + rng.normal(0, 0.004, (count, 2)) * np.sqrt(rolled)
+    read += drive.step * (rng.uniform(-0.5, 0.5, (count, 2)) + rng.uniform(-0.5, 0.5, (count, 2)))
+    read += rng.normal(0, 0.001, (count, 2))
+    track = TRACK * (1 + rng.normal(0, noise.track, count))
+    drawn = np.cov([read.mean(axis=1) / seconds, (read[:, 1] - read[:, 0]) / track / seconds])
+    spread = np.sqrt(np.diag(drawn))
+    own = drive.twist_covariance(0.02, 0.05, seconds, doubt=0.001)
+    np.testing.assert_allclose(own / np.outer(spread, spread), drawn / np.outer(spread, spread), atol=0.03)
+
+
 def test_uncertainty_grows_with_the_way_and_not_while_standing() -> None:
     path = np.vstack([steady(0.5, 0.1, 5.0), np.repeat(steady(0.5, 0.1, 5.0)[-1:], 40, axis=0)])
     played = driven(ticks(path))
