@@ -152,6 +152,32 @@ def test_a_part_begins_with_one_write_behind_its_header(
     sink.close("complete")
 
 
+@pytest.mark.parametrize("what", ["header", "static message", "state"])
+def test_a_limit_below_what_each_part_begins_with_does_not_begin_one_with_each_message(
+    what: str, recorded: Path, graph: Graph, tmp_path: Path
+) -> None:
+    """Such as a map that is larger than a part may be: the disk would be given little else."""
+    large = np.random.default_rng(1).random((1, 2_000), np.float32)
+    sink = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(size=2_000))).sink
+    with Recording(recorded) as recording:
+        found = [*recording.messages(["test/left/fast"])]
+        setup, *records = FiringLog.read(recording).of("first")
+    if what == "static message":
+        sink.message("test/left/constant", FeatureVector(stamp=0, vectors=large, model="test"), 0, 0)
+    if what == "state":
+        snapshot = replace(setup, kind="snapshot", index=1, detail={"state": large.tobytes()})
+        sink.firings("first", [setup, snapshot], encode_batch([setup, snapshot]))
+        records = [replace(record, index=record.index + 1) for record in records]
+    for each, record in zip(found, records, strict=False):
+        sink.message(each.stream, each.message, each.seq, each.incarnation)
+        sink.firings("first", [record], encode_batch([record]))
+        sink.flush()
+    parts = sink.close("complete")["parts"]
+
+    assert 2 <= len(parts) <= len(found) // 10
+    assert what == "header" or min(Path(part).stat().st_size for part in parts[:-1]) > 2 * large.nbytes
+
+
 def test_the_newest_part_stays_however_large_it_is(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     facts = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(every=6 * SECOND), keep=1000)).all()
 
