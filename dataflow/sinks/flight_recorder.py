@@ -109,9 +109,10 @@ class FlightSink:
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         made = (message.stamp for record in records for message in record.outputs if message is not None)
         self._recorded[operator] = max((records[-1].stamp, *made))
+        calls = sum(record.kind in CALLS for record in records)
         if self._sink is None:
-            self.lost.firings += sum(record.kind in CALLS for record in records)
-        self._store(lambda sink: sink.firings(operator, records[-1].stamp, payload))
+            self.lost.firings += calls
+        self._store(lambda sink: sink.firings(operator, records[-1].stamp, payload, calls=calls))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self._store(lambda sink: sink.end(stream, final_stamp, reason))

@@ -404,16 +404,15 @@ class PartsSink:
         if not part.sink.writer.failed:  # it refuses this one thing alone
             if self.lost.because(str(error)):
                 print(f"not recorded: {error}", flush=True)
-        elif part in self._open_parts():
-            was_current = part is self._current
-            self._full = None if part is self._full else self._full
-            self._current = None if was_current else self._current
-            self._abandon(part)
-            if was_current:
-                self._refused(error)
-        else:
-            self._abandon(part)
-            self.lost.because(str(error))
+            return
+        was_current = part is self._current
+        self._full = None if part is self._full else self._full
+        self._current = None if was_current else self._current
+        self._abandon(part)
+        if was_current:
+            self._refused(error)
+        elif self.lost.because(str(error)):
+            print(f"the end of a file is not recorded: {error}", flush=True)
 
     def _refused(self, error: RecordingError) -> None:
         """Nothing is recorded from here on, until the disk takes something again."""

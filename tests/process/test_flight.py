@@ -361,6 +361,16 @@ def test_a_full_disk_is_outlived_and_what_comes_after_is_kept(
     assert path.stat().st_mode & 0o777 == 0o600
 
 
+def test_calls_whose_records_find_no_room_are_lost(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
+) -> None:
+    """Those that the ring had taken and not given to the disk, too: each message is made by one."""
+    sink, _ = flown(recorded, graph, tmp_path, each=lambda stamp: setattr(disk, "full", stamp > 29.5))
+    lost = sink.close("complete")["lost"]
+
+    assert lost["firings"] >= lost["messages"] > 60
+
+
 def test_a_restart_is_kept_with_the_line_and_the_traceback_of_its_failure() -> None:
     failed = {"text": "operator 'a' failed", "operators": ["a"], "where": "crashy.py:12", "traceback": "Traceback …"}
     triggers = Triggers([Trigger("raise")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import time
 from collections import Counter
@@ -27,6 +28,7 @@ from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
+from dataflow.recording import RecordingError
 from dataflow.recording.parts import Storage
 from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan
@@ -412,6 +414,41 @@ RUN = Path(__file__).resolve().parent.parent / "recordings_of" / "run.mcap"
 """A whole recording."""
 
 
+@pytest.mark.parametrize("lost", [{}, {"lost": {"messages": 1}}], ids=["not counted", "counted"])
+def test_files_in_which_nothing_is_are_those_of_a_recorder_that_counts_what_is_lost(
+    lost: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of one that was killed when it began, of which the next one found the disk full."""
+    for name in ("run_000.mcap", "run_001.mcap"):
+        shutil.copy(RUN, tmp_path / name)
+    monkeypatch.setattr("simulation.check._unchanged", lambda *_, **__: None)
+    monkeypatch.setattr("simulation.check.joined", _nothing_is_there)
+    report = RunReport("robot", {}, {}, {}, {}, {}, {"@recorder": lost}, 0, 1, 0.0, interrupted=False, notes=())
+    outcome = Outcome(report)
+
+    if lost:
+        assert checks._verify(checks._joined(PLAIN, tmp_path, outcome), outcome, PLAIN) == "no recording"
+    else:
+        with pytest.raises(Violation, match="nothing is in any"):
+            checks._joined(PLAIN, tmp_path, outcome)
+
+
+def _nothing_is_there(*_: object) -> Path:
+    raise RecordingError("nothing is in any of these files")
+
+
+@pytest.mark.parametrize(
+    ("outcome", "whole"),
+    [
+        (Outcome(failure=RunFailed("interrupted")), True),
+        (Outcome(failure=RunFailed("interrupted"), disk_full=True), False),
+        (Outcome(failure=RunFailed("interrupted"), killed={"@recorder"}), False),
+    ],
+)
+def test_a_run_that_failed_does_not_tell_what_found_no_room(outcome: Outcome, whole: bool) -> None:
+    assert checks._holds_all(outcome) is whole
+
+
 def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -427,6 +464,13 @@ def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     assert checks._check_flight(Outcome(report), graph, tmp_path) == "nothing kept"
     with pytest.raises(Violation, match="nothing is kept, though left failed"):
         checks._check_flight(Outcome(replace(report, restarts={"left": 1})), graph, tmp_path)
+    reason = {"what": "left failed", "operators": ["left"], "stamp": 7}
+    no_room = {"kept": [{"path": "a.mcap", "reasons": [reason], "error": "No space left on device"}], "not_kept": 0}
+    restarted = replace(report, restarts={"left": 1}, files={"@recorder": no_room})
+    with pytest.raises(Violation, match="could not keep what was asked for: No space left"):
+        checks._check_flight(Outcome(restarted), graph, tmp_path)
+    flown = Flown(asked=[(("restart", "left", 7), 7)], kept=[(0, frozenset())])
+    assert checks._check_flight(Outcome(restarted, disk_full=True, flown=flown), graph, tmp_path) == "nothing kept"
     asked = Flown(asked=[(("drops", "left", 7), 7)])
     with pytest.raises(Violation, match=r"was asked .*'drops', 'left', 7.* and kept \[\]"):
         checks._check_flight(Outcome(report, flown=asked), graph, tmp_path)
