@@ -361,9 +361,7 @@ def test_a_full_disk_is_outlived_and_what_comes_after_is_kept(
     assert path.stat().st_mode & 0o777 == 0o600
 
 
-def test_calls_whose_records_find_no_room_are_lost(
-    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
-) -> None:
+def test_calls_whose_records_find_no_room_are_lost(recorded: Path, graph: Graph, tmp_path: Path, disk: Disk) -> None:
     """Those that the ring had taken and not given to the disk, too: each message is made by one."""
     sink, _ = flown(recorded, graph, tmp_path, each=lambda stamp: setattr(disk, "full", stamp > 29.5))
     lost = sink.close("complete")["lost"]

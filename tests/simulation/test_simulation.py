@@ -19,14 +19,15 @@ pytest.importorskip("greenlet", reason="simulated runs need the package greenlet
 from simulation import bindings
 from simulation import check as checks
 from simulation.check import check, is_outrun
+from simulation.disk import Disk
 from simulation.flights import Flown
 from simulation.keeping import Keeping, check_losses_of_files
 from simulation.mutants import MUTANTS, Mutant
 from simulation.pipes import journey_of, travel
 from simulation.run import Happening, Machine, Outcome, simulate
-from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
+from simulation.scenario import DRAWN, LONGEST_PAUSE, TICK, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
-from simulation.world import Process, Violation, World
+from simulation.world import MOST_CALLS, Process, Violation, World
 
 from dataflow.recording import RecordingError
 from dataflow.recording.parts import Storage
@@ -112,6 +113,25 @@ def test_who_spins_is_named() -> None:
     world.start("main", world.process("one"), spin)
     with pytest.raises(Violation, match="one: its task 'main' spins"):
         world.run(lambda: False, 1000.0)
+
+
+def test_who_makes_up_for_the_ticks_of_the_longest_pause_does_not_spin() -> None:
+    assert round(LONGEST_PAUSE / TICK) * 10 <= MOST_CALLS
+
+
+def test_what_is_deleted_makes_room_on_a_disk(tmp_path: Path) -> None:
+    disk = Disk(World(1), tmp_path, room=100)
+    descriptor = disk.open(tmp_path / "one", os.O_WRONLY | os.O_CREAT, 0o600)
+    data = memoryview(bytes(150))
+    written = 0
+    with pytest.raises(OSError, match="No space left"):
+        while True:
+            written += disk.write(descriptor, data[written:])
+    disk.close(descriptor)
+
+    assert (written, disk.statvfs(tmp_path).f_bavail, disk.full) == (100, 0, True)
+    (tmp_path / "one").unlink()
+    assert disk.statvfs(tmp_path).f_bavail == 100
 
 
 def test_nothing_reads_the_clock_past_the_simulation() -> None:
