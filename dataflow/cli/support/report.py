@@ -174,7 +174,7 @@ def _files(report: RunReport) -> list[Text]:
 
 
 def _kept(facts: Mapping[str, Any]) -> list[Text]:
-    """What a flight recorder kept, and how often it was asked for more than the graph allows."""
+    """Returns lines about the recordings that a flight recorder kept, and how often it was asked for more."""
     kept = [one for one in facts["kept"] if "error" not in one]
     lines = [
         Text(f"kept    {one['path']} ({one['reasons'][0]['what']}, {size(one['bytes'])})") for one in kept[:MOST_KEPT]
@@ -189,7 +189,7 @@ def _kept(facts: Mapping[str, Any]) -> list[Text]:
 
 
 def _not_kept(facts: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """What a flight recorder was asked to keep and could not."""
+    """Returns the recordings that a flight recorder was asked for and could not keep."""
     return [one for one in facts.get("kept", ()) if "error" in one]
 
 
