@@ -101,9 +101,12 @@ def _results(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def _load() -> None:
     """Has in memory what every process needs that runs seeds: none of them collects garbage, and each is over soon."""
     from simulation.bindings import load
+    from simulation.check import check
+    from simulation.scenario import scenario_of
 
     load()
-    _one(0)
+    with tempfile.TemporaryDirectory(dir=_memory()) as folder:  # others may run seed 0 meanwhile
+        check(scenario_of(0), Path(folder))
     gc.collect()
     gc.freeze()
 
@@ -131,8 +134,7 @@ def _one(seed: int) -> dict[str, Any]:
     from simulation.world import Violation
 
     scenario = scenario_of(seed)
-    memory = MEMORY if MEMORY.is_dir() else Path(tempfile.gettempdir())
-    folder = memory / f"simulated-{seed}"  # it is told in recordings: a seed gives the same bytes each time
+    folder = _memory() / f"simulated-{seed}"  # it is told in recordings: a seed gives the same bytes each time
     folder.mkdir(exist_ok=True)
     try:
         result = check(scenario, folder)
@@ -153,6 +155,11 @@ def _one(seed: int) -> dict[str, Any]:
         "replayed": int(result.replayed),
     }
     return {"seed": seed, "verdict": verdict, "violation": "", "plan": "", "counts": counts}
+
+
+def _memory() -> Path:
+    """A file system in memory, where there is one."""
+    return MEMORY if MEMORY.is_dir() else Path(tempfile.gettempdir())
 
 
 def _show_failure(result: dict[str, Any]) -> None:
@@ -216,7 +223,7 @@ def _find(task: tuple[str, int, int]) -> dict[str, Any]:
     if name == "link":
         return _find_link(first, most)
     begun = time.monotonic()
-    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder, MUTANTS[name].planted():
+    with tempfile.TemporaryDirectory(dir=_memory()) as folder, MUTANTS[name].planted():
         for seed in range(first, first + most):
             scenario = scenario_of(seed)
             try:

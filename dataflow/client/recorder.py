@@ -95,7 +95,7 @@ class AttachedRecorder:
         self._stamps: dict[str, int] = {}
         self._ends: dict[str, dict[str, Any]] = {}
         self._first: int | None = None
-        self._saved = 0
+        self._saved = self._front = 0
         self.tally = Tally()
         self._writer = self._open()
 
@@ -153,6 +153,7 @@ class AttachedRecorder:
             for known in (*self._statics.values(), *(packet for _, packet in self._groups)):
                 if known.message is not None:
                     self._write(known, known.message)
+            self._front = self._writer.given_bytes
         if due is not None and not static:
             missed = place[1] - (due[1] if place[0] == due[0] else 0)
             if missed:
@@ -177,7 +178,7 @@ class AttachedRecorder:
     def _split_due(self, stamp: int) -> bool:
         if self._first is None:
             return False
-        return self._splitting.due(self._writer.saved_bytes, stamp - self._first)
+        return self._splitting.due(self._writer.saved_bytes, stamp - self._first, self._front)
 
     def _open(self) -> RecordingWriter:
         path = self._path

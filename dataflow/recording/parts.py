@@ -18,7 +18,10 @@ OnFailure = Literal["go_on", "end"]
 
 @dataclass(frozen=True, slots=True)
 class Splitting:
-    """Limits of one file: bytes, or event time (ns), after which a recording goes on in the next; None: no limit."""
+    """Limits of one file: bytes, or event time (ns), after which a recording goes on in the next; None: no limit.
+
+    A file that begins with more than half of the bytes holds as much again before it is full.
+    """
 
     size: int | None = None
     every: int | None = None
@@ -28,9 +31,11 @@ class Splitting:
         """Tells whether there may be more than one file."""
         return self.size is not None or self.every is not None
 
-    def due(self, saved: int, elapsed: int) -> bool:
-        """Tells whether a file of `saved` bytes and `elapsed` ns of event time is full."""
-        return (self.size is not None and saved >= self.size) or (self.every is not None and elapsed >= self.every)
+    def due(self, saved: int, elapsed: int, front: int = 0) -> bool:
+        """Tells whether a file of `saved` bytes and `elapsed` ns of event time is full, which began with `front` bytes
+        that each file begins with: below that limit, one would begin with each message."""
+        large = self.size is not None and saved >= max(self.size, 2 * front)
+        return large or (self.every is not None and elapsed >= self.every)
 
 
 WHOLE = Splitting()

@@ -109,9 +109,10 @@ class FlightSink:
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         made = (message.stamp for record in records for message in record.outputs if message is not None)
         self._recorded[operator] = max((records[-1].stamp, *made))
+        calls = sum(record.kind in CALLS for record in records)
         if self._sink is None:
-            self.lost.firings += sum(record.kind in CALLS for record in records)
-        self._store(lambda sink: sink.firings(operator, records[-1].stamp, payload))
+            self.lost.firings += calls
+        self._store(lambda sink: sink.firings(operator, records[-1].stamp, payload, calls=calls))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self._store(lambda sink: sink.end(stream, final_stamp, reason))
@@ -174,17 +175,19 @@ class FlightSink:
         """Begins the next file, with the newest message of every stream in front."""
         path = self._ring / f"{self._made:06}.mcap"
         self._made += 1
-        sink = RecorderSink(path, self.graph, self._streams, self._options)
-        held: dict[str, list[Held]] = {}
-        for stream, (message, seq, incarnation) in sorted(self._newest.items()):
-            try:
+        sink, held = None, dict[str, list[Held]]()
+        try:
+            sink = RecorderSink(path, self.graph, self._streams, self._options)
+            for stream, (message, seq, incarnation) in sorted(self._newest.items()):
                 sink.message(stream, message, seq, incarnation)
-            except RecordingError:
+                one = Held(stream, incarnation, seq, message.stamp, message.digest())
+                held.setdefault(self.graph.streams[stream].node, []).append(one)
+        except RecordingError:
+            if sink is not None:
                 with suppress(RecordingError):  # the refusal once more; the file is closed
                     sink.writer.close()
-                raise
-            one = Held(stream, incarnation, seq, message.stamp, message.digest())
-            held.setdefault(self.graph.streams[stream].node, []).append(one)
+            path.unlink(missing_ok=True)
+            raise
         self.lost.messages += self._given  # while there was no file
         self._given = Counter(self._newest.keys())
         self._begun = self._clock
@@ -194,7 +197,8 @@ class FlightSink:
     def _rotate(self) -> None:
         if self._sink is not None:
             self._close_file(GOES_ON)
-            self._begin()
+            if not self._is_stopped:
+                self._begin()
         self._forget()
 
     def _close_file(self, outcome: str) -> None:

@@ -30,8 +30,8 @@ class Lost:
 
     @property
     def any(self) -> bool:
-        """Returns whether anything is lost."""
-        return bool(self.messages) or self.firings > 0 or bool(self.spans)
+        """Returns whether anything is lost, if only the end of a file."""
+        return bool(self.messages) or self.firings > 0 or bool(self.spans) or bool(self.reasons)
 
     def because(self, reason: str) -> bool:
         """Notes why; False where that reason is known."""

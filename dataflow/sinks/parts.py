@@ -39,14 +39,15 @@ SETTLES = 1.0
 @dataclass(slots=True)
 class Part:
     """One file. `start`: the stamp (ns) with which it begins, None for the beginning of the run; `ready`: when it may
-    be closed (s, steady); `repeated`: messages in front that the part before holds, too; `messages` and `bytes`: what
-    it holds, once it is closed."""
+    be closed (s, steady); `repeated`: messages in front that the part before holds, too; `front`: bytes of all that
+    stands in front; `messages` and `bytes`: what it holds, once it is closed."""
 
     path: Path
     sink: RecorderSink
     start: int | None
     repeated: Counter[str]
     ready: float = 0.0
+    front: int = 0
     messages: int = 0
     bytes: int = 0
     abandoned: bool = False
@@ -217,7 +218,7 @@ class PartsSink:
         yield from [part for part in (self._full, self._current) if part is not None]
 
     def _is_full(self, part: Part) -> bool:
-        return self._storage.splitting.due(part.sink.writer.saved_bytes, self._clock - self._begun)
+        return self._storage.splitting.due(part.sink.writer.saved_bytes, self._clock - self._begun, part.front)
 
     def _part_at(self, stamp: int) -> Part | None:
         current = self._current
@@ -247,6 +248,7 @@ class PartsSink:
         except RecordingError:
             self._abandon(part)
             raise
+        part.front = sink.writer.given_bytes
         return part
 
     def _repeat_groups(self, part: Part) -> None:
@@ -375,8 +377,10 @@ class PartsSink:
         """Puts what stands in for the operator's records before a part into it, once."""
         if operator not in self._introduced:
             self._introduced.add(operator)
+            given = part.sink.writer.given_bytes
             for before in consecutive(holding(self._folded.get(operator, ()), self._held.get(operator, ()))):
                 self._store(part, partial(part.sink.firings, operator, part.start or 0, encode_batch(before)))
+            part.front += max(0, part.sink.writer.given_bytes - given)  # less where a chunk was compressed
 
     def _introduce_all(self) -> None:
         """Does so for those that have not been called in the current part: their records may still come, or none."""
@@ -400,16 +404,15 @@ class PartsSink:
         if not part.sink.writer.failed:  # it refuses this one thing alone
             if self.lost.because(str(error)):
                 print(f"not recorded: {error}", flush=True)
-        elif part in self._open_parts():
-            was_current = part is self._current
-            self._full = None if part is self._full else self._full
-            self._current = None if was_current else self._current
-            self._abandon(part)
-            if was_current:
-                self._refused(error)
-        else:
-            self._abandon(part)
-            self.lost.because(str(error))
+            return
+        was_current = part is self._current
+        self._full = None if part is self._full else self._full
+        self._current = None if was_current else self._current
+        self._abandon(part)
+        if was_current:
+            self._refused(error)
+        elif self.lost.because(str(error)):
+            print(f"the end of a file is not recorded: {error}", flush=True)
 
     def _refused(self, error: RecordingError) -> None:
         """Nothing is recorded from here on, until the disk takes something again."""

@@ -9,7 +9,7 @@ from dataflow.environments import EnvError, environment_of
 from dataflow.graph.model import Graph
 from dataflow.graph.reach import downstream
 from dataflow.recording import Recording
-from dataflow.recording.layout import CUT, OUTCOME
+from dataflow.recording.layout import CUT, OUTCOME, TOLD
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import NotRecorded, ReplayError
 from dataflow.verification.books import Books
@@ -104,13 +104,15 @@ def require_records(recording: Recording, recorded: Collection[str], operators: 
     for name in operators:
         if name in recorded:
             continue
-        if recording.torn or outcome not in ("", COMPLETE):
-            why = "the recording has no proper end" if recording.torn else f"its outcome: {outcome}"
+        is_cut = CUT in recording.metadata
+        unfinished = recording.torn or (TOLD in recording.metadata and not outcome and not is_cut)
+        if unfinished or outcome not in ("", COMPLETE):
+            why = "the recording has no proper end" if unfinished else f"its outcome: {outcome}"
             raise ReplayError(
                 f"{recording.path}: the recorded run ended before operator {name!r} began ({why}): "
                 "there is nothing to verify"
             )
-        if CUT in recording.metadata:
+        if is_cut:
             raise ReplayError(
                 f"{recording.path}: this part of a recording has no firing records of operator {name!r}: verify the "
                 "whole (dataflow merge), or other operators (--only)"

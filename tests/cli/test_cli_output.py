@@ -18,7 +18,7 @@ from rich.text import Text
 from dataflow.cli.support.arguments import chosen_streams, existing, graph_file, output_file, window
 from dataflow.cli.support.output import about_a_file, friendly_errors, plural, seconds, size, table
 from dataflow.cli.support.progress import RunDisplay, shown, waiting_for
-from dataflow.cli.support.report import print_report, report_json
+from dataflow.cli.support.report import is_lacking, print_report, report_json
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, RunReport, Status
 from dataflow.text import jsonable
 
@@ -310,6 +310,31 @@ def test_what_a_recording_lacks_is_among_the_losses() -> None:
     lines = printed(replace(lossy_report(), drops={}, files={"@recorder": facts}))
 
     assert "lost    7 messages and 3 calls not recorded, from 2.000000000s to the end (a.mcap: no space)" in lines
+
+
+def test_a_file_without_its_end_is_among_the_losses() -> None:
+    lost = {"messages": 0, "firings": 0, "spans": [], "reasons": ["a.mcap: no space"], "streams": {}}
+    facts = {"path": "a.mcap", "messages": 9, "bytes": 5_000_000, "lost": lost}
+
+    assert "lost    the end of a file (a.mcap: no space)" in printed(
+        replace(lossy_report(), drops={}, files={"@recorder": facts})
+    )
+
+
+def test_what_a_flight_recorder_could_not_keep_is_among_the_losses() -> None:
+    """Not among what it has kept, though its name stands there."""
+    kept = {"path": "a.mcap", "reasons": [{"what": "asked for"}], "bytes": 5_000_000}
+    failed = {"path": "b.mcap", "reasons": [{"what": "asked for"}], "bytes": 0, "error": "no space"}
+    facts = {"path": "flight", "kept": [kept, failed], "not_kept": 2}
+
+    lines = printed(replace(lossy_report(), drops={}, files={"@recorder": facts}))
+
+    assert "lost    what b.mcap was to keep (asked for): no space" in lines
+    assert "kept    a.mcap (asked for, 5.0 MB)" in lines
+    assert "        2 more triggers came, of which nothing is kept: raise files:" in lines
+    assert not any(line.startswith("kept    b.mcap") for line in lines)
+    assert is_lacking(facts)
+    assert not is_lacking({**facts, "kept": [kept]})
 
 
 def test_a_note_is_printed_once() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 
@@ -78,17 +79,33 @@ def test_split_files_hold_everything_once_and_static_messages_each(
     constant = FeatureVector(stamp=0, vectors=[[7.0]], model="m")
     with AttachedRecorder(tmp_path / "a.mcap", graph, streams, metadata={}, splitting=splitting) as recorder:
         recorder.take(encode(Envelope(Kind.MESSAGE, "test/left/constant", 0, 0, 0, constant)))
-        for seq in range(12):
+        for seq in range(40):
             recorder.take(said(seq))
             recorder.flush()
 
     files = recorder.tally.files
     assert len(files) > 2
     assert [Path(f).name for f in files[:2]] == ["a_000.mcap", "a_001.mcap"]
-    assert [place for file in files for place in numbers(file)] == [(0, seq) for seq in range(12)]
+    assert [place for file in files for place in numbers(file)] == [(0, seq) for seq in range(40)]
     for file in files:
         with Recording(file) as recording:
             assert recording.counts("test/left/constant") == {0: 1}
+
+
+def test_a_static_message_that_is_larger_than_a_file_may_be_does_not_split_at_each_message(
+    graph: Graph, tmp_path: Path
+) -> None:
+    streams = ["test/smooth/mean", "test/left/constant"]
+    large = FeatureVector(stamp=0, vectors=np.random.default_rng(1).random((1, 2_000), np.float32), model="m")
+    split = Splitting(size=2_000)
+    with AttachedRecorder(tmp_path / "a.mcap", graph, streams, metadata={}, splitting=split) as recorder:
+        recorder.take(encode(Envelope(Kind.MESSAGE, "test/left/constant", 0, 0, 0, large)))
+        for seq in range(100):
+            recorder.take(said(seq))
+            recorder.flush()
+
+    assert 2 <= len(recorder.tally.files) <= 10
+    assert [place for file in recorder.tally.files for place in numbers(file)] == [(0, seq) for seq in range(100)]
 
 
 def test_every_file_is_compressed_as_is_asked_for(graph: Graph, tmp_path: Path) -> None:

@@ -361,6 +361,51 @@ def test_a_full_disk_is_outlived_and_what_comes_after_is_kept(
     assert path.stat().st_mode & 0o777 == 0o600
 
 
+def test_calls_whose_records_find_no_room_are_lost(recorded: Path, graph: Graph, tmp_path: Path, disk: Disk) -> None:
+    """Those that the ring had taken and not given to the disk, too: each message is made by one."""
+    sink, _ = flown(recorded, graph, tmp_path, each=lambda stamp: setattr(disk, "full", stamp > 29.5))
+    lost = sink.close("complete")["lost"]
+
+    assert lost["firings"] >= lost["messages"] > 60
+
+
+def test_a_file_whose_end_finds_no_room_is_followed_by_one_when_there_is_room(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where there would be room for the few bytes of a beginning: the span that is lost is told to its end."""
+    sink, _ = flown(recorded, graph, tmp_path)
+    assert sink._sink is not None
+    end = sink._sink.close
+
+    def refused(outcome: str) -> None:
+        disk.full = True
+        try:
+            end(outcome)
+        finally:
+            disk.full = False
+
+    sink._sink.close = refused
+    sink._rotate()
+    assert "flight recorder: stops" in capsys.readouterr().out
+    sink.flush()
+    assert "flight recorder: goes on" in capsys.readouterr().out
+
+    ((_, until),) = sink.close("complete")["lost"]["spans"]
+    assert until is not None
+
+
+def test_tries_that_failed_leave_nothing_on_a_full_disk(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
+) -> None:
+    sink, _ = flown(recorded, graph, tmp_path)
+    disk.full = True
+    for _ in range(3):
+        sink.flush()
+
+    assert sorted((tmp_path / ".ring").iterdir()) == [segment.path for segment in sink._segments]
+    sink.close("complete")
+
+
 def test_a_restart_is_kept_with_the_line_and_the_traceback_of_its_failure() -> None:
     failed = {"text": "operator 'a' failed", "operators": ["a"], "where": "crashy.py:12", "traceback": "Traceback …"}
     triggers = Triggers([Trigger("raise")])

@@ -22,6 +22,7 @@ from dataflow.recording.parts import Splitting, Storage, parts_of
 from dataflow.recording.streams.copying import Origin
 from dataflow.records.firing import CALLS, encode_batch
 from dataflow.records.reading import FiringLog
+from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.sinks.parts import PartsSink
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
@@ -150,6 +151,32 @@ def test_a_part_begins_with_one_write_behind_its_header(
     assert len(writes) == 2
     assert sink.size == sum(writes)
     sink.close("complete")
+
+
+@pytest.mark.parametrize("what", ["header", "static message", "state"])
+def test_a_limit_below_what_each_part_begins_with_does_not_begin_one_with_each_message(
+    what: str, recorded: Path, graph: Graph, tmp_path: Path
+) -> None:
+    """Such as a map that is larger than a part may be: the disk would be given little else."""
+    large = np.random.default_rng(1).random((1, 2_000), np.float32)
+    sink = Given(recorded, graph, tmp_path / "run.mcap", Storage(Splitting(size=2_000))).sink
+    with Recording(recorded) as recording:
+        found = [*recording.messages(["test/left/fast"])]
+        setup, *records = FiringLog.read(recording).of("first")
+    if what == "static message":
+        sink.message("test/left/constant", FeatureVector(stamp=0, vectors=large, model="test"), 0, 0)
+    if what == "state":
+        snapshot = replace(setup, kind="snapshot", index=1, detail={"state": large.tobytes()})
+        sink.firings("first", [setup, snapshot], encode_batch([setup, snapshot]))
+        records = [replace(record, index=record.index + 1) for record in records]
+    for each, record in zip(found, records, strict=False):
+        sink.message(each.stream, each.message, each.seq, each.incarnation)
+        sink.firings("first", [record], encode_batch([record]))
+        sink.flush()
+    parts = sink.close("complete")["parts"]
+
+    assert 2 <= len(parts) <= len(found) // 10
+    assert what == "header" or min(Path(part).stat().st_size for part in parts[:-1]) > 2 * large.nbytes
 
 
 def test_the_newest_part_stays_however_large_it_is(recorded: Path, graph: Graph, tmp_path: Path) -> None:
@@ -337,6 +364,30 @@ def test_what_a_part_holds_is_counted_once_however_often_it_refuses(
         stored = {name: info.count for name, info in again.streams.items()}
         lost = facts["lost"]["streams"]
         assert {n: stored[n] + lost.get(n, 0) for n in stored} == {n: was.streams[n].count for n in stored}
+
+
+def test_a_part_of_which_only_the_end_finds_no_room_is_said_at_once_and_at_the_end(
+    recorded: Path, graph: Graph, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All messages are there, and the next part goes on; but the file does not say that there is one."""
+    sink = Given(recorded, graph, tmp_path / "run.mcap", replace(GO_ON, splitting=Splitting(every=2 * SECOND))).sink
+    with Recording(recorded) as recording:
+        found = [m for m in recording.messages() if m.stamp <= 4 * SECOND]
+    for each in found:
+        sink.message(each.stream, each.message, each.seq, each.incarnation)
+    sink.flush()
+    disk.full = True
+    sink._close_full()
+    disk.full = False
+    said = capsys.readouterr().out
+    facts = sink.close("complete")
+
+    assert f"the end of a file is not recorded: writing {tmp_path / 'run_000.mcap'} failed: No space left" in said
+    assert [Path(part).name for part in facts["parts"]] == ["run_000.mcap", "run_001.mcap"]
+    assert (facts["messages"], facts["lost"]["messages"], facts["lost"]["spans"]) == (len(found), 0, [])
+    assert "run_000.mcap failed: No space left" in facts["lost"]["reasons"][0]
+    with pytest.raises(ReplayError, match="the recording has no proper end"):
+        verify(tmp_path / "run_000.mcap", jobs=1)
 
 
 def test_a_static_message_of_which_only_a_copy_is_stored_is_not_lost(

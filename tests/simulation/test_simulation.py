@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import time
 from collections import Counter
@@ -18,15 +19,17 @@ pytest.importorskip("greenlet", reason="simulated runs need the package greenlet
 from simulation import bindings
 from simulation import check as checks
 from simulation.check import check, is_outrun
+from simulation.disk import Disk
 from simulation.flights import Flown
 from simulation.keeping import Keeping, check_losses_of_files
 from simulation.mutants import MUTANTS, Mutant
 from simulation.pipes import journey_of, travel
 from simulation.run import Happening, Machine, Outcome, simulate
-from simulation.scenario import DRAWN, TICKING, Scenario, scenario_of
+from simulation.scenario import DRAWN, LONGEST_PAUSE, TICK, TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
-from simulation.world import Process, Violation, World
+from simulation.world import MOST_CALLS, Process, Violation, World
 
+from dataflow.recording import RecordingError
 from dataflow.recording.parts import Storage
 from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan
@@ -110,6 +113,25 @@ def test_who_spins_is_named() -> None:
     world.start("main", world.process("one"), spin)
     with pytest.raises(Violation, match="one: its task 'main' spins"):
         world.run(lambda: False, 1000.0)
+
+
+def test_who_makes_up_for_the_ticks_of_the_longest_pause_does_not_spin() -> None:
+    assert round(LONGEST_PAUSE / TICK) * 10 <= MOST_CALLS
+
+
+def test_what_is_deleted_makes_room_on_a_disk(tmp_path: Path) -> None:
+    disk = Disk(World(1), tmp_path, room=100)
+    descriptor = disk.open(tmp_path / "one", os.O_WRONLY | os.O_CREAT, 0o600)
+    while disk.statvfs(tmp_path).f_bavail:
+        disk.write(descriptor, memoryview(bytes(150)))
+    with pytest.raises(OSError, match="No space left"):
+        disk.write(descriptor, memoryview(bytes(1)))
+    disk.close(descriptor)
+    size = (tmp_path / "one").stat().st_size
+    (tmp_path / "one").unlink()
+
+    assert (size, disk.full) == (100, True)
+    assert disk.statvfs(tmp_path).f_bavail == 100
 
 
 def test_nothing_reads_the_clock_past_the_simulation() -> None:
@@ -304,7 +326,7 @@ FOUND_BY = {
         count=12,
         machine=Machine(2, socket_room=2),
         happenings=(
-            Happening(0.01, "freeze", "right", {"span": 1e6}),
+            Happening(0.01, "freeze", "@recorder", {"span": 1e6}),
             Happening(0.1, "freeze", "smooth", {"span": 0.05}),
         ),
     ),
@@ -360,7 +382,7 @@ def test_a_planted_fault_is_found_and_its_plan_shrunk(name: str, memory: Path) -
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "seed"), [("part", 36), ("state", 26), ("reload", 79), ("again", 4), ("drops", 173), ("half", 11)]
+    ("name", "seed"), [("part", 36), ("state", 26), ("reload", 93), ("again", 4), ("drops", 173), ("half", 11)]
 )
 def test_a_fault_of_what_is_recorded_is_found(name: str, seed: int, memory: Path) -> None:
     check(scenario_of(seed), memory, replay=False)
@@ -412,6 +434,41 @@ RUN = Path(__file__).resolve().parent.parent / "recordings_of" / "run.mcap"
 """A whole recording."""
 
 
+@pytest.mark.parametrize("lost", [{}, {"lost": {"messages": 1}}], ids=["not counted", "counted"])
+def test_files_in_which_nothing_is_are_those_of_a_recorder_that_counts_what_is_lost(
+    lost: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of one that was killed when it began, of which the next one found the disk full."""
+    for name in ("run_000.mcap", "run_001.mcap"):
+        shutil.copy(RUN, tmp_path / name)
+    monkeypatch.setattr("simulation.check._unchanged", lambda *_, **__: None)
+    monkeypatch.setattr("simulation.check.joined", _nothing_is_there)
+    report = RunReport("robot", {}, {}, {}, {}, {}, {"@recorder": lost}, 0, 1, 0.0, interrupted=False, notes=())
+    outcome = Outcome(report)
+
+    if lost:
+        assert checks._verify(checks._joined(PLAIN, tmp_path, outcome), outcome, PLAIN) == "no recording"
+    else:
+        with pytest.raises(Violation, match="nothing is in any"):
+            checks._joined(PLAIN, tmp_path, outcome)
+
+
+def _nothing_is_there(*_: object) -> Path:
+    raise RecordingError("nothing is in any of these files")
+
+
+@pytest.mark.parametrize(
+    ("outcome", "whole"),
+    [
+        (Outcome(failure=RunFailed("interrupted")), True),
+        (Outcome(failure=RunFailed("interrupted"), disk_full=True), False),
+        (Outcome(failure=RunFailed("interrupted"), killed={"@recorder"}), False),
+    ],
+)
+def test_a_run_that_failed_does_not_tell_what_found_no_room(outcome: Outcome, whole: bool) -> None:
+    assert checks._holds_all(outcome) is whole
+
+
 def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -427,6 +484,13 @@ def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
     assert checks._check_flight(Outcome(report), graph, tmp_path) == "nothing kept"
     with pytest.raises(Violation, match="nothing is kept, though left failed"):
         checks._check_flight(Outcome(replace(report, restarts={"left": 1})), graph, tmp_path)
+    reason = {"what": "left failed", "operators": ["left"], "stamp": 7}
+    no_room = {"kept": [{"path": "a.mcap", "reasons": [reason], "error": "No space left on device"}], "not_kept": 0}
+    restarted = replace(report, restarts={"left": 1}, files={"@recorder": no_room})
+    with pytest.raises(Violation, match="could not keep what was asked for: No space left"):
+        checks._check_flight(Outcome(restarted), graph, tmp_path)
+    flown = Flown(asked=[(("restart", "left", 7), 7)], kept=[(0, frozenset())])
+    assert checks._check_flight(Outcome(restarted, disk_full=True, flown=flown), graph, tmp_path) == "nothing kept"
     asked = Flown(asked=[(("drops", "left", 7), 7)])
     with pytest.raises(Violation, match=r"was asked .*'drops', 'left', 7.* and kept \[\]"):
         checks._check_flight(Outcome(report, flown=asked), graph, tmp_path)

@@ -115,7 +115,7 @@ def execute(
 ) -> RunReport:
     """Runs it; ends the command where it was interrupted, or where its recording lacks something."""
     from dataflow.cli.support.progress import RunDisplay, shown
-    from dataflow.cli.support.report import print_report, report_json
+    from dataflow.cli.support.report import is_lacking, print_report, report_json
     from dataflow.cli.support.viewers import attached_viewer, open_saved
     from dataflow.supervision.core.report import RunFailed
 
@@ -138,7 +138,7 @@ def execute(
         open_saved(outputs.view_file)
     if report.interrupted:
         raise typer.Exit(INTERRUPTED)
-    if any(facts.get("lost") or facts.get("deaths") for facts in report.files.values()):
+    if any(map(is_lacking, report.files.values())):
         raise typer.Exit(DIFFERENT)
     return report
 

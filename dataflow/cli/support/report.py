@@ -130,6 +130,9 @@ def _losses_in_short(report: RunReport) -> Text:
     for facts in report.files.values():
         if lost := facts.get("lost"):
             words.append(_not_recorded(lost))
+        words += [
+            f"what {one['path']} was to keep ({one['reasons'][0]['what']}): {one['error']}" for one in _not_kept(facts)
+        ]
         if deaths := facts.get("deaths"):
             words.append(
                 f"what the recorder, which died {plural(deaths, 'time')}, had not stored, and what came until the next "
@@ -150,6 +153,8 @@ def _not_recorded(lost: Mapping[str, Any]) -> str:
     ]
     when = f", from {' and from '.join(spans)}" if spans else ""
     count_of = f"{plural(lost['messages'], 'message')} and {plural(lost['firings'], 'call')} not recorded"
+    if not (lost["messages"] or lost["firings"] or spans):
+        count_of = "the end of a file"
     return f"{count_of}{when} ({lost['reasons'][0]})" if lost["reasons"] else f"{count_of}{when}"
 
 
@@ -160,20 +165,37 @@ def _files(report: RunReport) -> list[Text]:
     lines: list[Text] = []
     for facts in report.files.values():
         if "kept" in facts:
-            kept = facts["kept"]
-            lines += [
-                Text(f"kept    {one['path']} ({one['reasons'][0]['what']}, {size(one['bytes'])})")
-                for one in kept[:MOST_KEPT]
-            ]
-            if len(kept) > MOST_KEPT:
-                lines.append(Text(f"kept    {len(kept) - MOST_KEPT} more in {facts['path']}"))
-            if not kept:
-                lines.append(Text("kept    nothing: no trigger came"))
+            lines += _kept(facts)
         elif facts:
             lines.append(Text(WROTE + _written(facts)))
         if facts.get("failed"):
             lines.append(Text(f"        {plural(facts['failed'], 'message')} could not be drawn", style="yellow"))
     return lines
+
+
+def _kept(facts: Mapping[str, Any]) -> list[Text]:
+    """Returns lines about the recordings that a flight recorder kept, and how often it was asked for more."""
+    kept = [one for one in facts["kept"] if "error" not in one]
+    lines = [
+        Text(f"kept    {one['path']} ({one['reasons'][0]['what']}, {size(one['bytes'])})") for one in kept[:MOST_KEPT]
+    ]
+    if len(kept) > MOST_KEPT:
+        lines.append(Text(f"kept    {len(kept) - MOST_KEPT} more in {facts['path']}"))
+    if not kept:
+        lines.append(Text("kept    nothing" + ("" if facts["kept"] else ": no trigger came")))
+    if more := facts["not_kept"]:
+        lines.append(Text(f"        {plural(more, 'more trigger')} came, of which nothing is kept: raise files:"))
+    return lines
+
+
+def _not_kept(facts: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Returns the recordings that a flight recorder was asked for and could not keep."""
+    return [one for one in facts.get("kept", ()) if "error" in one]
+
+
+def is_lacking(facts: Mapping[str, Any]) -> bool:
+    """Tells whether the files of a sink lack anything of what they were to hold."""
+    return bool(facts.get("lost") or facts.get("deaths") or _not_kept(facts))
 
 
 def _written(facts: Mapping[str, Any]) -> str:

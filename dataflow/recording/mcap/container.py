@@ -113,6 +113,11 @@ class ContainerWriter:
         """Size of the file as it is now."""
         return self._position
 
+    @property
+    def given_bytes(self) -> int:
+        """Size of the file with all that waits to be written, before it is compressed."""
+        return self._position + self._declared_bytes + sum(chunk.size for chunk in self._gathered())
+
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         """The id of a schema; an equal one that is there already is used again."""
         for known in self._schemas:

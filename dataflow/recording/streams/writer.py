@@ -121,6 +121,11 @@ class RecordingWriter:
         return self._file.saved_bytes
 
     @property
+    def given_bytes(self) -> int:
+        """Bytes that are in the file, and in the unfinished chunk before it is compressed."""
+        return self._file.given_bytes
+
+    @property
     def failed(self) -> bool:
         """Tells whether a write has failed: nothing more can be added."""
         return self._file.failed

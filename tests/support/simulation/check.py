@@ -138,8 +138,10 @@ def is_outrun(outcome: Outcome) -> bool:
 
 
 def _holds_all(outcome: Outcome) -> bool:
-    """Whether the files hold all that the recorder was given."""
-    facts = {} if outcome.report is None else outcome.report.files.get("@recorder", {})
+    """Whether the files hold all that the recorder was given. A run that failed does not tell what found no room."""
+    if outcome.report is None:
+        return not (outcome.disk_full or "@recorder" in outcome.killed)
+    facts = outcome.report.files.get("@recorder", {})
     return not (facts.get("lost") or facts.get("deleted") or "@recorder" in outcome.killed)
 
 
@@ -154,7 +156,7 @@ def _joined(scenario: Scenario, folder: Path, outcome: Outcome) -> Path:
     try:
         path = joined(files, folder / "joined.mcap")
     except RecordingError as error:
-        if outcome.failure is not None and "nothing is in any" in str(error):
+        if "nothing is in any" in str(error) and not (outcome.failure is None and _holds_all(outcome)):
             return folder / "joined.mcap"
         raise Violation(f"its parts cannot be joined: {error}") from error
     if outcome.report is not None and "@recorder" not in outcome.killed:
@@ -185,10 +187,10 @@ def _check_flight(outcome: Outcome, graph: Graph, folder: Path) -> str:
     kept = kept_by_flight(outcome.report, full=outcome.disk_full)
     for one in kept:
         _unchanged(Path(one["path"]), lacks=not _holds_all(outcome))
-    if outcome.report.restarts and not kept and _holds_all(outcome):
+    facts = outcome.report.files["@recorder"]
+    if outcome.report.restarts and not facts["kept"] and _holds_all(outcome):
         raise Violation(f"nothing is kept, though {', '.join(outcome.report.restarts)} failed and was started again")
     if _holds_all(outcome):
-        facts = outcome.report.files["@recorder"]
         check_reasons(outcome.flown, facts)
         check_spans(outcome.flown, graph, facts)
     return "kept" if kept else "nothing kept"
@@ -238,7 +240,7 @@ def _notes(outcome: Outcome) -> tuple[str, ...]:
 def _verify(path: Path, outcome: Outcome, scenario: Scenario) -> str:
     """Verifies what was recorded. A run that failed may be cut, but what is there must be as it was."""
     if not path.exists():
-        if outcome.failure is None:
+        if outcome.failure is None and _holds_all(outcome):
             raise Violation("there is no recording")
         return "no recording"
     try:

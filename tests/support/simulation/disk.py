@@ -14,13 +14,15 @@ from typing import Any
 
 from simulation.world import World
 
+LARGE = 1 << 40
+
 
 class Disk:
-    """The module `os` for who writes files. `room`: bytes until it is full; `slow`: seconds that a write may take."""
+    """The module `os` for who writes files below `folder`. `room`: bytes that they take until it is full; `slow`:
+    seconds that a write may take."""
 
-    def __init__(self, world: World, *, room: int | None = None, slow: float = 0.0) -> None:
-        self._world, self._room, self._slow = world, room, slow
-        self._written = 0
+    def __init__(self, world: World, folder: Path | None, *, room: int | None = None, slow: float = 0.0) -> None:
+        self._world, self._folder, self._room, self._slow = world, folder, room, slow
         self._opened: dict[int, Callable[[], None]] = {}
         self.full = False
         self._busy: list[tuple[float, float]] = []
@@ -48,13 +50,11 @@ class Disk:
         count = len(data)
         if world.random.random() < 0.1:
             count = world.random.randint(1, count)
-        if self._room is not None and self._written + count > self._room:
-            count = self._room - self._written
-            if count <= 0:
-                self.full = True
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        self._written += count
-        return os.write(descriptor, data[:count])
+        room = self._free()
+        if not room:
+            self.full = True
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return os.write(descriptor, data[: min(count, room)])
 
     def busy(self, since: float) -> float:
         """Seconds that writes took since then."""
@@ -66,12 +66,13 @@ class Disk:
             self._room += more
 
     def statvfs(self, folder: Path) -> Any:
-        whole = self._room or 1 << 40
-        return SimpleNamespace(f_bavail=max(0, whole - self._written), f_frsize=1, f_blocks=whole)
+        return SimpleNamespace(f_bavail=self._free(), f_frsize=1, f_blocks=self._room or LARGE)
 
-    def ftruncate(self, descriptor: int, size: int) -> None:
-        self._written -= os.fstat(descriptor).st_size - size
-        os.ftruncate(descriptor, size)
+    def _free(self) -> int:
+        """Bytes that there is room for: what was deleted takes none."""
+        if self._room is None or self._folder is None:
+            return LARGE
+        return max(0, self._room - sum(file.stat().st_size for file in self._folder.rglob("*") if file.is_file()))
 
     def close(self, descriptor: int) -> None:
         task = self._world.task

@@ -117,7 +117,9 @@ class Simulation:
         self.world = World(machine_.seed, pace=machine_.pace, preempt=machine_.preempt)
         self.system = machine.System(self.world, socket_room=machine_.socket_room)
         self._ring_bytes = machine_.ring_bytes
-        self.disk = Disk(self.world, room=machine_.room, slow=machine_.slow_disk)
+        written = plan.record or plan.flight
+        folder = None if written is None else written.parent
+        self.disk = Disk(self.world, folder, room=machine_.room, slow=machine_.slow_disk)
         self.outcome = Outcome()
         self._plan, self._happenings, self._mode, self._limit = plan, happenings, mode, limit
         self._supervisor: Supervisor | None = None

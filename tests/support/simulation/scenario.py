@@ -81,6 +81,8 @@ POLICIES = (
 FOREVER = 1e6
 """Seconds that a process is frozen for good."""
 GENTLE = ("pause", "set", "play", "reload", "trigger", "room")
+LONGEST_PAUSE = 40.0
+"""Seconds for which a whole machine stands still, at most."""
 PATIENCE = 2.5
 """Seconds of a freeze that every run outlives."""
 TIMEOUT = 20.0
@@ -312,7 +314,7 @@ def _gentle(plain: Scenario, graph: Graph, r: random.Random) -> list[Happening]:
     if r.random() < 0.15:
         where = r.choice(("*", "*", "", r.choice([*graph.processes(plain.placement), "@recorder"])))
         at = round(r.random() * 0.3, 4)
-        found.append(Happening(at, "pause", where, {"span": r.choice((1.0, 4.0, 6.0, 15.0, 40.0))}))
+        found.append(Happening(at, "pause", where, {"span": r.choice((1.0, 4.0, 6.0, 15.0, LONGEST_PAUSE))}))
     if not plain.live and r.random() < 0.1:
         at = round(r.random() * 0.2, 4)
         found.append(Happening(at, "play", "", {"action": "pause"}))

@@ -16,9 +16,9 @@ from greenlet import getcurrent, greenlet
 
 EPOCH = 1_700_000_000.0
 """The wall clock (s) when a world begins."""
-MOST_CALLS = 600_000
-"""Calls that a task may make without ever waiting: one that makes more spins. The longest freeze leaves 24,000 ticks of
-the quickest timer to be made up for, at some ten calls each."""
+MOST_CALLS = 1_700_000
+"""Calls that a task may make without ever waiting: one that makes more spins. The longest pause leaves 160,000 ticks of
+the quickest timer to be dropped or made up for, at some ten calls each."""
 READING = 1e-6
 """Seconds that pass when a task looks at the clock: a loop that only waits for it comes to an end."""
 
