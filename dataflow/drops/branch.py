@@ -137,7 +137,7 @@ class HeldRunner(OperatorRunner):
             emitter,
             static=graph.static,
             seed=graph.seed,
-            operator=player.calls.operator,
+            operator=player.operator.shell,
             lossy=True,
         )
         self.calls = PlayedCalls(player)

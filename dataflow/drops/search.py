@@ -229,7 +229,7 @@ class Drops:
     def _branch(self, feeding: Feeding, losses: Sequence[Loss]) -> Branch:
         version = seeding_of(self._recording)
         players = {
-            name: Player(self.graph.nodes[name], self.graph.seed, version, self._records.get(name, ()))
+            name: Player(self.graph.nodes[name], self.graph, version, self._records.get(name, ()))
             for name in feeding.operators
         }
         self._players += players.values()

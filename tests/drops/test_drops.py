@@ -13,8 +13,7 @@ from dataflow.drops import player as player_module
 from dataflow.drops.losses import Loss, bursts_of
 from dataflow.drops.player import Given, PlayedCalls, Player
 from dataflow.drops.search import Cost, Drops, DropsError, Worse
-from dataflow.graph import load_text
-from dataflow.graph.model import Node
+from dataflow.graph import Graph, load_text
 from dataflow.messages import FeatureVector, Message
 from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord
@@ -187,9 +186,9 @@ def _firing(stamp: int, value: float, port: str) -> Firing:
 
 
 def test_a_parameter_of_an_operator_without_a_state_is_as_it_was_at_each_call_of_each_replay() -> None:
-    node = _node("Scaled", "at: drive/step")
+    graph = _graph("Scaled", "at: drive/step")
     change = FiringRecord("it", 0, 2, "param", 10, detail={"name": "gain", "value": 2.0})
-    player = Player(node, 0, 1, [FiringRecord("it", 0, 1, "fire", 10), change])
+    player = Player(graph.nodes["it"], graph, 1, [FiringRecord("it", 0, 1, "fire", 10), change])
 
     replays = [
         [_value(PlayedCalls(player).process(_firing(stamp, value, "at"))) for stamp in (10, 20)] for value in (1.0, 3.0)
@@ -203,7 +202,8 @@ def test_inputs_before_a_kept_state_are_let_go_and_more_than_can_be_held_are_ref
 ) -> None:
     monkeypatch.setattr(player_module, "SPACING", 0.0)
     given = Given()
-    player = Player(_node("Count", "step: drive/step"), 0, 1, ())
+    graph = _graph("Count", "step: drive/step")
+    player = Player(graph.nodes["it"], graph, 1, ())
     for stamp in (10, 20, 30):
         player.process(given, _firing(stamp, 1.0, "step"))
     assert [firing.inputs for firing in given.firings] == [{}, {}, {}]
@@ -215,9 +215,9 @@ def test_inputs_before_a_kept_state_are_let_go_and_more_than_can_be_held_are_ref
         player.process(given, _firing(40, 1.0, "step"))
 
 
-def _node(operator: str, inputs: str) -> Node:
+def _graph(operator: str, inputs: str) -> Graph:
     text = "graph: held\noperators:\n  drive: {use: 'held_runs:Drive'}\n"
-    return load_text(f"{text}  it: {{use: 'held_runs:{operator}', inputs: {{{inputs}}}}}\n").nodes["it"]
+    return load_text(f"{text}  it: {{use: 'held_runs:{operator}', inputs: {{{inputs}}}}}\n")
 
 
 def _value(made: Mapping[str, Message]) -> float:
