@@ -110,6 +110,12 @@ class Fired:
             "error": self.error,
         }
 
+    def names_then(self) -> dict[str, Any]:
+        """Names for an expression about the call as it was recorded; an output that was not stored is None."""
+        then = {made.port: made.recorded for made in self.made}
+        out = SimpleNamespace(**dict.fromkeys(self.ports) | then)
+        return self.names() | {"out": out, "same": True, "error": self.recorded_error}
+
     @property
     def silent(self) -> bool:
         """Returns whether an input or an output has nothing in this call."""

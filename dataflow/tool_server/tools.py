@@ -362,8 +362,9 @@ def mended(
     with _debugger(recording, operator, graph, params) as (debugger, origin, _):
         fired = _at(debugger, origin, call)
         number = fired.number
-        if alone and not _named_in(expect) & _names(fired).keys():
-            raise ToolError(f"expect={expect!r} names nothing of the call, such as out: expected what is right in it")
+        if alone and _is_true_then(expected, fired):
+            told = "is true of what was recorded as well: expected what is right in this call, and was not"
+            raise ToolError(f"expect={expect!r} {told}")
         meets, differs = bool(_evaluated(expected, expect, _names(fired))), not fired.same
         shown = _shown(fired, debugger, origin)
         say(f"call {number} of {debugger.node.name} made again; all its calls follow")
@@ -553,6 +554,15 @@ def _compiled(argument: str, text: str) -> Any:
 
 def _named_in(expression: str) -> set[str]:
     return {node.id for node in ast.walk(ast.parse(expression, mode="eval")) if isinstance(node, ast.Name)}
+
+
+def _is_true_then(code: Any, fired: Fired) -> bool:
+    """Returns whether an expression is true of a call as it was recorded, as far as that is known: not the state behind
+    it, nor what is in no recorded stream."""
+    try:
+        return bool(eval(code, fired.names_then() | {"before": fired.states()[0]}))
+    except Exception:  # it needs what is not known, or what the recorded call did not make
+        return False
 
 
 def _evaluated(code: Any, text: str, names: dict[str, Any]) -> Any:
