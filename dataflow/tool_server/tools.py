@@ -357,7 +357,7 @@ def mended(
     *,
     say: Say,
 ) -> Any:
-    """Make all calls of an operator that was mended, for `prove`. `alone`: nothing but `expect` says what is right."""
+    """Make all calls of an operator that was mended, for `prove`. `alone`: `expect` is all that is known of what is right."""
     expected, _ = _compiled("expect", expect), _compiled("may_change", may_change)
     with _debugger(recording, operator, graph, params) as (debugger, origin, _):
         fired = _at(debugger, origin, call)
