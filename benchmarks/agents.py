@@ -211,7 +211,7 @@ class Bench:
             return wrong
         first = self.first_difference(recording, operator) if recording.exists() else None
         if first is None or first >= len(self.outcomes(recording, operator)):
-            return "changes no output" if wrong is None else f"fails before a call: {wrong[:80]}"
+            return "changes its figures alone" if wrong is None else f"fails before a call: {wrong[:80]}"
         return first
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import math
 import re
 import time
@@ -13,7 +14,7 @@ from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.capture.reduce import needed, none_to_spare, shortest_end, smallest, thinned
+from dataflow.debugging.reduce import needed, none_to_spare, smallest, thinned
 from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, Sent, bursts_of, losses_of, sent_by
 from dataflow.drops.player import Player
@@ -154,7 +155,8 @@ class Drops:
     """Looks for the losses of a recorded run that made `worse` true of its figures.
 
     `budget`: seconds; `watch` gets the numbers of replays and of losses that may still be left. Runs operators in this
-    process. Raises `DropsError`, `ReplayError`, `OperatorFailure`, and SyntaxError for `worse`.
+    process, or in those of their environments. Raises `DropsError`, `ReplayError`, `OperatorFailure`, and SyntaxError
+    for `worse`.
     """
 
     def __init__(
@@ -166,6 +168,7 @@ class Drops:
         budget: float = SECONDS,
         watch: Callable[[int, int], None] = lambda replays, left: None,
     ) -> None:
+        self._began = time.monotonic()
         self._recording, self._budget, self._watch = recording, budget, watch
         self.graph = graph_that_is_here(recording)[0] if graph is None else graph
         self._log = FiringLog.read(recording)
@@ -174,25 +177,37 @@ class Drops:
         self.worse = Worse(worse, self._recorded)
         self._records = {name: list(self._log.ordered(self.graph.nodes[name])) for name in names}
         self.replays = 0
+        self._known: dict[frozenset[Loss], Figures | OperatorFailure | ReplayError] = {}
+        """By what was undone, what a replay gave."""
         self._players: list[Player] = []
+
+    def figures_without(self, undone: Sequence[Loss]) -> Figures:
+        """Returns the figures of one replay with some losses undone, by operators that are made anew."""
+        feeding, losses, _ = self._plan
+        branch = self._branch(feeding, losses)
+        try:
+            with limited_threads(self.graph.threads):
+                return branch.replay(frozenset(undone))
+        finally:
+            branch.close()
 
     def find(self) -> Cost:
         """Finds them."""
-        began = time.monotonic()
         if not self.worse.is_true(self._recorded):
             raise DropsError(
                 f"the recorded figures are not {self.worse.text}: {_said(self.worse.values(self._recorded))}"
             )
-        feeding, losses, sent = self._plan()
+        feeding, losses, sent = self._plan
         if not losses:
             raise NothingLost("nothing was lost, or came late, between the sources and these figures")
         branch = self._branch(feeding, losses)
         try:
             with limited_threads(self.graph.threads):
-                return self._search(branch, feeding, bursts_of(losses, sent), began)
+                return self._search(branch, feeding, bursts_of(losses, sent))
         finally:
-            self._close()
+            branch.close()
 
+    @functools.cached_property
     def _plan(self) -> tuple[Feeding, list[Loss], Sent]:
         """The operators between losses and figures, with what feeds them, the losses, and the messages sent."""
         graph = self.graph
@@ -235,7 +250,7 @@ class Drops:
         self._players += players.values()
         return Branch(self._recording, self.graph, feeding, players, losses)
 
-    def _search(self, branch: Branch, feeding: Feeding, bursts: Sequence[Sequence[Loss]], began: float) -> Cost:
+    def _search(self, branch: Branch, feeding: Feeding, bursts: Sequence[Sequence[Loss]]) -> Cost:
         losses = _flat(bursts)
         before = self._replay(branch, ())
         self._check(branch, before)
@@ -247,7 +262,7 @@ class Drops:
 
         def heals(part: Sequence[Loss]) -> bool:
             nonlocal in_time
-            if time.monotonic() > began + self._budget:
+            if time.monotonic() > self._began + self._budget:
                 in_time = False
                 return False
             self._watch(self.replays, len(part))
@@ -259,12 +274,13 @@ class Drops:
         def heal(part: Sequence[Sequence[Loss]]) -> bool:
             return heals(_flat(part))
 
-        named = _flat(needed(shortest_end(sorted(bursts, key=len), heal), heal))  # the longest of them at first
+        longest = max(bursts, key=len)  # else from the last on: a replay makes the calls behind its first difference
+        named = list(longest) if heal([longest]) else _flat(needed(bursts, heal))
         if in_time and len(named) > 1:
             named = _reduced(named, heals)
         undone = self._replay(branch, named)
-        again = self._branch(feeding, losses)
-        if self.worse.values(self._replay(again, named)) != self.worse.values(undone):
+        self.replays += 1
+        if self.worse.values(self.figures_without(named)) != self.worse.values(undone):
             raise DropsError("two equal replays do not give equal figures: dataflow verify --why shows what differs")
         return Cost(
             named=named,
@@ -278,12 +294,22 @@ class Drops:
             not_sent=self._not_sent(),
             replays=self.replays,
             calls=sum(player.made for player in self._players),
-            seconds=time.monotonic() - began,
+            seconds=time.monotonic() - self._began,
         )
 
     def _replay(self, branch: Branch, undone: Sequence[Loss]) -> Figures:
-        self.replays += 1
-        return branch.replay(frozenset(undone))
+        """Returns the figures of a replay; those of an equal one that was made before. Raises what it raised."""
+        asked = frozenset(undone)
+        if asked not in self._known:
+            self.replays += 1
+            try:
+                self._known[asked] = branch.replay(asked)
+            except (OperatorFailure, ReplayError) as error:
+                self._known[asked] = error
+        found = self._known[asked]
+        if isinstance(found, Exception):
+            raise found
+        return found
 
     def _check(self, branch: Branch, figures: Figures) -> None:
         """Raises `DropsError` where a replay with all losses is not what was recorded: then one without them would show
@@ -314,10 +340,6 @@ class Drops:
         sources = [records for name, records in self._records.items() if self.graph.nodes[name].source]
         details = [r.detail for records in sources for r in records if r.kind in ("fire", "finish")]
         return sum(n for detail in details for n in detail.values() if type(n) is int)
-
-    def _close(self) -> None:
-        for player in self._players:
-            player.close()
 
 
 def _reduced(named: Sequence[Loss], heals: Callable[[Sequence[Loss]], bool]) -> list[Loss]:

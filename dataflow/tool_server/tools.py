@@ -115,9 +115,10 @@ def lines(
     """Name the lines that can have made a call of an operator other than recorded (`call` as in `goto`).
 
     `changes`: where the operator's code differs from that which was recorded, as far as that is in git's commits or was
-    replaced by a reload (`recorded_code`); first those without which the call gives what was recorded (`mends`), then
-    those that ran in it. `raised`: the line of its error. `alone`: the lines that ran in it and in none of the 8
-    calls before. `ran`, where there are no changes: all its lines.
+    replaced by a reload (`recorded_code`); first those without which the call gives what was recorded (`mends`), or a
+    smallest set of them where that takes several (`together`), then those that ran in it. `raised`: the line of its
+    error. `alone`: the lines that ran in it and in none of the 8 calls before. `ran`, where there are no changes: all
+    its lines.
     """
     from dataflow.debugging.suspects import ranges, suspects
 
@@ -357,7 +358,7 @@ def mended(
     *,
     say: Say,
 ) -> Any:
-    """Make all calls of an operator that was mended, for `prove`. `alone`: `expect` is all that is known of what is right."""
+    """Make all calls of an operator that was mended, for `prove`. `alone`: there is no recording of right code."""
     expected, _ = _compiled("expect", expect), _compiled("may_change", may_change)
     with _debugger(recording, operator, graph, params) as (debugger, origin, _):
         fired = _at(debugger, origin, call)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import held_runs
@@ -10,6 +10,7 @@ import pytest
 from held_runs import MS, STAMP
 
 from dataflow.drops import player as player_module
+from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, bursts_of
 from dataflow.drops.player import Given, PlayedCalls, Player
 from dataflow.drops.search import Cost, Drops, DropsError, Worse
@@ -67,9 +68,29 @@ def test_losses_without_a_message_between_them_are_one_burst_and_tried_together(
     assert sorted(map(sorted, found)) == sorted([stop, *others])
     assert found[0][0].stamp == 30
 
-    held = cost(run, "end_error_m > 5", budget=0.0)  # nothing but the replays before and behind
+    held = cost(run, "end_error_m > 5", budget=0.0)
     assert not held.minimal
-    assert held.replays == 4
+    assert held.replays == 3  # as it was, with all losses undone, and that by operators made anew
+
+
+def test_nothing_is_replayed_twice_and_the_longest_burst_is_tried_first(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[frozenset[Loss]] = []
+    replay = Branch.replay
+
+    def counted(branch: Branch, undone: Collection[Loss] = ()) -> Figures:
+        asked.append(frozenset(undone))
+        return replay(branch, undone)
+
+    monkeypatch.setattr(Branch, "replay", counted)
+    found = cost(run, "end_error_m > 5")
+
+    *before, last = asked
+    assert len({*before}) == len(before) == found.replays - 1
+    assert last == {*found.named}  # by operators made anew
+    assert len(before[1]) == found.losses
+    assert {loss.operator for loss in before[2]} == {"smooth"}  # which stood still for longest
 
 
 @pytest.mark.long

@@ -110,6 +110,17 @@ def test_the_changed_line_that_made_a_call_differ_is_named_first(
     assert "vectors + 1\n" in told["changes"][0]["recorded"]
     assert told["alone"] == {str(file): [[wrong, wrong]]}
 
+    two = SCALED.replace("x.vectors * 2", "x.vectors * 3").replace("vectors + 1", "vectors + 10")
+    file.write_text(two.replace("class Scaled", "\nclass Scaled"))
+    monkeypatch.delitem(sys.modules, "scaled_operators")
+    told = ask("lines", recording, operator="scaled", call="4")
+    changes = [(each["here"].strip(), each["mends"], each["together"]) for each in told["changes"]]
+    assert [mends for _, mends, _ in changes] == [False] * 3
+    assert [together for *_, together in changes] == [True, True, False]
+    assert changes[2][0] == ""  # the new line
+
+    file.write_text(SCALED.replace("x.vectors * 2", "2.0 * x.vectors").replace("vectors + 1", "vectors + 10"))
+    monkeypatch.delitem(sys.modules, "scaled_operators")
     (tmp_path / ".git").rename(tmp_path / "hidden")
     told = ask("lines", recording, operator="scaled")
     assert (told["changes"], told["recorded_code"]) == ([], {"scaled_operators": "not found"})
