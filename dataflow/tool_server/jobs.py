@@ -207,16 +207,15 @@ def _env_of(tool: str, arguments: Mapping[str, Any], recording: Recording, graph
         return None
 
 
-def answered_there(tool: str, arguments: Mapping[str, Any], say: Callable[[str], None]) -> Any:
-    """Answers a tool, or a part of one, in the environment of its operators: in this process where it is in that.
+def answered_there(part: Callable[..., Any], arguments: Mapping[str, Any], say: Callable[[str], None]) -> Any:
+    """Answers a part of a tool in the environment of its operators: in this process where it is in that.
 
-    Raises what the tool raises, as `Refused` from another process, and `Refused` where there is no such environment.
+    Raises what the part raises, as `Refused` from another process, and `Refused` where there is no such environment.
     """
-    from dataflow.tool_server.tools import answer
-
+    tool = part.__name__
     python, variables = place_of(tool, arguments)
     if in_same(variables):
-        return answer(tool, arguments, say)
+        return part(**arguments, say=say)
     command = [python, "-P", "-m", "dataflow.tool_server.work"]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, env=variables, **pipes) as process:  # it ends with the group of this one

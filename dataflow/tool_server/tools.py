@@ -313,9 +313,7 @@ def prove(
     from dataflow.tool_server.proof import judge
 
     asked = {"recording": recording, "operator": operator, "call": call, "expect": expect, "may_change": may_change}
-    made = answered_there(
-        "mended", asked | {"alone": right is None, "params": params, "graph": graph, "path": path}, say
-    )
+    made = answered_there(mended, asked | {"alone": right is None, "params": params, "graph": graph, "path": path}, say)
     name, number, with_graph = made["operator"], made["call"], _loaded(graph)
     say("all operators are verified")
     with Recording(_file(recording)) as opened:
