@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from dataflow.blame.links import Chain, Link
 from dataflow.blame.nudge import made_finite, nudged
 from dataflow.cli.commands.blame import _in_runs
 from dataflow.cli.main import app
+from dataflow.debugging.debugger import Debugger
 from dataflow.graph import load_text
 from dataflow.messages import FeatureVector, RangeReading
 from dataflow.recording import Recording
@@ -127,6 +129,18 @@ def test_a_time_behind_the_end_is_told(spiky: Path) -> None:
 
     assert "made by smooth #59 at 5.900 s, the last one: the recording ends before" in " ".join(told.output.split())
     assert not found(spiky, "smooth/out.value@5.9").late
+
+
+def test_the_seconds_of_a_part_count_from_its_beginning_as_in_the_debugger(tmp_path: Path) -> None:
+    path, part = tmp_path / "run.mcap", tmp_path / "part.mcap"
+    dataflow.run(load_text("record: {snapshots: 500ms}\n" + GRAPH % "false"), record=path)
+    cut = CliRunner().invoke(app, ["cut", str(path), "-o", str(part), "--from", "1.45", "--to", "3"])
+    assert cut.exit_code == 0, cut.output
+
+    with Recording(part) as recording, closing(Debugger(recording, "smooth")) as debugger:
+        for seconds in (0.5, 1.2):
+            chain = Blame(recording, Field.parse(f"smooth/out.value@{seconds}")).find()
+            assert chain.target.number == debugger.number_at(debugger.origin + round(seconds * 1e9))
 
 
 def test_a_nudge_and_its_opposite_lie_on_either_side() -> None:
