@@ -11,6 +11,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dataflow.execution.failure import cut
+
 if TYPE_CHECKING:
     from dataflow.debugging.debugger import Debugger
     from dataflow.debugging.fired import Fired
@@ -110,7 +112,7 @@ def state(
 
 
 def lines(
-    recording: str, operator: str, call: str = "diff", graph: str | None = None, path: list[str] | None = None
+    recording: str, operator: str, call: CallName = "diff", graph: str | None = None, path: list[str] | None = None
 ) -> Any:
     """Name the lines that can have made a call of an operator other than recorded (`call` as in `goto`).
 
@@ -156,14 +158,18 @@ def history(
         code = _compiled("field", field)
         begin, end = (debugger.number(number) for number in (first, last))
         values: list[dict[str, Any]] = []
+        before: Any = None
 
         def visit(fired: Fired) -> bool:
+            nonlocal before
             try:
-                value = _text(eval(code, fired.names()))
+                value = eval(code, fired.names())
+                shown = _text(value)
             except Exception as error:  # such as of an output that this call did not make
-                value = {"error": readable(error)}
-            if not values or value != values[-1]["value"]:
-                values.append({"call": fired.number, "stamp": fired.call.stamp, "value": value})
+                value = shown = {"error": readable(error)}
+            if not values or not _alike(value, before):
+                values.append({"call": fired.number, "stamp": fired.call.stamp, "value": shown})
+            before = value
             return len(values) == MOST_CALLS
 
         found = debugger.until(visit, first=begin, last=end)
@@ -539,16 +545,36 @@ def _names(fired: Fired) -> dict[str, Any]:
 
 
 def _text(value: Any) -> Any:
+    """A value as JSON has it: numbers as they are, those of numpy by their own digits, anything else in words."""
+    import numpy as np
+
     from dataflow.messages.display.text import field_text
 
+    if isinstance(value, np.floating):
+        return float(str(value))
+    if isinstance(value, np.bool_ | np.integer):
+        return value.item()
     return value if value is None or isinstance(value, bool | int | float) else field_text(value)
+
+
+def _alike(value: Any, other: Any) -> bool:
+    """Returns whether two values of an expression are the same; NaN is the same as NaN."""
+    import numpy as np
+
+    if isinstance(value, np.ndarray) and isinstance(other, np.ndarray):
+        return (value.dtype, value.shape) == (other.dtype, other.shape) and value.tobytes() == other.tobytes()
+    try:
+        return bool(value == other or (value != value and other != other))
+    except Exception:  # such as an array beside a number
+        return False
 
 
 def _compiled(argument: str, text: str) -> Any:
     try:
         return compile(text, f"<{argument}>", "eval")
-    except SyntaxError as error:
-        raise ToolError(f"{argument}={text!r}: no Python expression: {error.msg}") from None
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        told = getattr(error, "msg", "") or str(error) or type(error).__name__
+        raise ToolError(f"{argument}={cut(text, 200)!r}: no Python expression: {told}") from None
 
 
 def _named_in(expression: str) -> set[str]:
