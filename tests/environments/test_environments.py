@@ -29,6 +29,7 @@ from dataflow.tool_server import proof
 from dataflow.tool_server.jobs import Refused, place_of
 from dataflow.tool_server.tools import answer
 from dataflow.verification.complete import complete
+from dataflow.verification.places import env_of_chain
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 
@@ -270,6 +271,19 @@ def test_another_operator_is_judged_although_its_recorded_code_cannot_be_tried_h
 def test_a_tool_that_would_need_two_environments_is_refused(recorded: Path) -> None:
     with pytest.raises(Refused, match=r"'second' runs in the environment"):
         place_of("blame", {"recording": str(recorded), "field": "second/y.vectors@0.01"})
+
+
+def test_a_chain_that_begins_in_an_environment_and_ends_outside_is_refused_with_what_may_be_asked(
+    environments: Path,
+) -> None:
+    text = TEXT.format(folder=environments, record="all").replace(f", env: {environments}/two", "")
+    wrong = r"'second' runs in the environment of dataflow itself, .* 'first' \('.*one'\); .* what comes out of first$"
+
+    with pytest.raises(EnvError, match=wrong):
+        env_of_chain(load_text(text), "second/y")
+    first = env_of_chain(load_text(text), "first/y")
+    assert first is not None
+    assert first.folder == environments / "one"
 
 
 def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_path: Path) -> None:
