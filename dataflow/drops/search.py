@@ -14,7 +14,7 @@ from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.debugging.reduce import needed, none_to_spare, smallest, thinned
+from dataflow.debugging.reduce import needed, none_to_spare, shortest_end, smallest, thinned
 from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, Sent, bursts_of, losses_of, sent_by
 from dataflow.drops.player import Player
@@ -31,6 +31,8 @@ from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, s
 from dataflow.sync import FOREVER, NEVER
 
 SECONDS = 60.0
+GROWS = 4
+"""Times as many bursts are tried next, where some do not suffice."""
 FUNCTIONS: Mapping[str, Callable[..., Any]] = {f.__name__: f for f in (abs, min, max, round, sum, len, any, all)}
 """Functions that an expression may call."""
 
@@ -274,8 +276,9 @@ class Drops:
         def heal(part: Sequence[Sequence[Loss]]) -> bool:
             return heals(_flat(part))
 
-        longest = max(bursts, key=len)  # else from the last on: a replay makes the calls behind its first difference
-        named = list(longest) if heal([longest]) else _flat(needed(bursts, heal))
+        # The longest at first; of those that suffice the last: a replay makes the calls behind its first difference.
+        suffice = shortest_end(sorted(bursts, key=len), heal, GROWS)
+        named = _flat(needed(sorted(suffice), heal))
         if in_time and len(named) > 1:
             named = _reduced(named, heals)
         undone = self._replay(branch, named)
