@@ -211,7 +211,7 @@ class Bench:
             return wrong
         first = self.first_difference(recording, operator) if recording.exists() else None
         if first is None or first >= len(self.outcomes(recording, operator)):
-            return "changes no output" if wrong is None else f"fails before a call: {wrong[:80]}"
+            return "changes its figures alone" if wrong is None else f"fails before a call: {wrong[:80]}"
         return first
 
 
@@ -383,13 +383,21 @@ def look(bench: Bench, bug: Bug) -> None:
             bug.answers["line without git"] = named(bench.ask("lines", recording=good, operator=operator), bug)
         finally:
             (bench.folder / "hidden").rename(bench.checkout / ".git")
-    innocent = list[Mutant]()
-    for each in bug.again:
-        if len(innocent) < INNOCENT and apart(each, [bug.mutant, *innocent]):
-            innocent.append(each)
+    innocent = beside(bench, bug)
     with written([bug.mutant, *innocent]):
         found = bench.ask("lines", recording=good, operator=bug.operator)
         bug.answers["line among changes"] = f"{named(found, bug)}, {len(innocent)} others"
+
+
+def beside(bench: Bench, bug: Bug) -> list[Mutant]:
+    """Returns faults that change nothing alone, in whose company the bug still shows."""
+    found = list[Mutant]()
+    for each in bug.again:
+        if len(found) < INNOCENT and apart(each, [bug.mutant, *found]):
+            with written([bug.mutant, *found, each]):
+                if forked(_changes, bench.good, bug.operator) is True:
+                    found.append(each)
+    return found
 
 
 def judge(bench: Bench, bug: Bug, wrong: bool, seed: int) -> None:

@@ -23,6 +23,7 @@ from dataflow.blame.links import Chain, Effect, Link, Way
 from dataflow.blame.nudge import nudged
 from dataflow.blame.others import ANOTHER, Others, Taken, without
 from dataflow.blame.split import split
+from dataflow.execution.feeds.playable import span_of
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph
 from dataflow.graph.reach import upstream
@@ -114,8 +115,8 @@ class Blame:
 
     def _target(self) -> Chain:
         stream = self._stream(self._field.stream)
-        begins = [i.first for i in self._recording.streams.values() if i.first is not None and not i.static]
-        until = min(begins, default=0) + round(self._field.seconds * 1e9)
+        origin, end = span_of(self._recording, self._recording.streams) or (0, 0)
+        until = origin + round(self._field.seconds * 1e9)
         maker = self.graph.streams[stream].node
         node = self.graph.nodes[maker]
         if node.source or node.external:
@@ -143,8 +144,7 @@ class Blame:
         if value is None:
             raise BlameError(f"{stream} at {emission.stamp} ns has no {self._field.path.lstrip('.')}: {message!r}")
         self._value = value
-        late = until > max((i.last for i in self._recording.streams.values() if i.last is not None), default=until)
-        return Chain(target, (stream, record.incarnation, emission.seq), emission.stamp, value, late)
+        return Chain(target, (stream, record.incarnation, emission.seq), emission.stamp, value, until > end)
 
     def _stream(self, name: str) -> str:
         streams = {stream: stream for stream in self.graph.streams} | dict(self.graph.aliases)

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dataflow.capture.captured import BEFORE, Captured, Change, Outcome, Predicate, Setting, Shot
-from dataflow.capture.reduce import shortest_end, smallest
 from dataflow.capture.repeats import NotRepeated, check_repeats
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Fired
+from dataflow.debugging.reduce import shortest_end, smallest
 from dataflow.execution.failure import place_of, readable
 from dataflow.messages.base import Message
 from dataflow.recording import Recording

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 WALL = "wall clock"
 MONOTONIC = "monotonic clock"
-COMPILED = "clock read by compiled code"
+COMPILED = "clock read by compiled code or at an import"
 RANDOM = "random"
 NUMPY = "numpy's generator"
 UUID = "uuid"
@@ -37,7 +37,10 @@ class Source:
 SOURCES = {
     WALL: Source("the time of day", "the stamp of an input, or context.stamp"),
     MONOTONIC: Source("how long something took", "context.stamp; for elapsed time self.log or a summary"),
-    COMPILED: Source("a clock that compiled code reads", "a call of the library that is given the time"),
+    COMPILED: Source(
+        "a clock that compiled code reads, or a library when it is loaded",
+        "a call of the library that is given the time",
+    ),
     RANDOM: Source("random numbers that nothing seeded", "self.rng, within setup() or process()"),
     NUMPY: Source("numbers of a numpy generator that nothing seeded", "self.rng, within setup() or process()"),
     UUID: Source("a random identifier", "self.rng.bytes(16), or a count kept in the state"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -82,8 +82,8 @@ class Why:
     `cleared` sources were tried without effect; `reads` are those of chance among them, with the lines. Of each group
     in `open` one has an effect, `left_out` could not be tried, with the reason. `changed` are facts that the recording
     holds and that differ now; `also`: sources that have an effect, and need not differ from those of the recording:
-    files and folders that are older than it, and all others where the operator itself was changed. `code_known`: it
-    holds digests of the operator's code. `seconds` in all."""
+    files and folders that are older than it, and all others where the operator, or a file that it reads, was changed.
+    `code_known`: it holds digests of the operator's code. `seconds` in all."""
 
     operator: str
     refused: str = ""
@@ -99,6 +99,11 @@ class Why:
     code_known: bool = False
     reruns: int = 0
     seconds: float = 0.0
+
+    @property
+    def chance(self) -> bool:
+        """Returns whether its results differ from run to run, or would but for chance."""
+        return self.repeats is False or any(cause.kind in CHANCE for cause in (*self.causes, *self.also))
 
     def as_json(self) -> dict[str, Any]:
         plain = asdict(replace(self, causes=(), also=(), reads=(), left_out=dict(self.left_out or {})))
@@ -164,7 +169,13 @@ def refusal(report: VerifyReport, operator: str, found: Verification | None) -> 
 def _answer(findings: Findings, alone: _Alone, wrote: Rerun | None, found: Verification, revised: bool) -> Why:
     """Returns the answer from an operator's findings; `revised`: it is not itself as it was recorded."""
     effective = [_cause(source, findings.first, findings.left) for source in findings.causes]
-    causes = [cause for cause in effective if _explains(cause, findings, alone, found, revised)]
+    newer = {
+        cause.source
+        for cause in effective
+        if findings.repeats and cause.kind in (FILE, FOLDER) and alone.is_newer(name_of(cause.source), found)
+    }
+    as_it_was = not revised and not newer
+    causes = [cause for cause in effective if _explains(cause, findings, newer, as_it_was=as_it_was)]
     first = [] if wrote is None else [_cause(INPUT, wrote)]
     reads = [_cause(source, findings.first) for source in findings.cleared if source in CHANCE]
     return Why(
@@ -180,15 +191,12 @@ def _answer(findings: Findings, alone: _Alone, wrote: Rerun | None, found: Verif
     )
 
 
-def _explains(cause: Cause, findings: Findings, alone: _Alone, found: Verification, revised: bool) -> bool:
+def _explains(cause: Cause, findings: Findings, newer: Collection[str], *, as_it_was: bool) -> bool:
     """Returns whether a source on which results depend explains why they are not the recorded ones: it makes them
-    differ from run to run, it is newer than the recording, or all that the recording holds of the operator is as it
-    was."""
-    if not findings.repeats:
+    differ from run to run, it is `newer` than the recording, or all that is known of the operator is as it was."""
+    if not findings.repeats or cause.source in newer:
         return True
-    if cause.kind in (FILE, FOLDER):
-        return alone.is_newer(name_of(cause.source), found)
-    return not revised
+    return as_it_was and cause.kind not in (FILE, FOLDER)
 
 
 def _cause(source: str, rerun: Rerun | None, left: tuple[str, ...] = ()) -> Cause:

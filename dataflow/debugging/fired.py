@@ -110,13 +110,22 @@ class Fired:
             "error": self.error,
         }
 
-    @property
-    def silent(self) -> bool:
-        """Returns whether an input or an output has nothing in this call."""
+    def names_then(self) -> dict[str, Any]:
+        """Names for an expression about the call as it was recorded; an output that was not stored is None."""
+        then = {made.port: made.recorded for made in self.made}
+        out = SimpleNamespace(**dict.fromkeys(self.ports) | then)
+        return self.names() | {"out": out, "same": True, "error": self.recorded_error}
+
+    def lacks_for(self, error: BaseException) -> bool:
+        """Returns whether an error of an expression comes of an input or an output that has nothing in this call: of
+        None as if it were a message, or of the first, the last or the largest of no messages."""
         given = dict.fromkeys(self.takes) | dict(self.inputs)
         made = dict.fromkeys(self.ports) | dict(self.outputs)
         values = [*given.values(), *made.values()]
-        return any(value is None or (isinstance(value, tuple | Mapping) and not value) for value in values)
+        if isinstance(error, AttributeError | TypeError):
+            return "'NoneType'" in str(error) and any(value is None for value in values)
+        empty = any(isinstance(value, tuple | Mapping) and not value for value in values)
+        return isinstance(error, LookupError | ValueError) and empty
 
     def as_json(self, operator: str, origin: int) -> dict[str, Any]:
         """Returns the call of an operator as JSON values; the stamps of messages are counted from `origin` (ns)."""

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,9 +16,11 @@ from types import FrameType
 from dataflow.debugging.debugger import Debugger
 from dataflow.debugging.fired import Call, Fired
 from dataflow.debugging.lines import Lines, homes_of, is_own
+from dataflow.debugging.reduce import needed, smallest
 from dataflow.execution.failure import OperatorFailure
 from dataflow.graph.code import ReloadError, code_now, digest_of, other_texts, stored
-from dataflow.graph.model import OperatorImportError
+from dataflow.graph.model import Node, OperatorImportError
+from dataflow.operator import Operator, ParameterError, validate_parameters
 from dataflow.recording import Recording
 from dataflow.records.cuts import code_in
 from dataflow.records.reading import FiringLog
@@ -41,7 +43,8 @@ Place = tuple[str, int]
 class Change:
     """Lines `first` to `last` of a file, which hold `here` and held `recorded`; `last` is before `first` where lines
     are missing in front of `first`. `ran`: one of them ran in the call. `mends`: without this change alone the call
-    gives what was recorded; None where it was not tried, or cannot be without it."""
+    gives what was recorded; None where it was not tried, or cannot be without it. `together`: it is one of a smallest
+    set without which the call gives what was recorded, where no change does alone."""
 
     module: str
     file: str
@@ -51,6 +54,7 @@ class Change:
     recorded: str
     ran: bool
     mends: bool | None = None
+    together: bool = False
 
 
 @dataclass(frozen=True)
@@ -58,8 +62,9 @@ class Suspects:
     """Holds what can have made a call other than recorded.
 
     `raised`: where its error was raised, the innermost line of the operator's source. `modules`: of each one that
-    differs, where its recorded text was found; None where it was not. `changes`: those that mend the call first, then
-    those that ran. `ran`: the lines that ran in the call; `alone`: those that ran in none of the `BEFORE` calls before.
+    differs, where its recorded text was found; None where it was not. `changes`: those that mend the call, alone or
+    together, first, then those that ran. `ran`: the lines that ran in the call; `alone`: those that ran in none of the
+    `BEFORE` calls before.
     """
 
     number: int
@@ -85,16 +90,13 @@ def suspects(recording: Recording, debugger: Debugger, number: int) -> Suspects:
         fired = debugger.goto(each, Lines(at_line, homes).through, touched=lambda: False)
         ran.append(frozenset(places))
     modules, texts, changes = _changes(recording, debugger, fired.call, ran[-1])
-    tried = [
-        replace(change, mends=_mends(recording, debugger, fired, undone) if k < MOST_TRIED else None)
-        for k, (change, undone) in enumerate(_undone(changes, texts))
-    ]
+    tried = _tried(changes, lambda undone: _mends(recording, debugger, fired, _without(undone, texts)))
     return Suspects(
         number=fired.number,
         same=fired.same,
         raised=_raised(fired, homes),
         modules=modules,
-        changes=tuple(sorted(tried, key=lambda c: (not c.mends, not c.ran))),
+        changes=tuple(sorted(tried, key=lambda c: (not c.mends, not c.together, not c.ran))),
         ran=ran[-1],
         alone=ran[-1].difference(*ran[:-1]),
     )
@@ -150,24 +152,53 @@ def _differing(name: str, file: str, then: list[str], here: list[str], ran: froz
             yield Change(name, file, first + 1, last, "".join(here[first:last]), "".join(then[i:j]), touched)
 
 
-def _undone(changes: list[Change], texts: Mapping[str, list[str]]) -> Iterator[tuple[Change, dict[str, bytes]]]:
-    """Yields each change, those that ran first, with the text of its module without it."""
-    for change in sorted(changes, key=lambda each: not each.ran):
-        lines = texts[change.module]
-        kept = "".join([*lines[: change.first - 1], change.recorded, *lines[change.last :]])
-        yield change, {change.module: kept.encode()}
+def _tried(changes: list[Change], mends: Callable[[Sequence[Change]], bool | None]) -> list[Change]:
+    """Returns the changes, those that ran first, with what the call gives without each; where it gives what was
+    recorded without none of them alone, with the smallest set that is found."""
+    ordered = sorted(changes, key=lambda each: not each.ran)
+    found = [replace(each, mends=mends([each])) for each in ordered[:MOST_TRIED]] + ordered[MOST_TRIED:]
+    if len(found) < 2 or any(each.mends for each in found):
+        return found
+    left = MOST_TRIED
+
+    def shows(undone: Sequence[Change]) -> bool:
+        nonlocal left
+        left -= 1
+        return left >= 0 and bool(undone) and mends(undone) is True
+
+    if not shows(found):
+        return found
+    together = smallest(needed(found, shows), shows)
+    return [replace(each, together=left >= 0 and each in together) for each in found]
+
+
+def _without(undone: Iterable[Change], texts: Mapping[str, list[str]]) -> dict[str, bytes]:
+    """Returns the texts of modules without some changes."""
+    found = {change.module: list(texts[change.module]) for change in undone}
+    for change in sorted(undone, key=lambda each: each.first, reverse=True):
+        found[change.module][change.first - 1 : change.last] = [change.recorded]
+    return {module: "".join(lines).encode() for module, lines in found.items()}
 
 
 def _mends(recording: Recording, debugger: Debugger, fired: Fired, texts: Mapping[str, bytes]) -> bool | None:
     """Returns whether the call gives what was recorded with other texts of modules."""
+    node, here = debugger.node, debugger.node.operator
     try:
-        with (
-            other_texts(debugger.node, texts),
-            closing(Debugger(recording, debugger.node.name, debugger.graph)) as again,
-        ):
-            return again.goto(fired.number).same
-    except (ReloadError, OperatorImportError, ReplayError, OperatorFailure):  # it cannot be made with them
+        with other_texts(node, texts):
+            nodes = {**debugger.graph.nodes, node.name: _with_defaults(node, here)}
+            with closing(Debugger(recording, node.name, replace(debugger.graph, nodes=nodes))) as again:
+                return again.goto(fired.number).same
+    except (ParameterError, ReloadError, OperatorImportError, ReplayError, OperatorFailure):  # it cannot be made so
         return None
+
+
+def _with_defaults(node: Node, before: type[Operator]) -> Node:
+    """Returns a node with the defaults of its class as it is now where it has those of the class before."""
+    fields = before.spec.parameters.model_fields
+    needed = {name: value for name, value in node.params.items() if fields[name].is_required()}
+    defaults = validate_parameters(before, needed).model_dump(mode="json")
+    given = {name: value for name, value in node.params.items() if name in needed or value != defaults[name]}
+    return replace(node, params=validate_parameters(node.operator, given).model_dump(mode="json"))
 
 
 def _raised(fired: Fired, homes: tuple[Path, ...]) -> Place | None:

@@ -73,6 +73,11 @@ class Branch:
             raise ReplayError(f"{waiting[0].node.name} waits for {waiting[0].waiting()} after all was given")
         return {name: found[-1].detail.get("summary", {}) for name, found in self.records.items()}
 
+    def close(self) -> None:
+        """Closes the operators."""
+        for player in self._players.values():
+            player.close()
+
 
 class _Read:
     """A recording that stays open, always asked for the same messages, which are kept where they are not too many."""
@@ -137,23 +142,33 @@ class HeldRunner(OperatorRunner):
             emitter,
             static=graph.static,
             seed=graph.seed,
-            operator=player.calls.operator,
+            operator=player.operator.shell,
             lossy=True,
         )
         self.calls = PlayedCalls(player)
         self._watched = 0
         self._held = {(loss.stream, loss.stamp): loss for loss in held}
+        self._holds = {loss.stream for loss in held}
         self._behind: dict[str, deque[Arrival]] = {}
         self._ticks = {loss.stamp for loss in held if loss.input == TICK}
 
     def push(self, stream: str, entry: Entry) -> None:
-        self._take(stream, entry)
+        if stream in self._holds:
+            self._take(stream, entry)
+        else:
+            super().push(stream, entry)
 
     def advance(self, stream: str, frontier: int) -> None:
-        self._take(stream, Promise(frontier))
+        if stream in self._holds:
+            self._take(stream, Promise(frontier))
+        else:
+            super().advance(stream, frontier)
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        self._take(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
+        if stream in self._holds:
+            self._take(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
+        else:
+            super().end(stream, final_stamp, reason)
 
     def _take(self, stream: str, arrival: Arrival) -> None:
         if behind := self._behind.get(stream):

@@ -9,10 +9,10 @@ from typing import Any
 
 import xxhash
 
+from dataflow.drops.distant import operator_of
 from dataflow.execution.calls import Calls, Place
-from dataflow.execution.effects.journal import EFFECTS, RecordedJournal
-from dataflow.execution.restarts import close_quietly
-from dataflow.graph.model import Node
+from dataflow.execution.effects.journal import EFFECTS
+from dataflow.graph.model import Graph, Node
 from dataflow.messages.base import Message
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.reexecution.recorded_run import ReplayError
@@ -53,12 +53,11 @@ class Given:
 class Player:
     """One operator, through all replays. Parameters change as in `records`, and effects get the answers in them."""
 
-    def __init__(self, node: Node, seed: int, version: int, records: Sequence[FiringRecord]) -> None:
+    def __init__(self, node: Node, graph: Graph, version: int, records: Sequence[FiringRecord]) -> None:
         self.node, self.stateless = node, node.operator.stateless
         self._parameters = _parameters_of(records)
         self._answers = {r.stamp: r.detail for r in records if r.kind in CALLS and EFFECTS in r.detail}
-        self._journal = RecordedJournal()
-        self.calls = Calls(node, node.make(), seed, version=version, effects=self._journal)
+        self.operator = operator_of(node, graph.seed, version, graph.threads)
         self.statics: Mapping[str, Message] | None = None
         self.known: dict[bytes, Mapping[str, Message]] = {}
         """Outputs by the past up to the call."""
@@ -75,7 +74,7 @@ class Player:
     def set_up(self) -> Mapping[str, Message]:
         """Sets the operator up, once; returns its static messages."""
         if self.statics is None:
-            self.statics, self._at = self.calls.setup(), _NEW
+            self.statics, self._at = self.operator.setup(), _NEW
         return self.statics
 
     def bring(self, given: Given) -> None:
@@ -87,11 +86,11 @@ class Player:
             k for k in range(len(pasts) - 1, -1, -1) if not k or pasts[k] in self._states or pasts[k] == self._at
         )
         if pasts[near] != self._at:
-            self._make_anew()
+            self.operator.anew()
             for _, name, value in self._due(NEVER, firings[near - 1].stamp if near else NEVER):
-                self.calls.parameter(name, value, (0, NEVER))
+                self.operator.parameter(name, value, (0, NEVER))
             if near:
-                self.calls.restore(self._states[pasts[near]], (0, firings[near - 1].stamp))
+                self.operator.restore(self._states[pasts[near]], (0, firings[near - 1].stamp))
             self._at = pasts[near]
         for k in range(near, len(pasts) - 1):
             self._call(firings[k], firings[k - 1].stamp if k else NEVER, pasts[k + 1])
@@ -121,45 +120,38 @@ class Player:
         due = self._due(NEVER if self.stateless else before, firing.stamp)
         if self.stateless:
             if len(due) < self._changed:
-                self._make_anew()
+                self.operator.anew()
                 self._changed = 0
             due, self._changed = due[self._changed :], len(due)
         for _, name, value in due:
-            self.calls.parameter(name, value, (0, firing.stamp - 1))
+            self.operator.parameter(name, value, (0, firing.stamp - 1))
         began = time.perf_counter()
         self._at = None
-        self._journal.begin(self._answers.get(firing.stamp, {}))
-        made = self.calls.process(firing)
+        made = self.operator.process(firing, self._answers.get(firing.stamp, {}))
         self.made += 1
         self._at = past
         self._worked += time.perf_counter() - began
         if self._worked >= SPACING and not self.stateless and past not in self._states:
             self._worked = 0.0
-            state = self.calls.snapshot((0, firing.stamp))
+            state = self.operator.snapshot((0, firing.stamp))
             if state is not None and self._state_bytes + len(state) <= MOST_BYTES:
                 self._states[past] = state
                 self._state_bytes += len(state)
         return made
-
-    def _make_anew(self) -> None:
-        close_quietly(self.calls.operator)
-        self.calls.operator = self.node.make()
-        self.calls.setup()
 
     def _due(self, after: int, until: int) -> Sequence[tuple[int, str, Any]]:
         return [change for change in self._parameters if after < change[0] <= until]
 
     def close(self) -> None:
         """Closes the operator."""
-        close_quietly(self.calls.operator)
+        self.operator.close()
 
 
 class PlayedCalls(Calls):
     """The calls of one replay, which a player makes."""
 
     def __init__(self, player: Player) -> None:
-        calls = player.calls
-        super().__init__(calls.node, calls.operator, calls.seed, version=calls.version, effects=calls.effects)
+        super().__init__(player.node, player.operator.shell, 0)
         self._player = player
         self._given = Given()
 
@@ -173,7 +165,7 @@ class PlayedCalls(Calls):
         past = self._given.pasts[-1]
         if past not in self._player.summaries:
             self._player.bring(self._given)
-            self._player.summaries[past] = self._player.calls.summary(place)
+            self._player.summaries[past] = self._player.operator.summary(place)
         return dict(self._player.summaries[past])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import math
 import re
 import time
@@ -13,7 +14,7 @@ from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.capture.reduce import needed, none_to_spare, shortest_end, smallest, thinned
+from dataflow.debugging.reduce import needed, none_to_spare, shortest_end, smallest, thinned
 from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, Sent, bursts_of, losses_of, sent_by
 from dataflow.drops.player import Player
@@ -30,6 +31,8 @@ from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, s
 from dataflow.sync import FOREVER, NEVER
 
 SECONDS = 60.0
+GROWS = 4
+"""Times as many bursts are tried next, where some do not suffice."""
 FUNCTIONS: Mapping[str, Callable[..., Any]] = {f.__name__: f for f in (abs, min, max, round, sum, len, any, all)}
 """Functions that an expression may call."""
 
@@ -154,7 +157,8 @@ class Drops:
     """Looks for the losses of a recorded run that made `worse` true of its figures.
 
     `budget`: seconds; `watch` gets the numbers of replays and of losses that may still be left. Runs operators in this
-    process. Raises `DropsError`, `ReplayError`, `OperatorFailure`, and SyntaxError for `worse`.
+    process, or in those of their environments. Raises `DropsError`, `ReplayError`, `OperatorFailure`, and SyntaxError
+    for `worse`.
     """
 
     def __init__(
@@ -166,6 +170,7 @@ class Drops:
         budget: float = SECONDS,
         watch: Callable[[int, int], None] = lambda replays, left: None,
     ) -> None:
+        self._began = time.monotonic()
         self._recording, self._budget, self._watch = recording, budget, watch
         self.graph = graph_that_is_here(recording)[0] if graph is None else graph
         self._log = FiringLog.read(recording)
@@ -174,25 +179,37 @@ class Drops:
         self.worse = Worse(worse, self._recorded)
         self._records = {name: list(self._log.ordered(self.graph.nodes[name])) for name in names}
         self.replays = 0
+        self._known: dict[frozenset[Loss], Figures | OperatorFailure | ReplayError] = {}
+        """By what was undone, what a replay gave."""
         self._players: list[Player] = []
+
+    def figures_without(self, undone: Sequence[Loss]) -> Figures:
+        """Returns the figures of one replay with some losses undone, by operators that are made anew."""
+        feeding, losses, _ = self._plan
+        branch = self._branch(feeding, losses)
+        try:
+            with limited_threads(self.graph.threads):
+                return branch.replay(frozenset(undone))
+        finally:
+            branch.close()
 
     def find(self) -> Cost:
         """Finds them."""
-        began = time.monotonic()
         if not self.worse.is_true(self._recorded):
             raise DropsError(
                 f"the recorded figures are not {self.worse.text}: {_said(self.worse.values(self._recorded))}"
             )
-        feeding, losses, sent = self._plan()
+        feeding, losses, sent = self._plan
         if not losses:
             raise NothingLost("nothing was lost, or came late, between the sources and these figures")
         branch = self._branch(feeding, losses)
         try:
             with limited_threads(self.graph.threads):
-                return self._search(branch, feeding, bursts_of(losses, sent), began)
+                return self._search(branch, feeding, bursts_of(losses, sent))
         finally:
-            self._close()
+            branch.close()
 
+    @functools.cached_property
     def _plan(self) -> tuple[Feeding, list[Loss], Sent]:
         """The operators between losses and figures, with what feeds them, the losses, and the messages sent."""
         graph = self.graph
@@ -229,13 +246,13 @@ class Drops:
     def _branch(self, feeding: Feeding, losses: Sequence[Loss]) -> Branch:
         version = seeding_of(self._recording)
         players = {
-            name: Player(self.graph.nodes[name], self.graph.seed, version, self._records.get(name, ()))
+            name: Player(self.graph.nodes[name], self.graph, version, self._records.get(name, ()))
             for name in feeding.operators
         }
         self._players += players.values()
         return Branch(self._recording, self.graph, feeding, players, losses)
 
-    def _search(self, branch: Branch, feeding: Feeding, bursts: Sequence[Sequence[Loss]], began: float) -> Cost:
+    def _search(self, branch: Branch, feeding: Feeding, bursts: Sequence[Sequence[Loss]]) -> Cost:
         losses = _flat(bursts)
         before = self._replay(branch, ())
         self._check(branch, before)
@@ -247,7 +264,7 @@ class Drops:
 
         def heals(part: Sequence[Loss]) -> bool:
             nonlocal in_time
-            if time.monotonic() > began + self._budget:
+            if time.monotonic() > self._began + self._budget:
                 in_time = False
                 return False
             self._watch(self.replays, len(part))
@@ -259,12 +276,14 @@ class Drops:
         def heal(part: Sequence[Sequence[Loss]]) -> bool:
             return heals(_flat(part))
 
-        named = _flat(needed(shortest_end(sorted(bursts, key=len), heal), heal))  # the longest of them at first
+        # The longest at first; of those that suffice the last: a replay makes the calls behind its first difference.
+        suffice = shortest_end(sorted(bursts, key=len), heal, GROWS)
+        named = _flat(needed(sorted(suffice), heal))
         if in_time and len(named) > 1:
             named = _reduced(named, heals)
         undone = self._replay(branch, named)
-        again = self._branch(feeding, losses)
-        if self.worse.values(self._replay(again, named)) != self.worse.values(undone):
+        self.replays += 1
+        if self.worse.values(self.figures_without(named)) != self.worse.values(undone):
             raise DropsError("two equal replays do not give equal figures: dataflow verify --why shows what differs")
         return Cost(
             named=named,
@@ -278,12 +297,22 @@ class Drops:
             not_sent=self._not_sent(),
             replays=self.replays,
             calls=sum(player.made for player in self._players),
-            seconds=time.monotonic() - began,
+            seconds=time.monotonic() - self._began,
         )
 
     def _replay(self, branch: Branch, undone: Sequence[Loss]) -> Figures:
-        self.replays += 1
-        return branch.replay(frozenset(undone))
+        """Returns the figures of a replay; those of an equal one that was made before. Raises what it raised."""
+        asked = frozenset(undone)
+        if asked not in self._known:
+            self.replays += 1
+            try:
+                self._known[asked] = branch.replay(asked)
+            except (OperatorFailure, ReplayError) as error:
+                self._known[asked] = error
+        found = self._known[asked]
+        if isinstance(found, Exception):
+            raise found
+        return found
 
     def _check(self, branch: Branch, figures: Figures) -> None:
         """Raises `DropsError` where a replay with all losses is not what was recorded: then one without them would show
@@ -314,10 +343,6 @@ class Drops:
         sources = [records for name, records in self._records.items() if self.graph.nodes[name].source]
         details = [r.detail for records in sources for r in records if r.kind in ("fire", "finish")]
         return sum(n for detail in details for n in detail.values() if type(n) is int)
-
-    def _close(self) -> None:
-        for player in self._players:
-            player.close()
 
 
 def _reduced(named: Sequence[Loss], heals: Callable[[Sequence[Loss]], bool]) -> list[Loss]:

@@ -135,6 +135,11 @@ def is_environment(env: str) -> bool:
     return str(_folder(env)) == os.environ.get(_MARK, "").partition(os.pathsep)[0]
 
 
+def in_same(variables: Mapping[str, str]) -> bool:
+    """Returns whether a process with these variables is in the environment that this one is in."""
+    return variables.get(_MARK) == os.environ.get(_MARK)
+
+
 def imported_packages() -> dict[str, str]:
     """Returns the versions of the environment's packages of which this process has imported something, by name; none
     in a process that is in no environment."""

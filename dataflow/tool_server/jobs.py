@@ -10,13 +10,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dataflow.environments import EnvError, Environment
+from dataflow.environments import EnvError, Environment, in_same
 from dataflow.execution.threads import environment
 from dataflow.text import json_text
 
@@ -38,8 +38,8 @@ MOST_BYTES = 8000
 """Of an answer, in UTF-8."""
 NOTE = 200
 """Bytes of it for the note that there is more."""
-OF_ONE_OPERATOR = frozenset(("goto", "diff", "state", "lines", "history", "what_if", "capture"))
-"""Tools that make the calls of one operator, in its environment."""
+OF_ONE_OPERATOR = frozenset(("goto", "diff", "state", "lines", "history", "what_if", "capture", "mended"))
+"""Tools, and parts of them, that make the calls of one operator, in its environment."""
 PRINTED = 2000
 """Characters that are shown of what operators printed."""
 
@@ -138,7 +138,7 @@ class Jobs:
             timer = threading.Timer(LONGEST, _end, [process])
             timer.start()
             try:
-                found = _converse(process, job, arguments)
+                found = _converse(process, job.tool, arguments, lambda text: setattr(job, "progress", text))
             finally:
                 timer.cancel()
                 _end(process)
@@ -207,12 +207,34 @@ def _env_of(tool: str, arguments: Mapping[str, Any], recording: Recording, graph
         return None
 
 
-def _converse(process: subprocess.Popen[str], job: Job, arguments: Mapping[str, Any]) -> dict[str, Any] | None:
+def answered_there(part: Callable[..., Any], arguments: Mapping[str, Any], say: Callable[[str], None]) -> Any:
+    """Answers a part of a tool in the environment of its operators: in this process where it is in that.
+
+    Raises what the part raises, as `Refused` from another process, and `Refused` where there is no such environment.
+    """
+    tool = part.__name__
+    python, variables = place_of(tool, arguments)
+    if in_same(variables):
+        return part(**arguments, say=say)
+    command = [python, "-P", "-m", "dataflow.tool_server.work"]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env=variables, **pipes) as process:  # it ends with the group of this one
+        found = _converse(process, tool, arguments, say)
+    if found is None:
+        raise Refused(f"the process of {tool} in {python} ended without an answer ({process.returncode})")
+    if "error" in found:
+        raise Refused(found["error"])
+    return found["answer"]
+
+
+def _converse(
+    process: subprocess.Popen[str], tool: str, arguments: Mapping[str, Any], say: Callable[[str], None]
+) -> dict[str, Any] | None:
     """Returns the last line of a process; None where it ended without one."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:
-        process.stdin.write(json.dumps({"tool": job.tool, "arguments": arguments}) + "\n")
+        process.stdin.write(json.dumps({"tool": tool, "arguments": arguments}) + "\n")
         process.stdin.close()
     except BrokenPipeError:  # it has ended
         return None
@@ -220,7 +242,7 @@ def _converse(process: subprocess.Popen[str], job: Job, arguments: Mapping[str, 
         found: dict[str, Any] = json.loads(line)
         if "progress" not in found:
             return found
-        job.progress = found["progress"]
+        say(found["progress"])
     return None
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from dataflow.debugging.debugger import Debugger
 from dataflow.debugging.fired import Fired
 from dataflow.debugging.suspects import recorded_code, recorded_text
+from dataflow.environments import EnvError
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.graph.code import ReloadError, other_texts
 from dataflow.graph.model import Graph, OperatorImportError
@@ -148,5 +149,5 @@ def _differs_as_recorded(recording: Recording, graph: Graph, v: Verification) ->
     try:
         with other_texts(node, texts), closing(Debugger(recording, v.operator, graph)) as debugger:
             return debugger.first_difference() is not None
-    except (ReloadError, OperatorImportError, ReplayError, OperatorFailure):
+    except (EnvError, ReloadError, OperatorImportError, ReplayError, OperatorFailure):
         return None

@@ -11,6 +11,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dataflow.execution.failure import cut
+
 if TYPE_CHECKING:
     from dataflow.debugging.debugger import Debugger
     from dataflow.debugging.fired import Fired
@@ -110,14 +112,15 @@ def state(
 
 
 def lines(
-    recording: str, operator: str, call: str = "diff", graph: str | None = None, path: list[str] | None = None
+    recording: str, operator: str, call: CallName = "diff", graph: str | None = None, path: list[str] | None = None
 ) -> Any:
     """Name the lines that can have made a call of an operator other than recorded (`call` as in `goto`).
 
     `changes`: where the operator's code differs from that which was recorded, as far as that is in git's commits or was
-    replaced by a reload (`recorded_code`); first those without which the call gives what was recorded (`mends`), then
-    those that ran in it. `raised`: the line of its error. `alone`: the lines that ran in it and in none of the 8
-    calls before. `ran`, where there are no changes: all its lines.
+    replaced by a reload (`recorded_code`); first those without which the call gives what was recorded (`mends`), or a
+    smallest set of them where that takes several (`together`), then those that ran in it. `raised`: the line of its
+    error. `alone`: the lines that ran in it and in none of the 8 calls before. `ran`, where there are no changes: all
+    its lines.
     """
     from dataflow.debugging.suspects import ranges, suspects
 
@@ -155,14 +158,18 @@ def history(
         code = _compiled("field", field)
         begin, end = (debugger.number(number) for number in (first, last))
         values: list[dict[str, Any]] = []
+        before: Any = None
 
         def visit(fired: Fired) -> bool:
+            nonlocal before
             try:
-                value = _text(eval(code, fired.names()))
+                value = eval(code, fired.names())
+                shown = _text(value)
             except Exception as error:  # such as of an output that this call did not make
-                value = {"error": readable(error)}
-            if not values or value != values[-1]["value"]:
-                values.append({"call": fired.number, "stamp": fired.call.stamp, "value": value})
+                value = shown = {"error": readable(error)}
+            if not values or not _alike(value, before):
+                values.append({"call": fired.number, "stamp": fired.call.stamp, "value": shown})
+            before = value
             return len(values) == MOST_CALLS
 
         found = debugger.until(visit, first=begin, last=end)
@@ -306,43 +313,70 @@ def prove(
     is recorded there, too. Operators that do not repeat with the recorded code either are named, and not judged.
     Nothing is proven where calls could not be made again.
     """
+    from dataflow.recording import Recording
+    from dataflow.reexecution.recorded_run import graph_that_is_here
+    from dataflow.tool_server.jobs import answered_there
     from dataflow.tool_server.proof import judge
 
-    expected, _ = _compiled("expect", expect), _compiled("may_change", may_change)
-    with _debugger(recording, operator, graph, params) as (debugger, origin, opened):
-        fired = _at(debugger, origin, call)
-        number, name, changed_graph = fired.number, debugger.node.name, debugger.graph
-        if right is None and not _named_in(expect) & _names(fired).keys():
-            raise ToolError(f"expect={expect!r} names nothing of the call, such as out: expected what is right in it")
-        meets, differs = bool(_evaluated(expected, expect, _names(fired))), not fired.same
-        shown = _shown(fired, debugger, origin)
-        say(f"call {number} of {name} made again; all its calls follow")
-        changes = _changes(debugger, number, expect, may_change)
-        say("all operators are verified")
-        with_graph = changed_graph if graph or params else None
+    asked = {"recording": recording, "operator": operator, "call": call, "expect": expect, "may_change": may_change}
+    made = answered_there(mended, asked | {"alone": right is None, "params": params, "graph": graph, "path": path}, say)
+    name, number, with_graph = made["operator"], made["call"], _loaded(graph)
+    say("all operators are verified")
+    with Recording(_file(recording)) as opened:
+        with_graph = _with(with_graph, opened, operator, params) if params else with_graph
         report = _verify(_file(recording), None, with_graph)
-        others = judge(opened, report, changed_graph, name)
+        others = judge(opened, report, graph_that_is_here(opened)[0] if with_graph is None else with_graph, name)
     of_right = "identical" if right is None else _verdict(_file(right), name, with_graph)
-    first = changes.changed[:MOST_CHANGED]
     reasons = [
-        *(() if differs else [f"call {number} still gives what was recorded"]),
-        *(() if meets else [f"call {number}: expect is false: {expect}"]),
-        *([f"calls raise what is not recorded: {raised}"] if (raised := dict(changes.raised[:MOST_ERRORS])) else ()),
-        *([f"calls that may not change do: {changes.refused[:MOST_CHANGED]}"] if changes.refused else ()),
-        *([] if debugger.unmade is None else [f"{name}: {debugger.unmade}"]),
+        *(() if made["differs"] else [f"call {number} still gives what was recorded"]),
+        *(() if made["meets"] else [f"call {number}: expect is false: {expect}"]),
+        *([f"calls raise what is not recorded: {dict(raised[:MOST_ERRORS])}"] if (raised := made["raised"]) else ()),
+        *([f"calls that may not change do: {made['refused'][:MOST_CHANGED]}"] if made["refused"] else ()),
+        *([f"{name}: {made['unmade']}"] if made["unmade"] else ()),
         *([f"{name} does not repeat: it differs each time"] if report.repeats(name) is False else ()),
         *([f"other operators: {others.reasons}"] if others.reasons else ()),
         *([f"{name} in {right}: {of_right}"] if of_right != "identical" else ()),
     ]
+    changed = made["changed"]
     return {
         "proven": not reasons,
         "reasons": reasons,
         "do_not_repeat": others.unrepeated,
-        "changed_calls": {"count": len(changes.changed), "of": len(debugger.calls), "first": first}
-        | _not_made(debugger),
+        "changed_calls": {"count": len(changed), "of": made["calls"], "first": changed[:MOST_CHANGED]}
+        | made["not_made"],
         "other_operators": _by_verdict(report, name),
-        "call": shown,
+        "call": made["shown"],
     }
+
+
+def mended(
+    recording: str,
+    operator: str,
+    call: CallName,
+    expect: str,
+    may_change: str,
+    alone: bool,
+    params: dict[str, Any] | None,
+    graph: str | None,
+    path: list[str] | None,
+    *,
+    say: Say,
+) -> Any:
+    """Make all calls of an operator that was mended, for `prove`. `alone`: there is no recording of right code."""
+    expected, _ = _compiled("expect", expect), _compiled("may_change", may_change)
+    with _debugger(recording, operator, graph, params) as (debugger, origin, _):
+        fired = _at(debugger, origin, call)
+        number = fired.number
+        if alone and _is_true_then(expected, fired):
+            told = "is true of what was recorded as well: expected what is right in this call, and was not"
+            raise ToolError(f"expect={expect!r} {told}")
+        meets, differs = bool(_evaluated(expected, expect, _names(fired))), not fired.same
+        shown = _shown(fired, debugger, origin)
+        say(f"call {number} of {debugger.node.name} made again; all its calls follow")
+        changes = _changes(debugger, number, expect, may_change)
+        found = {"operator": debugger.node.name, "call": number, "calls": len(debugger.calls), "shown": shown}
+        unmade = {"unmade": str(debugger.unmade or ""), "not_made": _not_made(debugger)}
+        return found | unmade | {"meets": meets, "differs": differs} | asdict(changes)
 
 
 def _changes(debugger: Debugger, number: int, expect: str, may_change: str) -> Changes:
@@ -363,8 +397,12 @@ TOOLS: Mapping[str, Callable[..., Any]] = {
 }
 
 
+PARTS: Mapping[str, Callable[..., Any]] = {"mended": mended}
+"""Parts of tools that have their own process."""
+
+
 def answer(name: str, arguments: Mapping[str, Any], say: Say) -> Any:
-    """Answers one call of a tool by values that JSON can hold. Raises what the library raises."""
+    """Answers one call of a tool, or of a part of one, by values that JSON can hold. Raises what the library raises."""
     import inspect
 
     from dataflow.graph.search import add_current_folder, add_folder
@@ -374,7 +412,7 @@ def answer(name: str, arguments: Mapping[str, Any], say: Say) -> Any:
             raise ToolError(f"path: no such folder: {folder}")
         add_folder(folder)
     add_current_folder()
-    tool = TOOLS[name]
+    tool = {**TOOLS, **PARTS}[name]
     more = {"say": say} if "say" in inspect.signature(tool).parameters else {}
     return tool(**arguments, **more)
 
@@ -460,12 +498,13 @@ def _with(graph: Graph | None, recording: Recording, operator: str, params: Mapp
     from dataflow.reexecution.recorded_run import graph_that_is_here
 
     graph = graph_that_is_here(recording)[0] if graph is None else graph
-    node = graph.nodes.get(operator)
-    if node is None:
+    names = [name for name in graph.nodes if name == operator or name.endswith(f"/{operator}")]
+    if len(names) != 1:
         raise ToolError(f"no operator {operator!r} in the graph; there are: {', '.join(sorted(graph.nodes))}")
+    node = graph.nodes[names[0]]
     changed = {**node.params, **params}
     validate_parameters(node.operator, changed)
-    return replace(graph, nodes={**graph.nodes, operator: replace(node, params=changed)})
+    return replace(graph, nodes={**graph.nodes, node.name: replace(node, params=changed)})
 
 
 def _at(debugger: Debugger, origin: int, call: CallName) -> Fired:
@@ -506,20 +545,49 @@ def _names(fired: Fired) -> dict[str, Any]:
 
 
 def _text(value: Any) -> Any:
+    """A value as JSON has it: numbers as they are, those of numpy by their own digits, anything else in words."""
+    import numpy as np
+
     from dataflow.messages.display.text import field_text
 
+    if isinstance(value, np.floating):
+        return float(str(value))
+    if isinstance(value, np.bool_ | np.integer):
+        return value.item()
     return value if value is None or isinstance(value, bool | int | float) else field_text(value)
+
+
+def _alike(value: Any, other: Any) -> bool:
+    """Returns whether two values of an expression are the same; NaN is the same as NaN."""
+    import numpy as np
+
+    if isinstance(value, np.ndarray) and isinstance(other, np.ndarray):
+        return (value.dtype, value.shape) == (other.dtype, other.shape) and value.tobytes() == other.tobytes()
+    try:
+        return bool(value == other or (value != value and other != other))
+    except Exception:  # such as an array beside a number
+        return False
 
 
 def _compiled(argument: str, text: str) -> Any:
     try:
         return compile(text, f"<{argument}>", "eval")
-    except SyntaxError as error:
-        raise ToolError(f"{argument}={text!r}: no Python expression: {error.msg}") from None
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        told = getattr(error, "msg", "") or str(error) or type(error).__name__
+        raise ToolError(f"{argument}={cut(text, 200)!r}: no Python expression: {told}") from None
 
 
 def _named_in(expression: str) -> set[str]:
     return {node.id for node in ast.walk(ast.parse(expression, mode="eval")) if isinstance(node, ast.Name)}
+
+
+def _is_true_then(code: Any, fired: Fired) -> bool:
+    """Returns whether an expression is true of a call as it was recorded, as far as that is known: not the state behind
+    it, nor what is in no recorded stream."""
+    try:
+        return bool(eval(code, fired.names_then() | {"before": fired.states()[0]}))
+    except Exception:  # it needs what is not known, or what the recorded call did not make
+        return False
 
 
 def _evaluated(code: Any, text: str, names: dict[str, Any]) -> Any:

@@ -24,22 +24,32 @@ def env_of_calls(recording: Recording, graph: Graph, operator: str) -> Environme
 
 def env_of_chain(graph: Graph, stream: str) -> Environment | None:
     """Returns the environment of the operators that decide a stream, by the end of its name: its own and those in front
-    of it. Raises `EnvError` where its own has one and another runs elsewhere."""
+    of it; None: that of this installation. Raises `EnvError` where they have several."""
     makers = [graph.streams[name].node for name in _ending(graph.streams, stream)]
-    if len(makers) != 1 or (env := graph.nodes[makers[0]].env) is None:
+    if len(makers) != 1:
         return None
-    others = {
-        name: graph.nodes[name].env or "that of dataflow itself"
-        for name in sorted(upstream(graph, makers))
-        if not (graph.nodes[name].source or graph.nodes[name].external) and graph.nodes[name].env != env
-    }
-    if others:
-        named = ", ".join(f"{name!r} ({where})" for name, where in others.items())
+    envs = _envs_of_chain(graph, makers[0])
+    env = envs.pop(makers[0], None)
+    if others := {name: where for name, where in envs.items() if where != env}:
+        named = ", ".join(f"{name!r} ({_called(where)})" for name, where in others.items())
+        whole = [name for name in envs if len({*_envs_of_chain(graph, name).values()}) == 1]
         raise EnvError(
-            f"{makers[0]!r} runs in the environment {env!r}, and what is in front of it in others: {named}; one "
-            "process cannot make the calls of all"
+            f"{makers[0]!r} runs in the environment {_called(env)}, and what is in front of it in others: {named}; one "
+            f"process cannot make the calls of all{': ask for what comes out of ' if whole else ''}{', '.join(whole)}"
         )
-    return environment_of(env)
+    return None if env is None else environment_of(env)
+
+
+def _envs_of_chain(graph: Graph, operator: str) -> dict[str, str | None]:
+    """The environments of an operator and of those in front of it, but for what a recording gives."""
+    chain = sorted({operator} | upstream(graph, [operator]))
+    return {
+        name: graph.nodes[name].env for name in chain if not (graph.nodes[name].source or graph.nodes[name].external)
+    }
+
+
+def _called(env: str | None) -> str:
+    return "of dataflow itself" if env is None else repr(env)
 
 
 def _ending(names: Iterable[str], end: str) -> list[str]:

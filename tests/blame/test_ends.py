@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,8 @@ from dataflow.blame.links import Chain, Link
 from dataflow.blame.nudge import made_finite, nudged
 from dataflow.cli.commands.blame import _in_runs
 from dataflow.cli.main import app
-from dataflow.graph import load_text
+from dataflow.debugging.debugger import Debugger
+from dataflow.graph import load_graph, load_text
 from dataflow.messages import FeatureVector, RangeReading
 from dataflow.recording import Recording
 
@@ -98,6 +100,7 @@ def test_a_value_that_nothing_changes_is_not_said_to_be_decided_by_nothing(spiky
     assert told.exit_code == 1
     assert "decided by" not in words
     assert "not known what decided brake #30: nothing that was tried there changes the value" in words
+    assert "by inputs or earlier calls that only change it together, by the code, or by the call's time" in words
     assert "nudged" in words
     answer = json.loads(CliRunner().invoke(app, ["blame", str(spiky), "--field", asked, "--json"]).stdout)
     assert (answer["whole"], answer["sensed"], answer["no_change_shows_at"]) == (False, [], [["brake", 30]])
@@ -122,11 +125,43 @@ def test_changes_that_a_recorded_answer_does_not_fit_could_not_be_tried(spiky: P
     assert "changes made a call raise, which shows nothing" in words
 
 
+def test_outputs_of_nested_graphs_go_by_their_names_and_so_do_the_calls_behind_them(tmp_path: Path) -> None:
+    (tmp_path / "inner.yaml").write_text(
+        "graph: inner\ninputs: {r: RangeReading}\noutputs: {smooth: filter/out}\n"
+        'operators:\n  filter: {use: "rangers:Smooth", inputs: {range: r}}\n'
+    )
+    (tmp_path / "outer.yaml").write_text(
+        'graph: outer\noperators:\n  finder: {use: "rangers:Finder"}\n'
+        "  a: {use: inner.yaml, inputs: {r: finder/range}}\n"
+        '  guard: {use: "rangers:Guard", inputs: {value: a/smooth}}\n'
+    )
+    path = tmp_path / "run.mcap"
+    dataflow.run(load_graph(tmp_path / "outer.yaml"), record=path)
+
+    exported, inner = found(path, "a/smooth.value@2"), found(path, "a/filter/out.value@2")
+    assert exported.target == inner.target == ("a/filter", 20)
+    assert sensed(exported) == sensed(inner)
+    behind = found(path, "guard/stop.on@5")
+    assert {link.call.operator for link in behind.links} == {"guard", "a/filter"}
+
+
 def test_a_time_behind_the_end_is_told(spiky: Path) -> None:
     told = CliRunner().invoke(app, ["blame", str(spiky), "--field", "smooth/out.value@1000"])
 
     assert "made by smooth #59 at 5.900 s, the last one: the recording ends before" in " ".join(told.output.split())
     assert not found(spiky, "smooth/out.value@5.9").late
+
+
+def test_the_seconds_of_a_part_count_from_its_beginning_as_in_the_debugger(tmp_path: Path) -> None:
+    path, part = tmp_path / "run.mcap", tmp_path / "part.mcap"
+    dataflow.run(load_text("record: {snapshots: 500ms}\n" + GRAPH % "false"), record=path)
+    cut = CliRunner().invoke(app, ["cut", str(path), "-o", str(part), "--from", "1.45", "--to", "3"])
+    assert cut.exit_code == 0, cut.output
+
+    with Recording(part) as recording, closing(Debugger(recording, "smooth")) as debugger:
+        for seconds in (0.5, 1.2):
+            chain = Blame(recording, Field.parse(f"smooth/out.value@{seconds}")).find()
+            assert chain.target.number == debugger.number_at(debugger.origin + round(seconds * 1e9))
 
 
 def test_a_nudge_and_its_opposite_lie_on_either_side() -> None:

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tampering import Kept, as_it_is, tampered
@@ -529,6 +530,53 @@ def test_an_expression_is_not_true_of_a_call_without_what_it_names(
     shell.onecmd("until inp.x.stampp < 0")
     assert shell.failed
     assert "inp.x.stampp < 0 at call 0: AttributeError" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "expression", "lacks"),
+    [
+        (None, "inp.x.stampp", True),  # it cannot be known that the name is wrong
+        (None, "inp.x.stamp > 3", True),
+        (None, "len(inp.x)", True),
+        (None, "inp.y", False),
+        (None, "inp.x is None and 1 / 0", False),
+        ((), "inp.x[-1].stamp", True),
+        ((), "max(m.stamp for m in inp.x)", True),
+        ({}, "inp.x['src/x'].stamp", True),
+        ((), "inp.x.stamp", False),
+        (1, "inp.x.stampp", False),
+        (1, "[][0]", False),
+    ],
+)
+def test_an_expression_lacks_what_a_call_was_not_given(
+    given: Any, expression: str, lacks: bool, added: Recording
+) -> None:
+    fired = replace(Debugger(added, "adder").goto(2), inputs={"x": given})
+    with pytest.raises(Exception) as caught:
+        eval(expression, fired.names())
+
+    assert fired.lacks_for(caught.value) == lacks
+
+
+def test_an_expression_that_could_be_tried_in_no_call_is_an_error(
+    added: Recording, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shell = Shell(debugger := Debugger(added, "adder"), 0, json=True)
+    until = debugger.until
+    monkeypatch.setattr(debugger, "until", lambda is_so: until(lambda fired: is_so(replace(fired, inputs={"x": None}))))
+
+    shell.onecmd("until inp.x.stampp < 0")
+    assert shell.failed
+    assert "in no call after this one is there what it needs: inp.x.stampp < 0 at call 0" in capsys.readouterr().out
+    shell.onecmd("until inp.x is not None and inp.x.stamp > 0 or number == 3 and out.total.vectors is None")
+    told = capsys.readouterr()
+    assert "no call after this one is so" in told.out
+    shell.onecmd("until number > 3 and inp.x.stamp < 0")
+    assert not shell.failed
+    assert (
+        "not so where there is nothing, in 26 calls: number > 3 and inp.x.stamp < 0 at call 4"
+        in capsys.readouterr().err
+    )
 
 
 def test_an_operator_that_was_not_called_has_no_call(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:

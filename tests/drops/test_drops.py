@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import held_runs
@@ -10,11 +10,11 @@ import pytest
 from held_runs import MS, STAMP
 
 from dataflow.drops import player as player_module
+from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, bursts_of
 from dataflow.drops.player import Given, PlayedCalls, Player
 from dataflow.drops.search import Cost, Drops, DropsError, Worse
-from dataflow.graph import load_text
-from dataflow.graph.model import Node
+from dataflow.graph import Graph, load_text
 from dataflow.messages import FeatureVector, Message
 from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord
@@ -68,9 +68,29 @@ def test_losses_without_a_message_between_them_are_one_burst_and_tried_together(
     assert sorted(map(sorted, found)) == sorted([stop, *others])
     assert found[0][0].stamp == 30
 
-    held = cost(run, "end_error_m > 5", budget=0.0)  # nothing but the replays before and behind
+    held = cost(run, "end_error_m > 5", budget=0.0)
     assert not held.minimal
-    assert held.replays == 4
+    assert held.replays == 3  # as it was, with all losses undone, and that by operators made anew
+
+
+def test_nothing_is_replayed_twice_and_the_longest_burst_is_tried_first(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[frozenset[Loss]] = []
+    replay = Branch.replay
+
+    def counted(branch: Branch, undone: Collection[Loss] = ()) -> Figures:
+        asked.append(frozenset(undone))
+        return replay(branch, undone)
+
+    monkeypatch.setattr(Branch, "replay", counted)
+    found = cost(run, "end_error_m > 5")
+
+    *before, last = asked
+    assert len({*before}) == len(before) == found.replays - 1
+    assert last == {*found.named}  # by operators made anew
+    assert len(before[1]) == found.losses
+    assert {loss.operator for loss in before[2]} == {"smooth"}  # which stood still for longest
 
 
 @pytest.mark.long
@@ -187,9 +207,9 @@ def _firing(stamp: int, value: float, port: str) -> Firing:
 
 
 def test_a_parameter_of_an_operator_without_a_state_is_as_it_was_at_each_call_of_each_replay() -> None:
-    node = _node("Scaled", "at: drive/step")
+    graph = _graph("Scaled", "at: drive/step")
     change = FiringRecord("it", 0, 2, "param", 10, detail={"name": "gain", "value": 2.0})
-    player = Player(node, 0, 1, [FiringRecord("it", 0, 1, "fire", 10), change])
+    player = Player(graph.nodes["it"], graph, 1, [FiringRecord("it", 0, 1, "fire", 10), change])
 
     replays = [
         [_value(PlayedCalls(player).process(_firing(stamp, value, "at"))) for stamp in (10, 20)] for value in (1.0, 3.0)
@@ -203,7 +223,8 @@ def test_inputs_before_a_kept_state_are_let_go_and_more_than_can_be_held_are_ref
 ) -> None:
     monkeypatch.setattr(player_module, "SPACING", 0.0)
     given = Given()
-    player = Player(_node("Count", "step: drive/step"), 0, 1, ())
+    graph = _graph("Count", "step: drive/step")
+    player = Player(graph.nodes["it"], graph, 1, ())
     for stamp in (10, 20, 30):
         player.process(given, _firing(stamp, 1.0, "step"))
     assert [firing.inputs for firing in given.firings] == [{}, {}, {}]
@@ -215,9 +236,9 @@ def test_inputs_before_a_kept_state_are_let_go_and_more_than_can_be_held_are_ref
         player.process(given, _firing(40, 1.0, "step"))
 
 
-def _node(operator: str, inputs: str) -> Node:
+def _graph(operator: str, inputs: str) -> Graph:
     text = "graph: held\noperators:\n  drive: {use: 'held_runs:Drive'}\n"
-    return load_text(f"{text}  it: {{use: 'held_runs:{operator}', inputs: {{{inputs}}}}}\n").nodes["it"]
+    return load_text(f"{text}  it: {{use: 'held_runs:{operator}', inputs: {{{inputs}}}}}\n")
 
 
 def _value(made: Mapping[str, Message]) -> float:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from typing import Any
 
 import pytest
 from made_environments import environment, install, packages
@@ -19,12 +20,17 @@ from dataflow.execution import threads
 from dataflow.graph import Graph, GraphError
 from dataflow.graph.load import load_text
 from dataflow.recording import Recording
+from dataflow.records.comparison import Difference, Verification
 from dataflow.records.reading import FiringLog
-from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.run import run
+from dataflow.tool_server import proof
 from dataflow.tool_server.jobs import Refused, place_of
+from dataflow.tool_server.tools import answer
 from dataflow.verification.complete import complete
+from dataflow.verification.places import env_of_chain
+from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 
 TEXT = """
@@ -205,7 +211,12 @@ def test_what_decided_a_value_is_found_in_the_environment_of_its_operators(recor
         ("blame", {"field": "first/y.vectors@0.01"}, "one"),
         ("blame", {"field": "first/y"}, None),  # no field: what the tool says
         ("verify", {}, None),
-        ("prove", {"operator": "first", "call": 1}, None),
+        (
+            "prove",
+            {"operator": "first", "call": 1},
+            None,
+        ),  # it verifies all; the calls of the mended one have a process
+        ("mended", {"operator": "first", "call": 1}, "one"),
     ],
 )
 def test_a_tool_of_an_agent_runs_in_the_environment_of_its_operator(
@@ -217,9 +228,62 @@ def test_a_tool_of_an_agent_runs_in_the_environment_of_its_operator(
     assert (variables["PYTHONPATH"].split(os.pathsep)[0] == str(packages(environments / (env or "one")))) is bool(env)
 
 
+@pytest.mark.long
+def test_a_fix_is_proven_by_calls_in_the_environment_of_its_operator(recorded: Path, environments: Path) -> None:
+    here = [str(Path(__file__).resolve().parent)]
+    asked = {"recording": str(recorded), "operator": "first", "call": 3, "path": here}
+    said: list[str] = []
+
+    def prove(gain: float) -> dict[str, Any]:
+        found: dict[str, Any] = answer("prove", {**asked, "expect": f"out.y.vectors[0, 0] == 3 * {gain}"}, said.append)
+        return found
+
+    assert prove(7.0)["reasons"][0] == "call 3 still gives what was recorded"
+    install(environments / "one", "1.5", 2.5)
+    try:
+        proof, wrong = prove(2.5), prove(7.0)
+    finally:
+        install(environments / "one", "1.0", 2.0)
+
+    assert proof["proven"], proof["reasons"]
+    assert proof["other_operators"] == {"identical": ["second"]}
+    assert proof["changed_calls"]["count"] == 19  # of 20: 0 times a gain is 0
+    assert wrong["reasons"] == ["call 3: expect is false: out.y.vectors[0, 0] == 3 * 7.0"]
+    assert "call 3 of first made again; all its calls follow" in said
+    with pytest.raises(Refused, match=r"expect='1 = 2'|no Python expression"):
+        answer("prove", {**asked, "expect": "1 = 2"}, said.append)
+
+
+def test_another_operator_is_judged_although_its_recorded_code_cannot_be_tried_here(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = Difference(4, "fire", 0, "y", "aa", "bb")
+    second = Verification("second", 20, 20, first=first, own_fault=True, code_changed=["env_operators"])
+    report = VerifyReport([second], (), (), 0, 0, 0.0, 0.0, repeated={"second": True})
+    monkeypatch.setattr(proof, "recorded_code", lambda *given: {"env_operators": "abc"})
+    monkeypatch.setattr(proof, "recorded_text", lambda code, file: (file.read_bytes(), "a commit"))
+    with Recording(recorded) as recording:
+        others = proof.judge(recording, report, graph_that_is_here(recording)[0], "first")
+
+    assert others.reasons == {"second": "culprit: differs alike each time (code changed: env_operators)"}
+
+
 def test_a_tool_that_would_need_two_environments_is_refused(recorded: Path) -> None:
     with pytest.raises(Refused, match=r"'second' runs in the environment"):
         place_of("blame", {"recording": str(recorded), "field": "second/y.vectors@0.01"})
+
+
+def test_a_chain_that_begins_in_an_environment_and_ends_outside_is_refused_with_what_may_be_asked(
+    environments: Path,
+) -> None:
+    text = TEXT.format(folder=environments, record="all").replace(f", env: {environments}/two", "")
+    wrong = r"'second' runs in the environment of dataflow itself, .* 'first' \('.*one'\); .* what comes out of first$"
+
+    with pytest.raises(EnvError, match=wrong):
+        env_of_chain(load_text(text), "second/y")
+    first = env_of_chain(load_text(text), "first/y")
+    assert first is not None
+    assert first.folder == environments / "one"
 
 
 def test_an_environment_whose_packages_break_the_engine_is_named_at_once(tmp_path: Path) -> None:

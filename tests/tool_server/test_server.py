@@ -51,6 +51,9 @@ def test_tools_are_listed_and_answer_in_parts_whatever_operators_print(loud: tup
         tools = {tool.name: tool for tool in (await client.list_tools()).tools}
         assert tools.keys() == TOOLS.keys() | {"job"}
         assert all(tool.description for tool in tools.values())
+        for tool in ("goto", "lines", "state", "what_if", "prove"):
+            kinds = {kind["type"] for kind in tools[tool].input_schema["properties"]["call"]["anyOf"]}
+            assert kinds == {"string", "integer"}, tool
         assert tools["prove"].input_schema["required"] == ["recording", "operator", "call", "expect"]
         assert "say" not in tools["prove"].input_schema["properties"]
         assert not any(tool.input_schema["additionalProperties"] for tool in tools.values())

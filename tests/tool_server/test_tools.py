@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tampering import Kept, as_it_is, tampered
 
@@ -20,7 +21,7 @@ from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
 from dataflow.text import json_text
-from dataflow.tool_server.tools import ToolError, _verified, answer
+from dataflow.tool_server.tools import ToolError, _alike, _text, _verified, answer
 from dataflow.verification.report import VerifyReport
 
 SKIPPED, DEGREES = 613, 640
@@ -110,10 +111,53 @@ def test_the_changed_line_that_made_a_call_differ_is_named_first(
     assert "vectors + 1\n" in told["changes"][0]["recorded"]
     assert told["alone"] == {str(file): [[wrong, wrong]]}
 
+    two = SCALED.replace("x.vectors * 2", "x.vectors * 3").replace("vectors + 1", "vectors + 10")
+    file.write_text(two.replace("class Scaled", "\nclass Scaled"))
+    monkeypatch.delitem(sys.modules, "scaled_operators")
+    told = ask("lines", recording, operator="scaled", call="4")
+    changes = [(each["here"].strip(), each["mends"], each["together"]) for each in told["changes"]]
+    assert [mends for _, mends, _ in changes] == [False] * 3
+    assert [together for *_, together in changes] == [True, True, False]
+    assert changes[2][0] == ""  # the new line
+
+    file.write_text(SCALED.replace("x.vectors * 2", "2.0 * x.vectors").replace("vectors + 1", "vectors + 10"))
+    monkeypatch.delitem(sys.modules, "scaled_operators")
     (tmp_path / ".git").rename(tmp_path / "hidden")
     told = ask("lines", recording, operator="scaled")
     assert (told["changes"], told["recorded_code"]) == ([], {"scaled_operators": "not found"})
     assert told["alone"] == {str(file): [[wrong, wrong]]}
+
+
+@pytest.mark.long
+def test_a_changed_default_of_a_parameter_is_a_change_that_is_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, right = (
+        tmp_path / "gained_operators.py",
+        SCALED.replace("x.vectors * 2", "x.vectors * self.gain")
+        .replace("    x: In[", '    gain: float = Param(2.0, doc="gain")\n    x: In[')
+        .replace("Operator, Out", "Operator, Out, Param"),
+    )
+    file.write_text(right)
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=robot", "-c", "user.email=robot@localhost"]
+    for words in (["init", "-q"], ["add", file.name], ["commit", "-qm", "Right"]):
+        subprocess.run([*git, *words], check=True, timeout=60)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    graph = load_text(
+        "graph: gained\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 8}}\n"
+        "  scaled: {use: 'gained_operators:Scaled', inputs: {x: src/x}}\n"
+    )
+    recording = str(tmp_path / "right.mcap")
+    dataflow.run(graph, record=recording)
+    file.write_text(right.replace("2.0, doc", "3.0, doc").replace("vectors + 1", "1 + vectors"))
+    monkeypatch.delitem(sys.modules, "gained_operators")
+
+    told = ask("lines", recording, operator="scaled")
+
+    assert [("gain: float" in each["here"], each["mends"]) for each in told["changes"]] == [
+        (True, True),
+        (False, False),
+    ]
 
 
 def test_the_state_before_and_after_a_call(bugs: dict[str, str]) -> None:
@@ -139,6 +183,42 @@ def test_the_history_of_a_field_leaves_out_what_stays(bugs: dict[str, str]) -> N
     ends = ask("history", bugs["wrong"], operator="sum", field="inp.x.stamp > 0 and number > 500", first=500)
     assert [each["call"] for each in ends["changes"]] == [500, 501, 700]
     assert ends["changes"][-1]["value"] == {"error": "AttributeError: 'NoneType' object has no attribute 'stamp'"}
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (np.float32(199990000), 199990000.0),
+        (np.float32(0.1), 0.1),
+        (np.float64(1 / 3), 1 / 3),
+        (np.uint8(7), 7),
+        (np.bool_(True), True),
+        (2**60, 2**60),
+        (np.array([0.1, 2.0]), "[0.1, 2. ]"),
+    ],
+)
+def test_numbers_of_numpy_are_numbers_with_all_their_digits(value: Any, shown: Any) -> None:
+    assert _text(value) == shown
+    assert type(_text(value)) is type(shown)
+
+
+def test_a_value_that_stays_not_a_number_does_not_change() -> None:
+    nan, half = np.float32("nan"), np.array([0.5, np.nan])
+
+    assert _alike(nan, float("nan"))
+    assert _alike(half, half.copy())
+    assert not _alike(half, half.astype(np.float32))
+    assert not _alike(np.array([0.10000001]), np.array([0.1]))
+    assert not _alike(half, 0.5)
+    assert not _alike(nan, 1.0)
+
+
+def test_the_history_of_what_stays_not_a_number_is_one_change(bugs: dict[str, str]) -> None:
+    told = ask(
+        "history", bugs["wrong"], operator="sine", field="float('nan') if number < 5 else inp.x.stamp * 0", last=9
+    )
+
+    assert [each["call"] for each in told["changes"]] == [0, 5]
 
 
 def test_that_nothing_differs_or_was_lost_is_an_answer(bugs: dict[str, str], tmp_path: Path) -> None:
@@ -214,8 +294,9 @@ def test_a_fix_that_raises_in_later_calls_is_not_proven(bugs: dict[str, str], mo
     [reason] = told["reasons"]
     assert reason.startswith("calls raise what is not recorded: {690: 'ZeroDivisionError: division by zero'")
     assert ask("prove", bugs["wrong"], **arguments, may_change="error is None or number > 600")["proven"]
-    with pytest.raises(ToolError, match="expect='True' names nothing of the call"):
-        ask("prove", bugs["wrong"], **arguments | {"expect": "True"})
+    for already in ("True", "number == 613", "out.out is not None and inp.x.vectors[0, 0] >= 0", "error is None"):
+        with pytest.raises(ToolError, match=r"expect=.* is true of what was recorded as well"):
+            ask("prove", bugs["wrong"], **arguments | {"expect": already})
 
 
 @pytest.mark.long
@@ -417,6 +498,12 @@ def test_why_finds_that_code_repeats_and_differs_from_the_recorded(bugs: dict[st
 def test_wrong_arguments_are_refused(bugs: dict[str, str], arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         ask("goto", bugs["right"], **{"operator": "sine", **arguments})
+
+
+def test_an_expression_that_cannot_be_compiled_is_none(bugs: dict[str, str]) -> None:
+    for field in ("1 +", "+".join("1" * 50_000), "a\0b"):
+        with pytest.raises(ToolError, match="no Python expression"):
+            ask("history", bugs["right"], operator="sine", field=field)
 
 
 def test_a_missing_recording_is_named_with_those_beside_it(bugs: dict[str, str]) -> None:

@@ -330,7 +330,7 @@ def _report(
         print_one(out, checked[0])
         for name in checked[0].culprits[:1]:
             path = shlex.quote(str(checked[0].path))
-            if _may_repeat(checked[0], name, reasons):
+            if checked[0].report is not None and _may_be_a_test(checked[0].report, name, reasons):
                 words = ["dataflow capture", path, "--op", name, *options]
                 out.print(Text(f"as a test: {' '.join(words)}", style="dim"), soft_wrap=True)
             words = ["dataflow debug", path, name, *options, "--do diff"]
@@ -349,10 +349,16 @@ def _report(
         write_junit(junit, checked, explain, reservations)
 
 
-def _may_repeat(checked: Checked, operator: str, reasons: list[list[Why]]) -> bool:
-    """Returns whether an operator that differs did so alike each time, so that a call of it can be a test."""
-    found = any(why.operator == operator and why.repeats is False for each in reasons for why in each)
-    return checked.report is not None and checked.report.repeats(operator) is not False and not found
+def _may_be_a_test(report: VerifyReport, operator: str, reasons: list[list[Why]]) -> bool:
+    """Returns whether a call of an operator that differs can be a test: it differs alike each time, and not by chance.
+
+    One that is as it was recorded depends on something else: without the reasons it is not known whether that stays.
+    """
+    told = [why for each in reasons for why in each if why.operator == operator and not why.refused]
+    if report.repeats(operator) is False or any(why.chance for why in told):
+        return False
+    known = next(v.code_known for v in report.operators if v.operator == operator)
+    return bool(told) or not known or bool(report.altered(operator))
 
 
 def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, whole: bool) -> None:

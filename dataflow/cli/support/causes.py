@@ -112,7 +112,8 @@ def _outcome(found: Why) -> str:
     if found.repeats and found.changed:
         return "it repeats here, and this is not as it was recorded"
     if found.repeats:
-        return f"it repeats here, and {as_recorded(code_known=found.code_known)} ({OUTSIDE})"
+        rare = "what it reads, as above, may show in few runs; " if found.reads else ""
+        return f"it repeats here, and {as_recorded(code_known=found.code_known)} ({rare}{OUTSIDE})"
     if found.settled is False:
         return "it does not repeat even with all known sources of chance fixed (a device, a service, a thread?)"
     freed = "those that were tried" if found.open else "each of them"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.support.output import out, plural, print_json_line
+from dataflow.cli.support.output import out, plural, print_json_line, say
 from dataflow.cli.support.verdicts import difference_text
 from dataflow.debugging.fired import described
 from dataflow.execution.snapshots import changes
@@ -81,28 +81,35 @@ class Shell(cmd.Cmd):
             code = compile(line, "<until>", "eval")
         except SyntaxError as error:
             raise WrongCommand(f"until {line}: no Python expression: {error.msg}") from None
-        raised: list[str] = []
+        lacking: list[str] = []
+        looked_at = 0
 
         def is_so(fired: Fired) -> bool:
+            nonlocal looked_at
             try:
-                return bool(_evaluated(code, f"{line} at call {fired.number}", fired.names()))
-            except WrongCommand as error:
-                if not fired.silent:
-                    raise
-                raised.extend([str(error)] if fired.call.kind != "finish" else [])
+                found = bool(eval(code, fired.names()))
+            except Exception as error:
+                told = f"{line} at call {fired.number}: {type(error).__name__}: {error}"
+                if not fired.lacks_for(error):
+                    raise WrongCommand(told) from None
+                lacking.extend([told] if fired.call.kind != "finish" else [])
                 return False
+            looked_at += 1
+            return found
 
         found = self._debugger.until(is_so)
         unmade = self._debugger.unmade
         if found is not None:
             self._show(found, unmade)
+        elif lacking and not looked_at:
+            raise WrongCommand(f"in no call after this one is there what it needs: {lacking[0]}")
         elif unmade is not None:
             raise WrongCommand(f"no call after this one that can be made is so: {line}; {unmade}")
         else:
             out.print(f"no call after this one is so: {escape(line)}")
-        if raised and not self._json:
-            how = f"  in {plural(len(raised), 'call')} without a message it raises: {raised[0]}"
-            out.print(Text(how, style="yellow"), soft_wrap=True)
+        if lacking:
+            calls = plural(len(lacking), "call")
+            say(f"[yellow]note:[/] not so where there is nothing, in {calls}: {escape(lacking[0])}")
 
     def do_diff(self, line: str) -> None:
         """diff      to the first call of all that does not give what was recorded"""

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.capture.reduce import needed as found_by_bisection
-from dataflow.capture.reduce import none_to_spare, shortest_end, smallest, thinned
+from dataflow.debugging.reduce import needed as found_by_bisection
+from dataflow.debugging.reduce import none_to_spare, shortest_end, smallest, thinned
 
 Reduced = Callable[[Sequence[int], Callable[[Sequence[int]], bool]], Sequence[int]]
 
