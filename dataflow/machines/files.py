@@ -2,12 +2,14 @@
 
 Code is installed, never sent: a difference is an error that names the file. Files are those that parameters name by a
 relative path (weights, calibrations); they are sent into the agent's folder, in which its processes run. A file that is
-named by an absolute path must lie there already, with the same content.
+named by an absolute path must lie there already, with the same content. Copies that earlier runs sent are known
+(`SENT`): one of a file that the run does not have any more is not used.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -20,6 +22,11 @@ from dataflow.graph.model import current_path
 MOST_SENT = 4 << 30
 """Bytes of files that are sent to a machine, at most."""
 PIECE = 1 << 20
+SENT = ".sent.json"
+"""Lists, in the agent's folder, the digests of the files that were sent there."""
+_ELF = b"\x7fELF"
+_PROCESSOR = slice(18, 20)
+"""Bytes of the header of a program (ELF) with the kind of processor that it is compiled for."""
 
 Digests = dict[str, str]
 """By name of a file, the SHA-256 of its content."""
@@ -30,10 +37,17 @@ class FilesError(ValueError):
 
 
 def code_of(uses: Iterable[str]) -> Digests:
-    """Returns the digests of the files of this package's code and of that of operators (`use:`), by path."""
+    """Returns the digests of the files of this package's code and of that of operators (`use:`), by path; those of
+    compiled programs with their kind of processor in front."""
     homes = sorted({"dataflow", *(current_path(use).partition(":")[0] for use in uses)})
     code = {name: path for home in homes for name, path in files_of_code(home).items()}
-    return {name: digest_of(path) for name, path in code.items()}
+    return {name: _processor(path) + digest_of(path) for name, path in code.items()}
+
+
+def _processor(path: Path) -> str:
+    with path.open("rb") as file:
+        head = file.read(_PROCESSOR.stop)
+    return f"{head[_PROCESSOR].hex()}:" if head.startswith(_ELF) and len(head) == _PROCESSOR.stop else ""
 
 
 def python() -> str:
@@ -48,9 +62,17 @@ def digest_of(path: Path) -> str:
 
 
 def differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
-    """Returns, for each file that differs, what is wrong with it there."""
+    """Returns, for each file that differs, what is wrong with it there. Programs for other processors cannot agree."""
     missing = [f"{name} is missing" for name in sorted(wanted.keys() - found.keys())]
-    return missing + [f"{name} differs" for name in sorted(wanted.keys() & found.keys()) if wanted[name] != found[name]]
+    both = sorted(wanted.keys() & found.keys())
+    return missing + [f"{name} differs" for name in both if _differ(wanted[name], found[name])]
+
+
+def _differ(one: str, other: str) -> bool:
+    built_for, built_there = one.partition(":"), other.partition(":")
+    if built_for[1] and built_there[1] and built_for[0] != built_there[0]:
+        return False
+    return one != other
 
 
 def files_of(parameters: Iterable[Mapping[str, Any]], folder: Path) -> Digests:
@@ -100,6 +122,33 @@ def lacking(wanted: Mapping[str, str], folder: Path) -> tuple[list[str], list[st
         else:
             sent.append(text)
     return sent, wrong
+
+
+def note_sent(folder: Path, text: str, digest: str) -> None:
+    """Notes that the file of a relative path in `folder` is a copy that was sent. Raises `OSError`."""
+    part = folder / f"{SENT}.part"
+    part.write_text(json.dumps(_sent(folder) | {text: digest}), encoding="utf-8")
+    part.replace(folder / SENT)
+
+
+def _sent(folder: Path) -> dict[str, str]:
+    try:
+        found = json.loads((folder / SENT).read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # nothing was sent, or not by a version that notes it
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def left_over(parameters: Iterable[Mapping[str, Any]], wanted: Mapping[str, str], folder: Path) -> list[str]:
+    """Returns what is wrong with files that parameters name, of which `folder` has only the copy of an earlier run."""
+    named = {text for params in parameters for text in _texts(dict(params))}
+    copies = {text: digest for text, digest in _sent(folder).items() if text in named and text not in wanted}
+    return [
+        f"{text} is missing where the run is started, and here is only the copy that an earlier run was sent: "
+        f"put the file back there, or delete {folder / text}"
+        for text, digest in sorted(copies.items())
+        if is_file(folder / text) and digest_of(folder / text) == digest  # another content is this machine's own
+    ]
 
 
 def inside(folder: Path, text: str) -> Path:

@@ -125,6 +125,9 @@ def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
     assert (robot.folder / "models/factor.txt").read_text() == "3.5"
     assert (robot.folder / "models/large.bin").stat().st_size == 70 << 20
     assert not list((robot.folder / "models").glob("*.part"))
+    Path("models/factor.txt").unlink()
+    with pytest.raises(RunFailed, match=r"models/factor\.txt is missing where the run is started"):
+        two(robot, text)
     theirs = robot.code / "machine_operators.py"
     before = theirs.read_text()
     theirs.write_text(before + "# changed there\n")
