@@ -17,7 +17,6 @@ from typing import Any
 
 from dataflow.graph.code import files_of as files_of_code
 from dataflow.graph.code import is_file
-from dataflow.graph.model import current_path
 
 MOST_SENT = 4 << 30
 """Bytes of files that are sent to a machine, at most."""
@@ -36,11 +35,16 @@ class FilesError(ValueError):
     """A machine cannot be given what it needs; the message names the file, and what would be right."""
 
 
-def code_of(uses: Iterable[str]) -> Digests:
+def code_of(uses: Iterable[str], given: Iterable[str] = ()) -> Digests:
     """Returns the digests of the files of this package's code and of that of operators (`use:`), by path; those of
-    compiled programs with their kind of processor in front."""
-    homes = sorted({"dataflow", *(current_path(use).partition(":")[0] for use in uses)})
-    code = {name: path for home in homes for name, path in files_of_code(home).items()}
+    compiled programs with their kind of processor in front. Imports nothing.
+
+    `given`: texts of parameters; a file that one of these names belongs to the parameters, and is no program.
+    """
+    homes = sorted({"dataflow", *(use.partition(":")[0] for use in uses)})
+    data = tuple(f"/{Path(text).as_posix()}" for text in given if text and not text.endswith(".py"))
+    found = {name: path for home in homes for name, path in files_of_code(home).items()}
+    code = {name: path for name, path in found.items() if not path.as_posix().endswith(data)}
     return {name: _processor(path) + digest_of(path) for name, path in code.items()}
 
 
@@ -82,7 +86,7 @@ def files_of(parameters: Iterable[Mapping[str, Any]], folder: Path) -> Digests:
     """
     found: Digests = {}
     total = 0
-    for text in sorted({text for params in parameters for text in _texts(dict(params))}):
+    for text in sorted(set(texts_of(parameters))):
         path = Path(text)
         if not is_file(folder / path):
             continue
@@ -94,6 +98,12 @@ def files_of(parameters: Iterable[Mapping[str, Any]], folder: Path) -> Digests:
     if total > MOST_SENT:
         raise FilesError(f"the files to be sent have {total / 1e9:.1f} GB, the limit is {MOST_SENT / 1e9:.1f} GB")
     return found
+
+
+def texts_of(parameters: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+    """Yields the texts that parameters hold."""
+    for each in parameters:
+        yield from _texts(dict(each))
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -141,7 +151,7 @@ def _sent(folder: Path) -> dict[str, str]:
 
 def left_over(parameters: Iterable[Mapping[str, Any]], wanted: Mapping[str, str], folder: Path) -> list[str]:
     """Returns what is wrong with files that parameters name, of which `folder` has only the copy of an earlier run."""
-    named = {text for params in parameters for text in _texts(dict(params))}
+    named = set(texts_of(parameters))
     copies = {text: digest for text, digest in _sent(folder).items() if text in named and text not in wanted}
     return [
         f"{text} is missing where the run is started, and here is only the copy that an earlier run was sent: "

@@ -236,7 +236,7 @@ class Stay:
         while self._words:
             try:
                 self._obey(*self._words.popleft())
-            except (OSError, ValueError, RuntimeError) as error:
+            except (ImportError, OSError, ValueError, RuntimeError) as error:
                 self._say("", "failed", why=f"{type(error).__name__}: {error}")
         if self._children is not None:
             self._tell_clock()

@@ -266,7 +266,7 @@ class Code:
             )
         described = graph.to_json()
         parts = [described[part] for part in ("nodes", "streams", "seed", "threads", "namespace")]
-        used = sorted({current_path(node.use).partition(":")[0] for node in graph.nodes.values()})
+        used = sorted({_home(node.use) for node in graph.nodes.values()})
         files = sorted(set(_files_named([node.params for node in graph.nodes.values()])))
         code = [self._package(name) for name in used]
         envs = [self._packages_of(env) for env in sorted({node.env for node in graph.nodes.values() if node.env})]
@@ -289,6 +289,14 @@ class Code:
 
     def _code(self, files: Sequence[Path]) -> str:
         return _digest([f.name, self._digests.of(f)] for f in files if f.parent.name != "__pycache__")
+
+
+def _home(use: str) -> str:
+    """Returns the module that has an operator; as it is named, where its package cannot be imported."""
+    try:
+        return current_path(use).partition(":")[0]
+    except (Exception, SystemExit):  # of a recording: its run fails with the reason
+        return use.partition(":")[0]
 
 
 def _files_named(value: Any) -> Iterator[Path]:

@@ -69,3 +69,38 @@ def test_programs_for_two_processors_are_not_the_same_file_and_those_for_one_are
     assert files.differences(here, code(ARM, b"b")) == []
     (tmp_path / "edges").write_text("#!/bin/sh\n")
     assert files.differences(here, files.code_of(["rig_of_programs:Edges"])) == ["edges differs"]
+
+
+def test_code_is_compared_without_importing_it_so_a_module_that_is_missing_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "rig_parts").mkdir()
+    for name in ("__init__.py", "gain.py"):
+        (tmp_path / "rig_parts" / name).write_text("GAIN = 2\n")
+    (tmp_path / "rig_in_parts.py").write_text("from rig_parts.gain import GAIN\n")
+    there = files.code_of(["rig_in_parts:Scaled"])
+    (tmp_path / "rig_parts" / "gain.py").unlink()
+
+    here = files.code_of(["rig_in_parts:Scaled"])
+
+    assert files.differences(there, here) == ["rig_parts/gain.py is missing"]
+    assert "rig_in_parts" not in sys.modules
+
+
+@pytest.mark.parametrize("named", ["w/net.txt", "./w/net.txt"])
+def test_a_file_that_a_parameter_names_is_sent_also_where_the_text_of_a_module_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w" / "net.txt").write_text("2")
+    (tmp_path / "w" / "edges").write_text("a program")
+    (tmp_path / "rig_of_weights.py").write_text("weights = Param('w/net.txt')\ncommand = ('w/edges',)\n")
+    used = ["rig_of_weights:Weights"]
+    parameters = [{"weights": named, "script": "rig_of_weights.py", "note": ""}]
+
+    code = files.code_of(used, files.texts_of(parameters))
+
+    assert {name for name in code if not name.startswith("dataflow/")} == {"rig_of_weights.py", "w/edges"}
+    assert files.files_of(parameters, tmp_path).keys() >= {named}

@@ -141,6 +141,36 @@ def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
 
 
 @pytest.mark.long
+def test_a_machine_that_lacks_a_module_is_named_let_go_and_takes_the_next_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its agent has not imported the operators then, and no process was begun."""
+    for place in ("here", "there"):
+        shutil.copytree(HERE, tmp_path / place)
+        own = tmp_path / place / "scales"
+        own.mkdir()
+        (own / "gains.py").write_text("GAIN = 2.0\n")
+        (tmp_path / place / "own_scale.py").write_text(
+            "from machine_operators import Scale\nfrom scales.gains import GAIN\nclass OwnScale(Scale): pass\n"
+        )
+    (tmp_path / "there" / "scales" / "gains.py").unlink()
+    monkeypatch.syspath_prepend(tmp_path / "here")
+    endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
+    agent = join("robot", endpoint, tmp_path / "files", code=tmp_path / "there")
+    text = GRAPH.replace("SIZE", "1").replace(", MORE", "")
+    other = text.replace('there: {use: "machine_operators:Scale"', 'there: {use: "own_scale:OwnScale"')
+
+    with pytest.raises(RunFailed, match=r"machine 'robot' cannot take part: scales/gains\.py is missing"):
+        run(load_text(other), machines=Meeting(endpoint))
+    report = run(load_text(text), machines=Meeting(endpoint))
+    with pytest.raises(RunFailed, match="is missing"):
+        run(load_text(other), machines=Meeting(endpoint))
+
+    assert report.summaries["there"]["taken"] == 120
+    assert "was not heard" not in end(agent)
+
+
+@pytest.mark.long
 def test_a_process_of_another_machine_that_dies_is_started_again_there_or_ends_the_run(
     robot: Robot, tmp_path: Path
 ) -> None:
