@@ -62,7 +62,7 @@ def command(words: Sequence[str]) -> int:
 
 def fetch(words: Sequence[str]) -> int:
     """Fetches a URL that fsspec opens into a file; returns the exit code."""
-    import fsspec  # of the extra `ray`
+    import fsspec  # of the extra `remote`
 
     end_with_parent()
     url, file = words
