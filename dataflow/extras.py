@@ -16,7 +16,12 @@ _OF_MODULES = {
 }
 """Module → distribution, where the names differ."""
 _COLLECTIONS = ("all", "dev")
-_BY_CALLER = {"operators.": "perception", "dataflow.view": "view", "dataflow.": "bags"}
+_BY_CALLER = {
+    "operators.": "perception",
+    "dataflow.view": "view",
+    "dataflow.sweep.plan": "remote",
+    "dataflow.": "bags",
+}
 """Package of the importing module → the extra that serves it, where several extras bring what is missing."""
 
 _REQUIREMENT = re.compile(r"([\w.-]+)[^;]*;.*extra\s*==\s*['\"](\w+)['\"]")

@@ -75,9 +75,10 @@ wheel brings FFmpeg with x264 and x265 (GPL-2.0): with them tests encode clips o
 `[dev]` brings libfaketime (GPL-2.0), too, a library of C that nothing imports or links with: where a user has installed
 it, the processes of re-runs by `dataflow verify --why` load it (`LD_PRELOAD`).
 
-`[ray]`, `[mcp]`, `[lidar]` and `[realsense]` are not in the table: Ray and pyrealsense2 are under Apache-2.0, fsspec
-and velodyne-decoder under BSD-3-Clause, mcp under MIT; what mcp brings is under MIT, Apache-2.0, BSD and PSF-2.0, what
-velodyne-decoder brings under Apache-2.0, BSD and MIT, and libusb under LGPL-2.1, loaded at run time.
+`[ray]`, `[remote]`, `[mcp]`, `[lidar]` and `[realsense]` are not in the table: Ray, pyrealsense2 and aiohttp are
+under Apache-2.0, fsspec, s3fs and velodyne-decoder under BSD-3-Clause, mcp under MIT; what mcp brings is under MIT,
+Apache-2.0, BSD and PSF-2.0, what velodyne-decoder brings under Apache-2.0, BSD and MIT, and libusb under LGPL-2.1,
+loaded at run time.
 """
 
 

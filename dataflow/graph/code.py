@@ -37,6 +37,7 @@ _DIGEST = re.compile("[0-9a-f]{64}")
 _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^#\n]*)|import[ \t]+([^#\n]*))", re.M)
 _FOR_TYPES = re.compile(r"^if (?:\w+\.)?TYPE_CHECKING:.*\n(?:[ \t]+.*\n|[ \t]*\n)*", re.M)
 """Imports that a type checker makes, and no program."""
+_IMPORT_BY_NAME = re.compile(r"""\b(?:import_module|__import__)\(\s*["']([.\w]+)["']""")
 _WORD = re.compile(r"""["'](?!/)([^"'\n]{1,255})["']""")
 """Strings of a module that may name a file."""
 _texts: WeakKeyDictionary[ModuleType, bytes] = WeakKeyDictionary()
@@ -392,7 +393,8 @@ def _imports(name: str, source: _Source) -> tuple[set[str], set[str]]:
 @lru_cache(maxsize=1024)
 def _statements(text: bytes) -> list[tuple[str, str, str]]:
     """The imports of a module: where from and which names, or the modules."""
-    return _IMPORT.findall(_FOR_TYPES.sub("", text.decode(errors="replace")))
+    read = _FOR_TYPES.sub("", text.decode(errors="replace"))
+    return [*_IMPORT.findall(read), *(("", "", name) for name in _IMPORT_BY_NAME.findall(read))]
 
 
 def _with_dependents(found: Iterable[str], own: Mapping[str, bytes]) -> set[str]:

@@ -2,12 +2,14 @@
 
 Code is installed, never sent: a difference is an error that names the file. Files are those that parameters name by a
 relative path (weights, calibrations); they are sent into the agent's folder, in which its processes run. A file that is
-named by an absolute path must lie there already, with the same content.
+named by an absolute path must lie there already, with the same content. Copies that earlier runs sent are known
+(`SENT`): one of a file that the run does not have any more is not used.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -15,11 +17,15 @@ from typing import Any
 
 from dataflow.graph.code import files_of as files_of_code
 from dataflow.graph.code import is_file
-from dataflow.graph.model import current_path
 
 MOST_SENT = 4 << 30
 """Bytes of files that are sent to a machine, at most."""
 PIECE = 1 << 20
+SENT = ".sent.json"
+"""Lists, in the agent's folder, the digests of the files that were sent there."""
+_ELF = b"\x7fELF"
+_PROCESSOR = slice(18, 20)
+"""Bytes of the header of a program (ELF) with the kind of processor that it is compiled for."""
 
 Digests = dict[str, str]
 """By name of a file, the SHA-256 of its content."""
@@ -29,11 +35,23 @@ class FilesError(ValueError):
     """A machine cannot be given what it needs; the message names the file, and what would be right."""
 
 
-def code_of(uses: Iterable[str]) -> Digests:
-    """Returns the digests of the files of this package's code and of that of operators (`use:`), by path."""
-    homes = sorted({"dataflow", *(current_path(use).partition(":")[0] for use in uses)})
-    code = {name: path for home in homes for name, path in files_of_code(home).items()}
-    return {name: digest_of(path) for name, path in code.items()}
+def code_of(uses: Iterable[str], given: Iterable[str] = ()) -> Digests:
+    """Returns the digests of the files of this package's code and of that of operators (`use:`), by path; those of
+    compiled programs with their kind of processor in front. Imports nothing.
+
+    `given`: texts of parameters; a file that one of these names belongs to the parameters, and is no program.
+    """
+    homes = sorted({"dataflow", *(use.partition(":")[0] for use in uses)})
+    data = tuple(f"/{Path(text).as_posix()}" for text in given if text and not text.endswith(".py"))
+    found = {name: path for home in homes for name, path in files_of_code(home).items()}
+    code = {name: path for name, path in found.items() if not path.as_posix().endswith(data)}
+    return {name: _processor(path) + digest_of(path) for name, path in code.items()}
+
+
+def _processor(path: Path) -> str:
+    with path.open("rb") as file:
+        head = file.read(_PROCESSOR.stop)
+    return f"{head[_PROCESSOR].hex()}:" if head.startswith(_ELF) and len(head) == _PROCESSOR.stop else ""
 
 
 def python() -> str:
@@ -48,9 +66,17 @@ def digest_of(path: Path) -> str:
 
 
 def differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
-    """Returns, for each file that differs, what is wrong with it there."""
+    """Returns, for each file that differs, what is wrong with it there. Programs for other processors cannot agree."""
     missing = [f"{name} is missing" for name in sorted(wanted.keys() - found.keys())]
-    return missing + [f"{name} differs" for name in sorted(wanted.keys() & found.keys()) if wanted[name] != found[name]]
+    both = sorted(wanted.keys() & found.keys())
+    return missing + [f"{name} differs" for name in both if _differ(wanted[name], found[name])]
+
+
+def _differ(one: str, other: str) -> bool:
+    built_for, built_there = one.partition(":"), other.partition(":")
+    if built_for[1] and built_there[1] and built_for[0] != built_there[0]:
+        return False
+    return one != other
 
 
 def files_of(parameters: Iterable[Mapping[str, Any]], folder: Path) -> Digests:
@@ -60,7 +86,7 @@ def files_of(parameters: Iterable[Mapping[str, Any]], folder: Path) -> Digests:
     """
     found: Digests = {}
     total = 0
-    for text in sorted({text for params in parameters for text in _texts(dict(params))}):
+    for text in sorted(set(texts_of(parameters))):
         path = Path(text)
         if not is_file(folder / path):
             continue
@@ -72,6 +98,12 @@ def files_of(parameters: Iterable[Mapping[str, Any]], folder: Path) -> Digests:
     if total > MOST_SENT:
         raise FilesError(f"the files to be sent have {total / 1e9:.1f} GB, the limit is {MOST_SENT / 1e9:.1f} GB")
     return found
+
+
+def texts_of(parameters: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+    """Yields the texts that parameters hold."""
+    for each in parameters:
+        yield from _texts(dict(each))
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -100,6 +132,33 @@ def lacking(wanted: Mapping[str, str], folder: Path) -> tuple[list[str], list[st
         else:
             sent.append(text)
     return sent, wrong
+
+
+def note_sent(folder: Path, text: str, digest: str) -> None:
+    """Notes that the file of a relative path in `folder` is a copy that was sent. Raises `OSError`."""
+    part = folder / f"{SENT}.part"
+    part.write_text(json.dumps(_sent(folder) | {text: digest}), encoding="utf-8")
+    part.replace(folder / SENT)
+
+
+def _sent(folder: Path) -> dict[str, str]:
+    try:
+        found = json.loads((folder / SENT).read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # nothing was sent, or not by a version that notes it
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def left_over(parameters: Iterable[Mapping[str, Any]], wanted: Mapping[str, str], folder: Path) -> list[str]:
+    """Returns what is wrong with files that parameters name, of which `folder` has only the copy of an earlier run."""
+    named = set(texts_of(parameters))
+    copies = {text: digest for text, digest in _sent(folder).items() if text in named and text not in wanted}
+    return [
+        f"{text} is missing where the run is started, and here is only the copy that an earlier run was sent: "
+        f"put the file back there, or delete {folder / text}"
+        for text, digest in sorted(copies.items())
+        if is_file(folder / text) and digest_of(folder / text) == digest  # another content is this machine's own
+    ]
 
 
 def inside(folder: Path, text: str) -> Path:

@@ -6,16 +6,21 @@ sees the next number (or the sender's mark) ahead of what it expects, and asks f
 Beats go both ways besides, of a higher priority: what was taken, the round that is wanted, and the time, by which the
 offset of the other machine's clock is measured (as NTP does, from the exchange with the shortest delay). A word that
 is soon out of date may go with a beat: it overtakes the frames, and is lost with a link.
+
+What the kernel and the network have taken can no longer be overtaken, and a kernel takes megabytes, which a slow link
+needs a minute for. So no more is on its way than the link delivers in about `LATE` (`Room`), long frames go in pieces,
+and what waits, waits here.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -26,14 +31,20 @@ BEAT_EVERY = 0.2
 AWAY_AFTER = 1.5
 """Seconds without a sign of the other end after which its link counts as down."""
 IN_FLIGHT, IN_FLIGHT_BYTES = 4096, 8 << 20
-"""Frames, and bytes of them, that are sent before the first of them is acknowledged."""
+"""Pieces, and bytes of them, that are sent before the first of them is acknowledged, at most."""
+PIECE = 30_000
+"""Bytes of a frame that are sent at once; a batch of Zenoh's holds 65,535."""
+LATE = 0.5
+"""Seconds for which what was sent may wait on its way, beyond what the link takes at best."""
 ACKNOWLEDGE_AFTER = 256
 MOST_WAITING = 256 << 20
 """Bytes that wait for a link, at most, before messages that may be missed are dropped."""
 EXCHANGES = 64
 """Exchanges of beats among which the one with the shortest delay measures the clocks' offset."""
 
-_FRAME = struct.Struct("!IQB")  # round, number, whether it is a mark: the number of the next frame
+_FRAME = struct.Struct("!IQB")  # round, number, kind
+_END, _MARK, _PART = range(3)
+"""Kinds: the last piece of a frame, or all of it; no piece, but the number of the next one; a piece before the last."""
 _BEAT = struct.Struct("!IQqqq")  # round wanted, frames taken, sent at; of the other's last beat: sent at, taken at (ns)
 
 
@@ -62,6 +73,34 @@ class Clocks:
         return min(tuple(self._exchanges), default=None)
 
 
+class Room:
+    """The bytes that may be on their way at once. Pure: times (s) are given."""
+
+    def __init__(self) -> None:
+        self.bytes = min(2 * PIECE, IN_FLIGHT_BYTES)
+        self._least = math.inf
+        self._cut = -math.inf  # when there was too much: the times of what was sent before no longer count
+
+    def taken(self, sent: float, now: float, nbytes: int, *, filled: bool) -> None:
+        """Takes that the other end has so many more bytes, the last of which was sent at `sent`; `filled`: there was no
+        room for more."""
+        if sent < self._cut:
+            return
+        self._least = min(self._least, now - sent)
+        waited = now - sent - self._least
+        if waited > LATE:  # so many of them are delivered in that time
+            self.bytes, self._cut = max(PIECE, int(self.bytes * LATE / waited)), now
+        elif filled and waited < LATE / 2:
+            self.bytes = min(IN_FLIGHT_BYTES, self.bytes + nbytes)
+
+
+class Sent(NamedTuple):
+    """A piece that is not acknowledged."""
+
+    kind: int
+    data: bytes
+
+
 class Pipe:
     """One end. `take` gets the frames in order, on a thread of Zenoh's, and must not wait."""
 
@@ -76,11 +115,15 @@ class Pipe:
         self._waiting: deque[tuple[bytes, bool]] = deque()
         self._waiting_bytes = 0
         self._look_beyond = 0  # bytes that wait before what waits is looked at again: much of it may not be dropped
-        self._sent: deque[bytes] = deque()
-        self._sent_bytes = 0
-        self._base, self._next = 0, 0  # numbers: of the first frame in `_sent`, and of the next one to go out (again)
+        self._sent: deque[Sent] = deque()
+        self._base, self._next = 0, 0  # numbers: of the first piece in `_sent`, and of the next one to go out (again)
+        self._room = Room()
+        self._flying: deque[float] = deque()  # when each piece from `_base` to `_next` was sent
+        self._flying_bytes = 0
         self._round = 0
-        self._wanted, self._expected, self._unsaid = 0, 0, 0
+        self._wanted, self._expected, self._unsaid, self._unsaid_bytes = 0, 0, 0, 0
+        self._parts: list[bytes] = []
+        """The pieces of a frame that is not complete."""
         self._heard: tuple[int, int] = (0, 0)  # the other's last beat: sent at, by its clock; taken at, by this one's
         self._heard_at = -AWAY_AFTER
         self._closed = False
@@ -170,31 +213,43 @@ class Pipe:
                     return
 
     def _due(self) -> bool:
-        room = len(self._sent) < IN_FLIGHT and self._sent_bytes < IN_FLIGHT_BYTES
-        return self._next < self._base + len(self._sent) or (bool(self._waiting) and room)
+        room = len(self._flying) < IN_FLIGHT and self._flying_bytes < self._room.bytes
+        return room and (self._next < self._base + len(self._sent) or bool(self._waiting))
 
     def _next_frame(self) -> bytes | None:
-        """Returns what goes out next: a frame again, a new one, or, while some are unacknowledged, the mark."""
+        """Returns what goes out next: a piece again, a new one, or, while some are unacknowledged, the mark."""
         if not self._due():
-            return _FRAME.pack(self._round, self._next, 1) if self._sent else None
+            return _FRAME.pack(self._round, self._next, _MARK) if self._sent else None
         if self._next == self._base + len(self._sent):
             frame, _ = self._waiting.popleft()
             self._waiting_bytes -= len(frame)
             self._look_beyond = min(self._look_beyond, self._waiting_bytes + MOST_WAITING // 10)
-            self._sent.append(frame)
-            self._sent_bytes += len(frame)
+            last = max(0, len(frame) - 1) // PIECE * PIECE
+            self._sent.extend(Sent(_PART, frame[at : at + PIECE]) for at in range(0, last, PIECE))
+            self._sent.append(Sent(_END, frame[last:]))
         number, self._next = self._next, self._next + 1
-        return _FRAME.pack(self._round, number, 0) + self._sent[number - self._base]
+        kind, data = self._sent[number - self._base]
+        self._flying.append(time.monotonic())
+        self._flying_bytes += len(data) + _FRAME.size
+        return _FRAME.pack(self._round, number, kind) + data
 
     def _taken(self, number: int, wanted: int) -> None:
-        """The other end has taken all frames before `number`, and wants them from there on as the round `wanted`."""
+        """The other end has taken all pieces before `number`, and wants them from there on as the round `wanted`."""
         with self._changed:
+            filled, sent, before = self._flying_bytes >= self._room.bytes - PIECE, None, self._flying_bytes
             while self._base < number and self._sent:
-                self._sent_bytes -= len(self._sent.popleft())
+                _, data = self._sent.popleft()
                 self._base += 1
+                if self._flying:
+                    sent = self._flying.popleft()
+                    self._flying_bytes -= len(data) + _FRAME.size
+            if sent is not None:
+                self._room.taken(sent, time.monotonic(), before - self._flying_bytes, filled=filled)
             self._next = max(self._next, self._base)
             if wanted > self._round:
                 self._round, self._next = wanted, self._base
+                self._flying.clear()
+                self._flying_bytes = 0
             self._changed.notify_all()
 
     # In
@@ -204,17 +259,21 @@ class Pipe:
         if len(data) < _FRAME.size or self._closed:
             return
         self._heard_at = time.monotonic()
-        round_, number, mark = _FRAME.unpack_from(data)
+        round_, number, kind = _FRAME.unpack_from(data)
         if round_ != self._wanted:
             return
         if number > self._expected:
             self._wanted += 1
             self._beat()
-        elif number == self._expected and not mark:
+        elif number == self._expected and kind != _MARK:
             self._expected += 1
             self._unsaid += 1
-            self._take(data[_FRAME.size :])
-            if self._unsaid >= ACKNOWLEDGE_AFTER or len(data) > IN_FLIGHT_BYTES // 16:
+            self._unsaid_bytes += len(data)
+            self._parts.append(data[_FRAME.size :])
+            if kind == _END:
+                frame, self._parts = self._parts[0] if len(self._parts) == 1 else b"".join(self._parts), []
+                self._take(frame)
+            if self._unsaid >= ACKNOWLEDGE_AFTER or self._unsaid_bytes > PIECE // 2:
                 self._beat()
 
     def _on_beat(self, sample: Any) -> None:
@@ -231,7 +290,7 @@ class Pipe:
             self._take(word)
 
     def _beat(self, word: bytes = b"") -> None:
-        self._unsaid = 0
+        self._unsaid = self._unsaid_bytes = 0
         try:
             self._beats.put(_BEAT.pack(self._wanted, self._expected, time.time_ns(), *self._heard) + word)
         except zenoh.ZError:  # the session is being closed

@@ -26,8 +26,9 @@ class ProcessConfig:
 
     `publish` maps the local streams that other processes take (firing records included) to how many take them;
     `subscribe` are the remote ones taken here. `listen` are the endpoints at which programs from outside reach it.
-    `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `paused`: its
-    sources wait until they are let go on. `firings`: whether a recorder takes the firing records. `live`: sources do
+    `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes); so is `ahead`,
+    by which its sources may be ahead of the graph; None: a window. `paused`: they wait until they are let go on.
+    `firings`: whether a recorder takes the firing records. `live`: sources do
     not wait for the graph, and operators not for their inputs. `resume` is given to a process that takes the place of
     one that died: for each operator, where it had got to (`Resumed`, as plain values). `warm`: the recording and the
     stamp from which on it is replayed, with the operators' states of that moment. `rings_out` and `rings_in`: for each
@@ -44,6 +45,7 @@ class ProcessConfig:
     listen: list[str]
     replay: dict[str, Any] | None = None
     window: tuple[int, int] = (256, 64 << 20)
+    ahead: tuple[int, int] | None = None
     rate: float | None = None
     paused: bool = False
     paranoid: bool = False

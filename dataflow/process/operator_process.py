@@ -67,8 +67,10 @@ class OperatorProcess:
         self.config, self.channel, self.inbox = config, channel, inbox
         self.graph = Graph.from_json(config.graph)
         self.pace = Pace(config.rate)
-        self.window = Window(*config.window)
-        self.backlog = Window(*(most * times for most, times in zip(config.window, BACKLOG, strict=True)))
+        ahead = config.ahead or config.window
+        self.window = Window(*ahead)
+        backlog = (most * times for most, times in zip(config.window, BACKLOG, strict=True))
+        self.backlog = Window(*map(max, ahead, backlog))
         feeding = Feeding(self.window, self.pace, paused=config.paused, speed=config.rate)
         self.driver = Driver(feeding, self._arrived)
         self.live = LiveSources(

@@ -1,8 +1,9 @@
-"""Returns the descriptors that can be read; of any number, where select(2) accepts those below 1,024 only."""
+"""Waits for descriptors, of any number, where select(2) accepts those below 1,024 only, and reads from sockets."""
 
 from __future__ import annotations
 
 import select
+import socket
 from collections.abc import Iterable
 from typing import Protocol, TypeVar
 
@@ -12,6 +13,18 @@ class HasDescriptor(Protocol):
 
 
 Waited = TypeVar("Waited", bound=int | HasDescriptor)
+
+
+def received(connection: socket.socket, nbytes: int, descriptors: int) -> tuple[bytes, list[int]]:
+    """Returns what is read from a Unix socket, and the descriptors with it; nothing where the other end is gone.
+
+    One that closes it, or is killed, with unread data in it resets it. Raises `OSError`.
+    """
+    try:
+        data, given, _, _ = socket.recv_fds(connection, nbytes, descriptors)
+    except ConnectionResetError:
+        return b"", []
+    return data, list(given)
 
 
 def readable(waited: Iterable[Waited], timeout: float | None) -> list[Waited]:

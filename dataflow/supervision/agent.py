@@ -236,7 +236,7 @@ class Stay:
         while self._words:
             try:
                 self._obey(*self._words.popleft())
-            except (OSError, ValueError, RuntimeError) as error:
+            except (ImportError, OSError, ValueError, RuntimeError) as error:
                 self._say("", "failed", why=f"{type(error).__name__}: {error}")
         if self._children is not None:
             self._tell_clock()
@@ -290,6 +290,9 @@ class Stay:
         wrong = [] if wanted["python"] == files.python() else [f"{files.python()} here, {wanted['python']} there"]
         wrong += files.differences(wanted["code"], files.code_of(wanted["uses"]))
         lacks, others = files.lacking(wanted["files"], self._agent.folder)
+        nodes = {name for process in wanted["processes"] for name in process["nodes"]}
+        params = [node["params"] for node in wanted["graph"]["nodes"] if node["name"] in nodes]
+        others += files.left_over(params, wanted["files"], self._agent.folder)
         if wrong + others:
             self._say("", "differs", what=wrong + others)
         else:
@@ -311,6 +314,7 @@ class Stay:
             part.unlink()
             raise files.FilesError(f"file {fields['path']!r} changed while it was sent")
         part.replace(path)
+        files.note_sent(self._agent.folder, fields["path"], fields["digest"])
 
     def _begin(self) -> None:
         """Makes the links of the processes here, and is ready to start them."""

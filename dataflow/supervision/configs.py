@@ -8,6 +8,8 @@ from typing import Any
 from dataflow.supervision.plan import LogPlan, ProcessPlan, RunPlan
 from dataflow.supervision.rings import pairs_of
 
+BEYOND_A_LINK = 64
+"""Windows of messages that the live sources of another machine may be ahead."""
 Config = tuple[str, dict[str, Any]]
 """Kind of process ("operators" or "sink"), and the fields of its `ProcessConfig` or `SinkConfig`."""
 
@@ -58,12 +60,21 @@ def _operators(
         "listen": [endpoints[process.label], *(plan.graph.network.listen if first else ())],
         "replay": replay_of(plan.log) if process.has_log else None,
         "window": list(plan.window),
+        "ahead": _ahead(plan) if plan.live and process.machine is not None else None,
         "rate": 1.0 if plan.live and plan.rate is None else plan.rate,
         "paused": plan.paused,
         "paranoid": plan.paranoid,
         "firings": plan.keeps_records,
         "warm": warm_start_of(plan.log),
     }
+
+
+def _ahead(plan: RunPlan) -> list[int]:
+    """Returns the messages and bytes that live sources of another machine may be ahead of the graph, of which they hear
+    by a link that may be slow or away for a while: as much as waits for a link."""
+    from dataflow.machines.pipe import MOST_WAITING  # most runs need no network
+
+    return [plan.window[0] * BEYOND_A_LINK, max(plan.window[1], MOST_WAITING)]
 
 
 def replay_of(log: LogPlan | None) -> dict[str, Any] | None:

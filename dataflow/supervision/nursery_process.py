@@ -28,7 +28,7 @@ import msgpack
 import psutil
 
 from dataflow.execution.threads import take_over
-from dataflow.process.polling import readable
+from dataflow.process.polling import readable, received
 
 LEAVE_WITHIN = 12.0
 """Seconds that its children get after the supervisor is gone."""
@@ -91,7 +91,7 @@ def serve(connection: socket.socket) -> None:
             if pidfd != connection.fileno():
                 _ended(connection, children, pidfd)
         if connection.fileno() in ready:
-            request, given, _, _ = socket.recv_fds(connection, 1, MOST_DESCRIPTORS)
+            request, given = received(connection, 1, MOST_DESCRIPTORS)
             if not request:
                 break
             descriptors += given

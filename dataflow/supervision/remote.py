@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.execution.threads import THREADS, environment
+from dataflow.graph.model import Node
 from dataflow.graph.sections import Network
 from dataflow.machines import files
 from dataflow.machines.gate import Routes
@@ -65,7 +66,8 @@ class Remote:
         self.facts: dict[str, dict[str, str]] = {}
         """Metadata of a recording: the facts of each machine (`machine_facts`), as its agent reports them."""
         self._noted: set[str] = set()
-        self._ending = False
+        self.ending = False
+        """The machines are being let go."""
         self.ended = False
         """The link's process has ended."""
         here.spawn(LINK)
@@ -128,17 +130,20 @@ class Remote:
         graph = self._plan.graph
         labels = [label for label, at in self.machine_of.items() if at == machine]
         nodes = [graph.nodes[name] for label in labels for name in self._processes[label].nodes]
+        params = [node.params for node in nodes]
         gate = gate_of(machine)
         wanted = environment(graph.threads)
         try:
-            self._files[machine] = files.files_of((node.params for node in nodes), Path.cwd())
+            self._files[machine] = files.files_of(params, Path.cwd())
         except files.FilesError as error:
             raise RunFailed(str(error)) from error
         self._missing[machine] = "is being given its files"
         self._say(
             machine,
             "prepare",
-            code=files.code_of(node.use for node in nodes),
+            code=files.code_of(
+                (node.use for node in nodes), files.texts_of(params + [_defaults(node) for node in nodes])
+            ),
             python=files.python(),
             files=self._files[machine],
             uses=[node.use for node in nodes],
@@ -196,7 +201,7 @@ class Remote:
 
     def close(self) -> None:
         """Lets the machines go; the link ends when they know."""
-        self._ending = True
+        self.ending = True
         for machine in self._machines:
             self._say(machine, "over")
         self._here.send(LINK, "leave", {})
@@ -210,13 +215,13 @@ class Remote:
                 raise RunFailed(f"the link to other machines failed: {fields['summary']}", fields["traceback"])
             case events.Said(_, kind, fields):
                 self._heard(kind, fields)
-            case events.NotReading(_, seconds, waiting, True) if not self._ending:
+            case events.NotReading(_, seconds, waiting, True) if not self.ending:
                 raise RunFailed(
                     f"the link to other machines has read nothing for {seconds:.1f} s; {waiting} words wait"
                 )
             case events.Died():
                 self.ended = True
-                if not self._ending:
+                if not self.ending:
                     raise RunFailed("the link to other machines died")
 
     def _heard(self, kind: str, fields: Mapping[str, Any]) -> None:
@@ -287,6 +292,10 @@ class Remote:
                 del self._missing[machine]
             case "failed":
                 raise RunFailed(f"machine {machine!r}: {fields['why']}")
+
+
+def _defaults(node: Node) -> dict[str, Any]:
+    return {name: declared.default for name, declared in node.spec.parameters.model_fields.items()}
 
 
 def link_of(live: bool, processes: Mapping[str, ProcessPlan], pairs: Pairs, gate: str) -> dict[str, Any]:

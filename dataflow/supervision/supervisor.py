@@ -126,8 +126,8 @@ class Supervisor:
             stack.callback(self._here.bury)
             self._selector.register(self._woken, selectors.EVENT_READ, None)
             if LINK in self._endpoints:
+                stack.callback(self._part)  # machines that were shown what they need are told of any end
                 self._meet(pairs)
-                stack.callback(self._part)
             over = self._loop()
         if over.failure is not None:
             raise over.failure
@@ -243,6 +243,8 @@ class Supervisor:
         try:
             self._remote.take(event)
         except RunFailed as failure:
+            if self._remote.ending:
+                return
             if self.core.run.release is None and self._remote.waits_for:
                 raise
             self._feed(events.Aborted(str(failure)))

@@ -6,6 +6,8 @@ import contextlib
 import itertools
 import json
 import os
+import re
+import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +18,7 @@ from typing import Any, Literal
 import xxhash
 
 from dataflow.environments import EnvError, environment_of, packages_in
+from dataflow.extras import missing_extra
 from dataflow.graph.code import files_of
 from dataflow.graph.model import Graph, current_path
 from dataflow.graph.problems import GraphError
@@ -164,21 +167,41 @@ def _local(path: Path, digests: Digests) -> Iterator[Source]:
 
 
 def _remote(url: str) -> Iterator[Source]:
-    import fsspec  # of the extra `ray`
-
     try:
+        import fsspec  # of the extra `remote`
+
         store, path = fsspec.core.url_to_fs(url)
-    except (ImportError, ValueError) as error:  # no such protocol, or its package is not installed
-        raise SweepError(f"{url} cannot be read: {error}") from error
-    if not store.exists(path):
-        raise SweepError(f"no file or folder {url}")
-    files = [path] if store.isfile(path) else sorted(p for p in store.find(path) if p.endswith(SUFFIXES))
-    if not files:
+        found = list(_stored(store, path))
+    except FileNotFoundError as error:
+        why = f": {error.__cause__}" if error.__cause__ else ""
+        raise SweepError(f"no file or folder {url}{why}") from None
+    except Exception as error:  # whatever stores raise: no such protocol, a package that lacks, no access, no network
+        why = str(error) or type(error).__name__
+        raise SweepError("; ".join(filter(None, (f"{url} cannot be read: {why}", missing_extra(error))))) from error
+    if not found:
         raise SweepError(f"{url} holds no recording (no file that ends in {', '.join(SUFFIXES)}, at any depth)")
+    yield from found
+
+
+def _stored(store: Any, path: str) -> Iterator[Source]:
+    """Yields the recordings of a store at a path. A web server's folder is a file, too: its list."""
+    if file_name(path).endswith(SUFFIXES):
+        files = [path]
+    else:
+        files = sorted(p for p in store.find(path) if file_name(p).endswith(SUFFIXES))
+        if not files:
+            store.info(path)  # raises FileNotFoundError where there is no such folder
     for file in files:
-        name = file.removeprefix(path).lstrip("/") or Path(file).name
+        name = file.removeprefix(path).lstrip("/") or file_name(file)
         mark = {key: str(value) for key, value in store.info(file).items()}  # sizes, times, entity tags
+        if not any(re.search("tag|time|modified|created|version|md5|digest", key, re.I) for key in mark):
+            mark["read"] = secrets.token_hex(16)  # other bytes of the same size would not be told apart
         yield Source(visible(name), store.unstrip_protocol(file), _digest((store.ukey(file), mark)))
+
+
+def file_name(url: str) -> str:
+    """Returns the name of a URL's file, without the query of a web address."""
+    return Path(url.partition("?")[0] if url.startswith(("http://", "https://")) else url).name
 
 
 def command_of(what: What) -> str:
@@ -266,7 +289,7 @@ class Code:
             )
         described = graph.to_json()
         parts = [described[part] for part in ("nodes", "streams", "seed", "threads", "namespace")]
-        used = sorted({current_path(node.use).partition(":")[0] for node in graph.nodes.values()})
+        used = sorted({_home(node.use) for node in graph.nodes.values()})
         files = sorted(set(_files_named([node.params for node in graph.nodes.values()])))
         code = [self._package(name) for name in used]
         envs = [self._packages_of(env) for env in sorted({node.env for node in graph.nodes.values() if node.env})]
@@ -289,6 +312,14 @@ class Code:
 
     def _code(self, files: Sequence[Path]) -> str:
         return _digest([f.name, self._digests.of(f)] for f in files if f.parent.name != "__pycache__")
+
+
+def _home(use: str) -> str:
+    """Returns the module that has an operator; as it is named, where its package cannot be imported."""
+    try:
+        return current_path(use).partition(":")[0]
+    except (Exception, SystemExit):  # of a recording: its run fails with the reason
+        return use.partition(":")[0]
 
 
 def _files_named(value: Any) -> Iterator[Path]:

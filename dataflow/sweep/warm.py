@@ -17,7 +17,7 @@ from typing import Any, Literal
 import msgpack
 
 from dataflow.execution.threads import environment
-from dataflow.process.polling import readable
+from dataflow.process.polling import readable, received
 
 STEP = 0.2
 """Seconds between two looks at whether to stop."""
@@ -112,8 +112,8 @@ class Worker:
         """Returns an answer with its descriptors; None where the process is gone, or it is time to stop."""
         while not _over(deadline, stop):
             if readable([connection], min(STEP, max(0.0, deadline - time.monotonic()))):
-                data, handles, _, _ = socket.recv_fds(connection, 1 << 16, 1)
-                return (msgpack.unpackb(data) if data else None), list(handles)
+                data, handles = received(connection, 1 << 16, 1)
+                return (msgpack.unpackb(data) if data else None), handles
         return None, []
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ from functools import partial
 import msgpack
 
 from dataflow.parent import end_with_parent
-from dataflow.process.polling import readable
+from dataflow.process.polling import readable, received
 from dataflow.process.start import become_warm, fork, threads
 from dataflow.supervision.nursery_process import PRELOAD as OPERATORS
 from dataflow.supervision.nursery_process import adopt_orphans, end_orphans
@@ -62,7 +62,7 @@ def command(words: Sequence[str]) -> int:
 
 def fetch(words: Sequence[str]) -> int:
     """Fetches a URL that fsspec opens into a file; returns the exit code."""
-    import fsspec  # of the extra `ray`
+    import fsspec  # of the extra `remote`
 
     end_with_parent()
     url, file = words
@@ -85,7 +85,7 @@ def serve(connection: socket.socket) -> None:
     loaded = set[str]()
     become_warm()
     while True:
-        data, given, _, _ = socket.recv_fds(connection, MOST_BYTES, 2)
+        data, given = received(connection, MOST_BYTES, 2)
         if not data:
             return
         call, words, operators = msgpack.unpackb(data)

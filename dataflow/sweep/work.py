@@ -16,7 +16,7 @@ from typing import Any, Literal, cast
 import xxhash
 
 from dataflow.recording.mcap.index import NO_END
-from dataflow.sweep.plan import Task
+from dataflow.sweep.plan import Task, file_name
 from dataflow.sweep.warm import Worker
 
 Outcome = Literal["done", "failed", "killed", "timed out", "not fetched"]
@@ -81,7 +81,7 @@ def _once(task: Task, timeout: float, worker: Worker, stop: Event | None) -> Res
         output = Path(name, PRINTED), Path(name, LOG)
         where, code = task.source.where, cast("int | None", 0)
         if "://" in where:
-            where = str(Path(name, Path(where).name))
+            where = str(Path(name, file_name(where)))
             code = worker.call("fetch", [task.source.where, where], (), output, timeout, stop)
         if got := code == 0:
             words = [where if word is None else word for word in task.words]

@@ -104,7 +104,7 @@ class ImageFolder(CalibratedImages):
             for entry in entries:
                 name = entry.name
                 fits = os.path.splitext(name)[1].lower() in SUFFIXES and fnmatch.fnmatchcase(name, self.pattern)
-                if name in known or not fits:
+                if name in known or not fits or not entry.is_file():  # reading a pipe would wait
                     continue
                 try:
                     found = entry.stat()

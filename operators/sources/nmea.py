@@ -29,6 +29,7 @@ _ADDRESS = re.compile(r"[A-Z0-9]{2}([A-Z]{3})")
 _NUMBER = re.compile(r"-?(?:\d{1,9}(?:\.\d{0,12})?|\.\d{1,12})")
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d{0,9}))?")
 _PLACE = re.compile(r"(\d{2,3})(\d\d(?:\.\d{0,12})?)")
+_QUALITY = re.compile("[0-9]?")
 _STATUS = {"1": "fix", "2": "sbas", "3": "fix", "4": "rtk_fixed", "5": "rtk_float", "9": "sbas"}
 """By the quality of GGA. Dead reckoning (6), manual input (7) and simulation (8) are no fixes."""
 
@@ -130,13 +131,17 @@ class Receiver:
 
     def _position(self, sentence: Sentence) -> NavSatFix | None:
         time, lat, north, lon, east, quality, satellites, dilution, height, _, geoid = sentence.fields[:11]
+        if not _QUALITY.fullmatch(quality):
+            raise ValueError(f"{quality!r} is no quality")
         status = _STATUS.get(quality, "no_fix")
         fixed = status != "no_fix"
         latitude = _place(lat, north, "NS", 90) if fixed else math.nan
         longitude = _place(lon, east, "EW", 180) if fixed else math.nan
         altitude = number(height) + number(geoid) if fixed and height and geoid else math.nan
         errors = self._error(status, _time(time), number(dilution) if dilution else 0.0) if fixed else None
-        seen = int(number(satellites)) if satellites else None
+        seen = _count(satellites) if satellites else None
+        if time:
+            _time(time)
         stamp = self._stamp(sentence.arrival, time)
         if stamp is None:
             return None
@@ -193,6 +198,12 @@ def number(text: str) -> float:
     if not _NUMBER.fullmatch(text):
         raise ValueError(f"{text!r} is no number")
     return float(text)
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise ValueError(f"{text!r} is no count")
+    return int(number(text))
 
 
 def _time(text: str) -> int:

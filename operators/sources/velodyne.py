@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import struct
 import threading
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +18,14 @@ from operators.sources.ports import lost_datagrams, read_port, udp_port
 
 PACKET = 1206
 """Bytes of a packet with points."""
+_PCAP_HEADER, _RECORD_HEADER = 24, 16
+_OTHER_KINDS = (
+    (b"\x0a\x0d\x0d\x0a", "a pcapng file", "editcap -F pcap IN.pcapng OUT.pcap"),
+    (b"\x1f\x8b", "compressed (gzip)", "gunzip it"),
+)
+_BLOCK = 100
+_MARKS = (b"\xff\xee", b"\xff\xdd")
+"""Of upper and of lower blocks; only an HDL-64E has lower ones."""
 SILENCE = 500_000_000
 """Nanoseconds without packets after which a turn that has begun is dropped."""
 
@@ -36,7 +45,8 @@ class _Velodyne(Source, abstract=True):
         "arrival", doc="clock of the stamps; `sensor` is its time within the hour, of satellites or free, at this hour"
     )
 
-    _packets, _others, _early, _last, _arrived = 0, 0, 0, -1, 0
+    _packets, _others, _unknown, _early, _last, _arrived = 0, 0, 0, 0, -1, 0
+    _refused = ""
 
     @abstractmethod
     def _received(self) -> Iterator[tuple[int, bytes]]:
@@ -55,20 +65,22 @@ class _Velodyne(Source, abstract=True):
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         for arrival, data in self._received():
-            if len(data) != PACKET:  # position packets, other programs
+            if not _has_points(data):  # position packets, other programs
                 self._others += bool(data)
                 continue
             if arrival - self._arrived > SILENCE:
                 self._begin()
             self._packets, self._arrived = self._packets + 1, arrival
-            yield from self._clouds(self._decoder.decode(arrival * 1e-9, data))
-        yield from self._clouds(self._decoder.finish())
+            yield from self._clouds(self._turn(self._decoder.decode, arrival * 1e-9, data))
+        yield from self._clouds(self._turn(self._decoder.finish))
 
     def summary(self) -> Mapping[str, int | str]:
         found = {"clock": self.clock, "packets": self._packets, "other_datagrams": self._others}
-        return {**found, "past": self._early}
+        return {**found, "undecoded": self._unknown, "past": self._early}
 
     def finding(self) -> str:
+        if self._refused and self._last < 0:
+            return f"{self._packets} packets, none that can be decoded: {self._refused}"
         if self._others and not self._packets:
             return f"{self._others} datagrams, none of {PACKET} bytes: is it a Velodyne LiDAR, is that its data port?"
         return ""
@@ -79,6 +91,15 @@ class _Velodyne(Source, abstract=True):
         model = getattr(library.Model, self.model) if self.model else None
         settings = library.Config(model=model, min_range=self.min_range, max_range=self.max_range)
         self._decoder = library.StreamDecoder(settings)
+
+    def _turn(self, decode: Callable[..., Any], *given: Any) -> Any:
+        """Returns what the decoder gives; nothing for packets of a model that it does not know, or of another one."""
+        try:
+            return decode(*given)
+        except RuntimeError as error:
+            self._refused, self._unknown = str(error), self._unknown + 1
+            self._begin()  # the decoder would come upon the same packet again; this turn is lost
+        return None
 
     def _clouds(self, turn: Any) -> Iterator[Mapping[str, Message]]:
         if turn is None or not len(turn[1]):
@@ -110,26 +131,61 @@ class VelodyneFile(_Velodyne):
 
     input: str = Param(min_length=1, doc="the file")
 
+    _broken_off = ""
+
     def setup(self) -> None:
         """Raises SourceError, FileNotFoundError."""
         self._path = self.use_file(Path(self.input).expanduser())
         super().setup()
 
     def finding(self) -> str:
-        """Returns what is wrong with the file, where nothing came out of it."""
+        """Returns what is wrong with the file, where nothing came out of it, or not all."""
         if not (self._packets or self._others):
             return f"{self._path.name} holds no packet"
-        return super().finding()
+        return super().finding() or self._broken_off
 
     def _received(self) -> Iterator[tuple[int, bytes]]:
         util = self._library.util
+        self._check_kind()
         try:
             for stamp, data in util.iter_pcap(self._path):
                 yield round(float(stamp) * 1e9), bytes(data)
         except (ValueError, util.dpkt.Error) as error:
             if not self._packets:
                 raise SourceError(f"{self._path} is no capture of packets (pcap): {error}") from error
-            self.log.warning("%s breaks off after %d packets: %s", self._path, self._packets, error)
+            self._broken_off = str(error)
+        if self._broken_off or _is_cut(self._path):
+            self._broken_off = f"{self._path.name} breaks off in a packet: {self._packets} before it were read"
+            self.log.warning("%s", self._broken_off)
+
+    def _check_kind(self) -> None:
+        """Raises SourceError for a file that would only have to be converted."""
+        with self._path.open("rb") as file:
+            magic = file.read(4)
+        for begins, kind, how in _OTHER_KINDS:
+            if magic.startswith(begins):
+                raise SourceError(f"{self._path} is {kind}, not a pcap: {how}")
+
+
+def _has_points(data: bytes) -> bool:
+    """Returns whether it is a packet with points: twelve blocks, each of which begins with its mark."""
+    return len(data) == PACKET and all(data[at : at + 2] in _MARKS for at in range(0, 12 * _BLOCK, _BLOCK))
+
+
+def _is_cut(path: Path) -> bool:
+    """Returns whether a pcap ends within a packet."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        order = "<" if file.read(_PCAP_HEADER)[:1] in b"\xd4\x4d" else ">"
+        at = _PCAP_HEADER
+        while head := file.read(_RECORD_HEADER):
+            if len(head) < _RECORD_HEADER:
+                return True
+            at += _RECORD_HEADER + int(struct.unpack(f"{order}8xI4x", head)[0])
+            if at > size:
+                return True
+            file.seek(at)
+    return False
 
 
 class VelodyneLidar(_Velodyne):

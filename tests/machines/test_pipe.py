@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from dataflow.machines import pipe as pipes
-from dataflow.machines.pipe import Clocks, Pipe
+from dataflow.machines.pipe import Clocks, Pipe, Room
 
 
 class Link:
@@ -109,6 +109,74 @@ def test_what_waits_for_a_dead_link_is_bounded_and_what_must_not_be_missed_is_ke
     assert a.dropped == 100 - len(kept) > 80
     a.close()
     b.close()
+
+
+@pytest.mark.parametrize("size", [0, 1, pipes.PIECE, pipes.PIECE + 1, 5 * pipes.PIECE, 1_000_003])
+def test_a_long_frame_goes_in_pieces_and_comes_whole(link: Link, size: int) -> None:
+    taken: list[bytes] = []
+    sizes: list[int] = []
+    passed = iter(range(1_000_000))
+    link.loses = lambda payload: sizes.append(len(payload)) or next(passed) % 5 == 2  # type: ignore[func-returns-value]
+    a, b = ends(link, taken)
+    frames = [b"before", bytes(range(256)) * (size // 256) + b"e" * (size % 256), b"behind"]
+
+    for frame in frames:
+        a.send(frame)
+
+    assert emptied(a)
+    assert taken == frames
+    assert max(sizes) <= pipes.PIECE + 100
+    a.close()
+    b.close()
+
+
+class SlowLink:
+    """A link that takes any number of bytes, in steps of a millisecond: what stands in it delays what follows."""
+
+    def __init__(self, rate: float, delay: float) -> None:
+        self.rate, self.delay = rate, delay
+        self.room = Room()
+        self.now = self.free = 0.0
+        self.flying: list[tuple[float, float]] = []  # of each piece: when it was sent, when it is acknowledged
+        self.delivered = 0
+
+    def go(self, seconds: float, *, stands: bool = False) -> float:
+        """Sends as much as there is room for; returns how long (s) a beat would wait at the most."""
+        worst, end = 0.0, self.now + seconds
+        if stands:
+            self.free = max(self.free, self.now) + seconds
+            self.flying = [(sent, at + seconds) for sent, at in self.flying]
+        while self.now < end:
+            self.now += 0.001
+            while self.flying and self.flying[0][1] <= self.now:
+                filled = len(self.flying) * pipes.PIECE >= self.room.bytes - pipes.PIECE
+                sent, _ = self.flying.pop(0)
+                self.delivered += pipes.PIECE
+                self.room.taken(sent, self.now, pipes.PIECE, filled=filled)
+            while len(self.flying) * pipes.PIECE < self.room.bytes:
+                self.free = max(self.free, self.now) + pipes.PIECE / self.rate
+                self.flying.append((self.now, self.free + self.delay))
+            worst = max(worst, self.free - self.now)
+        return worst
+
+
+@pytest.mark.parametrize("delay", [0.002, 0.3])
+@pytest.mark.parametrize("rate", [125e3, 1e6, 20e6])
+def test_a_slow_link_is_used_up_and_what_is_on_it_delays_a_beat_by_less_than_a_silence(
+    rate: float, delay: float
+) -> None:
+    link = SlowLink(rate, delay)
+
+    assert link.go(20) < pipes.AWAY_AFTER
+    link.go(10, stands=True)
+    link.go(10)
+    assert link.go(10) < pipes.AWAY_AFTER
+    before = link.delivered
+    link.go(10)
+    assert link.delivered - before > 0.8 * min(rate, pipes.IN_FLIGHT_BYTES / delay) * 10
+    link.rate = rate / 8  # the robot has driven away
+    link.go(10)
+    assert link.go(10) < pipes.AWAY_AFTER or link.rate < 20e3
 
 
 def test_the_offset_of_clocks_is_that_of_the_shortest_exchange() -> None:

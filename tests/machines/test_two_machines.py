@@ -125,6 +125,9 @@ def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
     assert (robot.folder / "models/factor.txt").read_text() == "3.5"
     assert (robot.folder / "models/large.bin").stat().st_size == 70 << 20
     assert not list((robot.folder / "models").glob("*.part"))
+    Path("models/factor.txt").unlink()
+    with pytest.raises(RunFailed, match=r"models/factor\.txt is missing where the run is started"):
+        two(robot, text)
     theirs = robot.code / "machine_operators.py"
     before = theirs.read_text()
     theirs.write_text(before + "# changed there\n")
@@ -135,6 +138,36 @@ def test_files_that_parameters_name_are_sent_and_code_that_differs_is_named(
         descriptors.append(settled(psutil.Process(robot.process.pid).num_fds))
     theirs.write_text(before)
     assert descriptors[0] == descriptors[1]
+
+
+@pytest.mark.long
+def test_a_machine_that_lacks_a_module_is_named_let_go_and_takes_the_next_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its agent has not imported the operators then, and no process was begun."""
+    for place in ("here", "there"):
+        shutil.copytree(HERE, tmp_path / place)
+        own = tmp_path / place / "scales"
+        own.mkdir()
+        (own / "gains.py").write_text("GAIN = 2.0\n")
+        (tmp_path / place / "own_scale.py").write_text(
+            "from machine_operators import Scale\nfrom scales.gains import GAIN\nclass OwnScale(Scale): pass\n"
+        )
+    (tmp_path / "there" / "scales" / "gains.py").unlink()
+    monkeypatch.syspath_prepend(tmp_path / "here")
+    endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
+    agent = join("robot", endpoint, tmp_path / "files", code=tmp_path / "there")
+    text = GRAPH.replace("SIZE", "1").replace(", MORE", "")
+    other = text.replace('there: {use: "machine_operators:Scale"', 'there: {use: "own_scale:OwnScale"')
+
+    with pytest.raises(RunFailed, match=r"machine 'robot' cannot take part: scales/gains\.py is missing"):
+        run(load_text(other), machines=Meeting(endpoint))
+    report = run(load_text(text), machines=Meeting(endpoint))
+    with pytest.raises(RunFailed, match="is missing"):
+        run(load_text(other), machines=Meeting(endpoint))
+
+    assert report.summaries["there"]["taken"] == 120
+    assert "was not heard" not in end(agent)
 
 
 @pytest.mark.long

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ from dataflow.sweep import plan
 from dataflow.sweep.plan import Code, Digests, SweepError, sources_in, tasks_of
 
 MODULE = """
+import importlib
+
 from gains.front import GAIN
 
 from dataflow.messages import FeatureVector
@@ -24,6 +27,7 @@ class Numbers(Source):
     command = ("./brightness",)
 
     def stream(self):
+        importlib.import_module("late_gain")
         yield {"out": FeatureVector(stamp=1, vectors=[[GAIN]], model="m")}
 """
 GRAPH = """
@@ -39,6 +43,7 @@ def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Graph:
     """A graph with an operator of a plain module, which imports a package beside it and names a program."""
     (tmp_path / "swept_plainly.py").write_text(MODULE)
     (tmp_path / "brightness").write_text("a program")
+    (tmp_path / "late_gain.py").write_text("GAIN = 3\n")
     (tmp_path / "gains").mkdir()
     (tmp_path / "gains" / "front.py").write_text("GAIN = 2\n")
     monkeypatch.chdir(tmp_path)
@@ -52,7 +57,7 @@ def key(graph: Graph | None, tmp_path: Path) -> str:
     return Code(Digests(tmp_path / "none.json"), ()).of(graph)
 
 
-@pytest.mark.parametrize("file", ["swept_plainly.py", "gains/front.py", "brightness"])
+@pytest.mark.parametrize("file", ["swept_plainly.py", "gains/front.py", "late_gain.py", "brightness"])
 @pytest.mark.parametrize("known", [True, False])
 def test_all_code_of_an_operator_counts(graph: Graph, tmp_path: Path, file: str, known: bool) -> None:
     """Of a graph that is not known, as one in a recording elsewhere, all operators here."""
@@ -62,6 +67,11 @@ def test_all_code_of_an_operator_counts(graph: Graph, tmp_path: Path, file: str,
         code.write("# another version\n")
 
     assert key(graph if known else None, tmp_path) != before
+
+
+def test_operators_that_cannot_be_imported_here_fail_in_their_own_runs(graph: Graph, tmp_path: Path) -> None:
+    gone = replace(graph, nodes={"gone": replace(graph.nodes["numbers"], use="not_here.at_all:Gone")})
+    assert key(gone, tmp_path) != key(graph, tmp_path)
 
 
 def test_packages_of_an_environment_count(graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

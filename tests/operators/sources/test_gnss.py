@@ -130,6 +130,10 @@ GOOD = gga("120000")
         (gga("120000", place="4861.0,N,01131.000,E"), 1),
         (gga("120000", dilution="nan"), 1),
         (sentence("GPGGA,120000"), 1),
+        (sentence("GPGGA,999999.99,9999.0,Q,nan,E,inf,-8,1e999,nan,M,,M,,"), 1),
+        (sentence("GPGGA,120000,,,,,E,,,,M,,M,,"), 1),
+        (sentence("GPGGA,120000,,,,,0,-8,,,M,,M,,"), 1),
+        (sentence("GPGGA,999999,,,,,0,00,,,M,,M,,"), 1),
         (rmc("120000", "320394"), 1),
         (rmc("120000", "2303945"), 1),
         (sentence("PUBX,00,120000"), 0),  # proprietary

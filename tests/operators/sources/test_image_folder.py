@@ -144,6 +144,17 @@ def test_images_that_come_are_read_once_whole(tmp_path: Path) -> None:
     assert source.summary() == {"clock": "number", "left_out": 0}
 
 
+def test_what_is_no_file_is_no_image(tmp_path: Path) -> None:
+    """Reading a pipe would wait for who writes into it."""
+    fill(tmp_path, "a_1.png", "a_3.png")
+    os.mkfifo(tmp_path / "a_2.png")
+    (tmp_path / "a_4.png").mkdir()
+    (tmp_path / "a_5.png").symlink_to("nowhere.png")
+    source = ImageFolder(path=str(tmp_path))
+    assert len(play(source)["image"]) == 2
+    assert source.summary()["passed_over"] == 0
+
+
 def test_images_that_are_late_or_damaged_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     fill(tmp_path, "5.png")
     source = growing(

@@ -75,7 +75,7 @@ def test_clouds_of_a_capture_have_the_sensors_geometry_and_times(tmp_path: Path)
     assert set(cloud.intensities) == set(range(16))
     assert np.ptp(cloud.time_offsets) == pytest.approx(75 * EVERY, abs=2 * EVERY)
     assert clouds[2].stamp - cloud.stamp == pytest.approx(75 * EVERY * 1e9, abs=2e3)
-    assert source.summary() == {"clock": "arrival", "packets": 230, "other_datagrams": 1, "past": 0}
+    assert source.summary() == {"clock": "arrival", "packets": 230, "other_datagrams": 1, "undecoded": 0, "past": 0}
 
 
 @need
@@ -92,6 +92,48 @@ def test_the_sensors_clock_gives_the_time_within_the_hour(tmp_path: Path) -> Non
 def test_a_capture_that_breaks_off_gives_what_it_holds(tmp_path: Path) -> None:
     clouds = play(VelodyneFile(input=str(capture(tmp_path / "a.pcap", [packet(k) for k in range(160)], cut=1250))))
     assert len(clouds["cloud"]) == 3
+
+
+@need
+@pytest.mark.parametrize("cut", [1, 700, 1247, 1250])  # in its data, or in its header
+def test_a_capture_that_breaks_off_in_a_packet_says_so(tmp_path: Path, cut: int) -> None:
+    source = VelodyneFile(input=str(capture(tmp_path / "a.pcap", [packet(k) for k in range(100)], cut=cut)))
+    play(source)
+    assert source.finding().startswith("a.pcap breaks off in a packet: 99")
+    whole = VelodyneFile(input=str(capture(tmp_path / "b.pcap", [packet(k) for k in range(100)])))
+    play(whole)
+    assert whole.finding() == ""
+
+
+@need
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [(b"\x0a\x0d\x0d\x0a" + bytes(60), "a pcapng file, not a pcap: editcap"), (b"\x1f\x8b" + bytes(60), "gzip")],
+)
+def test_a_capture_of_another_kind_is_named_with_what_converts_it(tmp_path: Path, content: bytes, kind: str) -> None:
+    (tmp_path / "a.pcap").write_bytes(content)
+    source = VelodyneFile(input=str(tmp_path / "a.pcap"))
+    source.setup()
+    with pytest.raises(SourceError, match=kind):
+        list(source.stream())
+
+
+@need
+def test_packets_of_others_that_have_the_size_of_a_velodynes_are_counted(tmp_path: Path) -> None:
+    turns = [packet(k) for k in range(160)]
+    other_model, foreign = packet(0)[:-1] + b"\x46", b"\xff" * 1206
+    strange = [foreign, other_model]
+    source = VelodyneFile(input=str(capture(tmp_path / "a.pcap", [foreign, *turns[:100], *strange, *turns[100:]])))
+
+    sizes = [len(cloud.points) // 384 for cloud in play(source)["cloud"]]
+
+    assert sizes == [75, 59]  # with a packet of another model the turn is lost that had begun
+    assert source.summary()["other_datagrams"] == 2
+    assert source.summary()["undecoded"] == 1
+    assert source.finding() == ""
+    alone = VelodyneFile(input=str(capture(tmp_path / "b.pcap", strange)))
+    assert play(alone)["cloud"] == []
+    assert alone.finding().startswith("1 packets, none that can be decoded: Data from an unsupported")
 
 
 @need

@@ -14,7 +14,7 @@ from dataflow.execution.live import LiveRunner
 from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import OutputPorts
 from dataflow.execution.runner import OperatorRunner
-from dataflow.machines.pipe import _FRAME, Pipe
+from dataflow.machines.pipe import _END, _FRAME, Pipe
 from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import ChannelClosed, QueuedChannel
 from dataflow.process.streams.losses import LossTold
@@ -228,8 +228,8 @@ class GapTaken(Mutant):
         right = Pipe._on_frame
 
         def on_frame(self: Pipe, sample: Any) -> None:
-            _, number, mark = _FRAME.unpack_from(sample.payload.to_bytes())
-            if number > self._expected and not mark:
+            _, number, kind = _FRAME.unpack_from(sample.payload.to_bytes())
+            if number > self._expected and kind == _END:
                 self._expected = number
             right(self, sample)
 

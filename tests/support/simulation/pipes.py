@@ -25,6 +25,7 @@ SETTLES = 60.0
 SMALL: Bindings = {
     ("dataflow.machines.pipe", "IN_FLIGHT"): 16,
     ("dataflow.machines.pipe", "IN_FLIGHT_BYTES"): 8_000,
+    ("dataflow.machines.pipe", "PIECE"): 1_000,
     ("dataflow.machines.pipe", "ACKNOWLEDGE_AFTER"): 4,
     ("dataflow.machines.pipe", "MOST_WAITING"): 20_000,
 }
