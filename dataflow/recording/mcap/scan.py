@@ -37,8 +37,7 @@ class Scan:
         self.end = len(MAGIC)
         self.whole = False
         self.salvaged = ""
-        self.believed = False
-        """Whether messages were taken from an index, and not from their chunk."""
+        self.believed = False  # that messages lie where an index puts them
         self._file = file
         self._in_vain = 0
         self._sealed, self._trusting, self._lenient = sealed, trusting, lenient
