@@ -26,10 +26,15 @@ operators:
 
 
 def poses(
-    path: Path, compression: CompressionType = CompressionType.ZSTD, *, summary: bool = True, bad: int | None = None
+    path: Path,
+    compression: CompressionType = CompressionType.ZSTD,
+    *,
+    summary: bool = True,
+    bad: int | None = None,
+    text: bytes = b'{"timestamp": {"sec": 17',
 ) -> Path:
     """120 poses of another program, as Foxglove's JSON, and 120 messages of a schema that nobody knows, in 10 chunks
-    or so. `bad`: the number of a pose that is cut off."""
+    or so. `bad`: the number of a pose that is `text` instead."""
     plain = {} if summary else {"index_types": IndexType.NONE, "repeat_channels": False, "use_statistics": False}
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=4096, compression=compression, **plain)
@@ -41,7 +46,7 @@ def poses(
             place = {"position": {"x": i, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
             stamp = {"sec": time // SECOND, "nsec": time % SECOND}
             data = json.dumps({"timestamp": stamp, "frame_id": "map", "pose": place}).encode()
-            writer.add_message(pose, time, data[:-9] if i == bad else data, time, i)
+            writer.add_message(pose, time, text if i == bad else data, time, i)
             writer.add_message(other, time, b'{"number": %d, "text": "%s"}' % (i, b"abcdefgh" * 10), time, i)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
@@ -231,8 +236,9 @@ def test_what_cannot_be_read_in_both_is_not_the_same(tmp_path: Path) -> None:
     assert not any(stream.missing_in_a or stream.differing for stream in report.streams)
 
 
-def test_a_first_message_that_cannot_be_read_costs_itself_alone(tmp_path: Path) -> None:
-    with Recording(poses(tmp_path / "a.mcap", bad=0)) as recording:
+@pytest.mark.parametrize("text", [b"", b"null", b"[]", b"7", b'{"pose": 5}', b"\xff", b"[" * 9000])
+def test_a_first_message_that_cannot_be_read_costs_itself_alone(tmp_path: Path, text: bytes) -> None:
+    with Recording(poses(tmp_path / "a.mcap", bad=0, text=text)) as recording:
         assert len(list(recording.messages(["/pose"]))) == COUNT - 1
         assert recording.unread["/pose"].count == 1
 
