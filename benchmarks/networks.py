@@ -102,7 +102,7 @@ def recorded(file: Path) -> Iterator[WorldImage]:
                 assert isinstance(image, CompressedImage)
                 assert isinstance(objects, Detections2D)
                 assert isinstance(masks, SegmentationMap)
-                yield WorldImage("recorded", 0, decoder.process(image), objects, masks)
+                yield WorldImage("recorded", 0, decoder.decode(image), objects, masks)
 
 
 def opened(detector_file: Path, segmenter_file: Path) -> Pair:

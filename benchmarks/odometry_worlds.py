@@ -63,8 +63,8 @@ def _render(file: Path, kind: str, seed: int) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     np.savez(
         file,
-        image=np.array([color.process(m["image_jpeg"]).data for m in messages]),
-        depth=np.array([depth.process(m["depth_png"]).data for m in messages]),
+        image=np.array([color.decode(m["image_jpeg"]).data for m in messages]),
+        depth=np.array([depth.decode(m["depth_png"]).data for m in messages]),
         truth=np.array([m["ground_truth"].matrix() for m in messages]),
         stamps=np.array([m["image_jpeg"].stamp for m in messages], np.int64),
         K_color=color_info.K,

@@ -75,13 +75,13 @@ def frames(file: Path) -> None:
     """Decodes frames of the demo recording, doubles their sides, adds a sensor's noise, and stores them."""
     noise = np.random.default_rng(7)
     graph = load_graph(HERE.parent / "graphs" / "simulated_robot.yaml")
-    decoders = {"robot1/robot/image_jpeg": ImageDecoder(), "robot1/robot/depth_png": DepthDecoder()}
+    decoders: dict[str, Any] = {"robot1/robot/image_jpeg": ImageDecoder(), "robot1/robot/depth_png": DepthDecoder()}
     assert set(decoders) <= set(graph.streams)
     found: dict[str, list[Any]] = {stream: [] for stream in decoders}
     with Recording(HERE.parent / "recordings" / "demo.mcap") as recording:
         for stream, decoder in decoders.items():
             for _, recorded in zip(range(FRAMES), recording.messages([stream]), strict=False):
-                made: Any = decoder.process(recorded.message)
+                made: Any = decoder.decode(recorded.message)
                 data = made.data
                 found[stream].append(data.repeat(2, axis=0).repeat(2, axis=1))
     color, depth = (np.stack(each) for each in found.values())

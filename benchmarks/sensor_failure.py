@@ -53,11 +53,11 @@ def read(seconds: float) -> tuple[Steps, Steps, dict[str, Message]]:
     """What the sensors measured and the truth by stamp, and the calibrations."""
     whole = dataflow.open(DEMO)
     part = whole.between(0, seconds)
-    decoders = {"image": ImageDecoder(), "depth": DepthDecoder()}
+    decoders: dict[str, Any] = {"image": ImageDecoder(), "depth": DepthDecoder()}
     measured: Steps = {}
     for name, stream in STREAMS.items():
         for message in part[stream]:
-            made = decoders[name].process(message) if name in decoders else message
+            made = decoders[name].decode(message) if name in decoders else message
             measured.setdefault(message.stamp, {})[name] = made
     true: Steps = {}
     for name in TRUTH:

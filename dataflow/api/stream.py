@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, SupportsIndex, overload
@@ -16,6 +17,7 @@ from dataflow.arguments import checked
 from dataflow.graph.problems import did_you_mean
 from dataflow.messages.base import Field, Message
 from dataflow.recording import Recorded, Recording, StreamInfo
+from dataflow.recording.layout import Kind
 from dataflow.recording.streams.access import StreamIndex
 from dataflow.recording.streams.json_columns import Values
 
@@ -56,7 +58,15 @@ class RecordedStream(Sequence[Message]):
 
     @cached_property
     def _index(self) -> StreamIndex[Recorded]:
-        return self._recording.index(self.name)
+        index = self._recording.index(self.name)
+        if (unread := self._recording.unread.get(self.name)) is not None:
+            warnings.warn(f"{self._recording.path}: {self.name}: {unread}", stacklevel=3)
+        return index
+
+    @property
+    def partial(self) -> bool:
+        """Tells whether this is a part of the stream."""
+        return self._chosen is not None
 
     @cached_property
     def _places(self) -> Stamps:
@@ -75,7 +85,8 @@ class RecordedStream(Sequence[Message]):
     # ------------------------------------------------------------------------------------------------- messages
 
     def __len__(self) -> int:
-        return self.info.count if self._chosen is None else len(self._chosen)
+        foreign = self.info.message_type is not None and self.info.metadata.get("kind") != Kind.STREAM
+        return len(self._places) if foreign or self._chosen is not None else self.info.count
 
     def __iter__(self) -> Iterator[Message]:
         return (self._index.read(int(place)).message for place in self._places)
@@ -195,7 +206,7 @@ class RecordedStream(Sequence[Message]):
     def __repr__(self) -> str:
         found = self.info.message_type
         kind = found.SCHEMA if found is not None else self.info.schema or self.info.encoding
-        return f"<{self.name}: {len(self):,} × {kind}>"
+        return f"<{self.name}: {facts_of(self).messages:,} × {kind}>"
 
     def _repr_html_(self) -> str:
         return stream_html(facts_of(self))
@@ -207,7 +218,8 @@ def _stamp(seconds: float | None, origin: int) -> int | None:
 
 def facts_of(stream: RecordedStream) -> StreamFacts:
     """Sums up a stream, or a part of one."""
-    info, count = stream.info, len(stream)
+    info = stream.info
+    count = len(stream) if stream.partial else info.count
     if count in (0, info.count):
         return StreamFacts(stream.name, info, count, info.first, info.last)
     return StreamFacts(stream.name, info, count, int(stream.stamps.min()), int(stream.stamps.max()))

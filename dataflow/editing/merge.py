@@ -84,7 +84,7 @@ def merge(
             topics = {c: prefixed(prefix, origin.channels[c].topic) for c in masks} if prefix else {}
             copy_messages(copy, origin, masks, _further(watch, before, total), topics)
             before += sum(int(mask.sum()) for mask in masks.values())
-            done.lose(origin.path, origin.lost, origin.reasons)
+            done.lose(origin)
         copy.frames(prefixes[0] + origins[0].namespace, _framing(origins, kept))
     done.bytes = out.stat().st_size
     with Origin(out) as made:

@@ -21,7 +21,6 @@ from dataflow.graph.model import Graph, Node, OperatorImportError
 from dataflow.interop.bag import is_latched
 from dataflow.recording import Recording
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, Kind
-from dataflow.recording.mcap.index import NO_END
 from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.streams.copying import RUN_KINDS, Copy, Mask, Origin, framing, places
 from dataflow.recording.streams.cutting import Cut, cut_of
@@ -156,10 +155,7 @@ def write_part(
     done.bytes = out.stat().st_size
     for stream, number in origin.lost.items():
         done.streams[stream] -= number
-    done.lose(origin.path, origin.lost, origin.reasons)
-    if origin.file.torn:
-        done.notes.append(f"{origin.path} {NO_END}")
-    done.notes += [f"{origin.path}: {note}" for note in origin.file.damage]
+    done.lose(origin)
     return done
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dataflow.recording.streams.copying import Origin
 
 Watch = Callable[[int, int], None]
 """Is told how many messages of how many are copied."""
@@ -22,7 +24,8 @@ class Edited:
     `streams`: messages by stream; `span`: first and last stamp of what is not static (ns). `beyond`: messages outside
     of the span that was asked for, which its firings took or made, and `lead` the stamp of the first firing that is
     repeated for it. `attachments`: how many files inside of it.
-    `lost`: by stream, messages that damage has kept from being read. `unknown`: operators whose state at the cut is not
+    `lost`: by stream, messages that damage has kept from being read; `lacking`: missing parts of the files
+    that it was made of, whose messages are not counted anywhere. `unknown`: operators whose state at the cut is not
     in the recording. `notes` tell what else is to be known, for people.
     """
 
@@ -36,13 +39,17 @@ class Edited:
     unknown: tuple[str, ...] = ()
     attachments: int = 0
     lost: dict[str, int] = field(default_factory=dict)
+    lacking: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def lose(self, path: Path, lost: Mapping[str, int], reasons: Mapping[str, str]) -> None:
-        """Takes off the messages of a file that could not be read, and notes them."""
-        for stream, number in lost.items():
+    def lose(self, origin: Origin) -> None:
+        """Notes the damage of a file that was copied, and counts its messages that could not be read."""
+        for stream, number in origin.lost.items():
             self.lost[stream] = self.lost.get(stream, 0) + number
-            self.notes.append(f"{path}: {stream}: {number:,} messages lost to damage: {reasons[stream]}")
+            self.notes.append(f"{origin.path}: {stream}: {number:,} messages lost to damage: {origin.reasons[stream]}")
+        self.lacking += origin.file.lacking
+        self.notes += origin.file.lacking
+        self.notes += [f"{origin.path}: {note}" for note in origin.file.damage]
 
     @property
     def messages(self) -> int:

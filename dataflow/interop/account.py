@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from dataflow.recording.streams.streams import Unread
+
 WORDS = {
     "reordered": "put in order",
     "repeated": "recorded twice, once left out",
@@ -15,14 +17,6 @@ WORDS = {
     "before_epoch": "before 1970, left out",
 }
 """Repairs in words, by the names of `Repair.facts`."""
-
-
-@dataclass(slots=True)
-class Unread:
-    """Messages of a topic that cannot be read and were passed over: how many, and what is wrong with the first."""
-
-    count: int
-    reason: str
 
 
 @dataclass(slots=True)
@@ -58,10 +52,7 @@ class Account:
             topic = called(name)
             found += [f"{topic}: {_messages(number)} {WORDS[what]}" for what, number in done.items()]
         found += [f"{called(topic)}: {text}" for topic, text in (*self.static.items(), *self.doubted.items())]
-        found += [
-            f"{called(topic)}: {_messages(unread.count)} that cannot be read passed over, the first: {unread.reason}"
-            for topic, unread in self.unread.items()
-        ]
+        found += [f"{called(topic)}: {unread}" for topic, unread in self.unread.items()]
         for topic, lost in self.lost.items():
             found += [f"{called(topic)}: no place for {text} (in {_messages(number)})" for text, number in lost.items()]
         return found

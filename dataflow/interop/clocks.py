@@ -80,8 +80,8 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
     """Returns the one clock for all topics that are used together.
 
     Header stamps, unless more than a tenth of a topic's are missing (zero or negative), one goes back by more than 5 s
-    or for good, most of them repeat, or the topics' headers are of different clocks: then log times, for all. Fewer
-    that are missing are placed by the log.
+    or for good, they leap ahead of the log by more than 5 s for good, most of them repeat, or the topics' headers are
+    of different clocks: then log times, for all. Fewer that are missing are placed by the log.
     """
     if wanted == "log":
         return Clock("log", "asked for")
@@ -113,6 +113,8 @@ def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
         back = int(-np.diff(set_).min(initial=0))
         if back > BACK or (back > STEP and not times.shares and _stays_back(times)):
             return Clock("log", f"the headers of {times.topic} go back by {back * 1e-9:.1f} s")
+        if (leap := _leap(times)) > BACK:
+            return Clock("log", f"the headers of {times.topic} leap ahead of the log by {leap * 1e-9:,.1f} s")
     if offsets and max(offsets.values()) - min(offsets.values()) > APART:
         late, early = max(offsets, key=lambda t: offsets[t]), min(offsets, key=lambda t: offsets[t])
         apart = (offsets[late] - offsets[early]) * 1e-9
@@ -152,6 +154,20 @@ def _stays_back(times: Times) -> bool:
     before, after = (log - header)[max(step - STAYS, 0) : step], (log - header)[step : step + STAYS]
     lost = float(np.median(after) - np.median(before)) if min(len(before), len(after)) == STAYS else 0.0
     return lost > 0.8 * float(header[step - 1] - header[step])
+
+
+def _leap(times: Times) -> int:
+    """By how much (ns) the headers leap ahead of the log for good, as where a clock was set in the middle; 0 where the
+    log goes on at another pace than they do, so that it cannot tell."""
+    assert times.header is not None
+    given = times.header > 0
+    header, log = times.header[given], times.log[given]
+    step = int(np.argmax(np.diff(header) - np.diff(log))) + 1 if len(header) > 1 else 0
+    before, after = (header - log)[max(step - STAYS, 0) : step], (header - log)[step : step + STAYS]
+    if min(len(before), len(after)) < STAYS:
+        return 0
+    leap, logged = int(np.median(after) - np.median(before)), int(np.ptp(log))
+    return leap if logged < 2 * (int(np.ptp(header)) - leap) < 4 * logged else 0
 
 
 def _offset(times: Times) -> int:

@@ -17,7 +17,7 @@ from dataflow.interop.zstd_frames import unpacked_message
 from dataflow.recording.errors import DamagedError
 from dataflow.recording.layout import Kind
 from dataflow.recording.mcap.cache import ChunkCache
-from dataflow.recording.mcap.index import NO_END, McapFile
+from dataflow.recording.mcap.index import McapFile
 from dataflow.recording.streams.codecs import SchemaText
 from dataflow.recording.streams.ordering import in_file_order
 
@@ -51,21 +51,8 @@ class McapBag:
         profiles = {f.header.profile for f in self.files} - {""}
         what = " ROS 2" if profiles == {"ros2"} else " ROS 1" if profiles == {"ros1"} else ""
         self.kind = f"MCAP{what}" + (f", {len(files)} files" if len(files) > 1 else "")
-        self.notes: tuple[str, ...] = tuple(
-            [f"{f.path.name} {NO_END}" for f in self.files if f.torn]
-            + [note for f in self.files for note in f.damage]
-            + list(joined.notes)
-        )
-        self.lost.parts += [
-            f"{f.path.name}: chunks that cannot be read, and whose messages nothing counts: {f.left_out}"
-            for f in self.files
-            if f.left_out
-        ]
-        self.lost.parts += [
-            f"{f.path.name}: messages behind byte {f.unread_from:,} of {f.nbytes:,}, if there were any"
-            for f in self.files
-            if f.unread_from is not None
-        ]
+        self.notes: tuple[str, ...] = tuple([note for f in self.files for note in f.damage] + list(joined.notes))
+        self.lost.parts += [text for f in self.files for text in f.lacking]
 
     def _topic(self, file: McapFile, channel: Channel, size: int) -> Topic:
         schema = file.schemas.get(channel.schema_id)

@@ -8,32 +8,21 @@ from pathlib import Path
 
 from dataflow.interop.bag import Bag, BagError, shortfalls, surpluses
 from dataflow.interop.mcap_bag import McapBag
-from dataflow.interop.unpacking import Unpacked, unpack
+from dataflow.interop.unpacking import Unpacked, unpack, unpacked_head
+from dataflow.recording.beginnings import RERUN_MAGICS, ROS1_MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, beginning, head_of
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.layout import RECORDING
+from dataflow.recording.layout import PROGRAM
 from dataflow.recording.mcap.ending import MAGIC
 from dataflow.recording.mcap.index import McapFile
 from dataflow.recording.notices import notice
 from dataflow.recording.streams.part_folder import parts_in
 
-ROS1_MAGIC = b"#ROSBAG V"
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-SQLITE_MAGIC = b"SQLite format 3\x00"
-RERUN_MAGICS = (b"RRF2", b"RRIO")
-WRITER = b"robot-dataflow/"
-"""Our library in the header of an MCAP; what others made of one of our files may name theirs."""
-HEAD_BYTES = 128
+LIBRARY_BYTES = 128
+"""Of an MCAP, at its beginning, among which its header names the library."""
 _PART = re.compile(r"(.*?)_?(?:\d{4}(?:-\d\d){5})?_\d+\.bag")
 """The name that `rosbag record --split` gives to a part: prefix, date and number."""
-ARCHIVES = ((b"\x1f\x8b", "gzip"), (b"PK\3\4", "zip"), (b"BZh", "bzip2"), (b"\xfd7zXZ", "xz"))
-OTHERS = (
-    (b"\x89mcap", "it begins as an MCAP file does whose line ends a transfer as text has changed; fetch it as binary"),
-    (b"version https:/", "it is a pointer of Git LFS, which `git lfs pull` replaces by the file"),
-    (b"<!doctype html", "it is a page of the web, as servers send it in place of a file"),
-    (b"<html", "it is a page of the web, as servers send it in place of a file"),
-)
-"""Beginnings of what is found in place of a bag, in small letters, and what it is."""
 DATASETS = "folders of datasets (TUM, EuRoC, KITTI) are read by sources of a graph: `dataflow operators` lists them"
+_SUFFIXES = ((MAGIC, ".mcap"), (SQLITE_MAGIC, ".db3"), (ROS1_MAGIC, ".bag"))
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
@@ -63,7 +52,7 @@ def bag_at(path: Path, *, strict: bool = False) -> Bag:
     """
     if path.is_dir():
         return _open_folder(path, strict)
-    head = _head(path)
+    head = head_of(path)
     if head.startswith(MAGIC):
         return McapBag(path, [path], strict=strict)
     if head.startswith(ROS1_MAGIC):
@@ -75,13 +64,14 @@ def bag_at(path: Path, *, strict: bool = False) -> Bag:
 
         return RerunFile(path)
     if head.startswith(ZSTD_MAGIC):
-        return _of_files(path, Path(path.stem).suffix, [path], strict)
-    begins = f"it begins with {head[:8].hex(' ')}" if head else "it is empty"
-    begins = next((f"it is a {name} file, to be unpacked first" for m, name in ARCHIVES if head.startswith(m)), begins)
-    begins = next((what for start, what in OTHERS if head.lower().startswith(start)), begins)
+        head = unpacked_head(path)
+        suffix = next((end for magic, end in _SUFFIXES if head.startswith(magic)), None)
+        if suffix is not None:
+            return _of_files(path, suffix, [path], strict)
+        raise BagError(f"{path} is a zstd file of something that is no bag: {beginning(path, head)}")
     raise BagError(
-        f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag), "
-        "ROS 2 bags (a folder with metadata.yaml, .db3 or .mcap) and Rerun files (.rrd)"
+        f"{path} is not an MCAP file, nor another kind of bag: {beginning(path, head)}. Known are MCAP files, "
+        "ROS 1 bags (.bag), ROS 2 bags (a folder with metadata.yaml, .db3 or .mcap) and Rerun files (.rrd)"
     )
 
 
@@ -91,21 +81,21 @@ def is_foreign(path: Path) -> bool:
         parts = parts_in(path)
         return not parts or is_foreign(parts[0])
     with path.open("rb") as opened:
-        head = opened.read(HEAD_BYTES)
+        head = opened.read(LIBRARY_BYTES)
     if not head.startswith(MAGIC):
         return True
-    if WRITER in head:
+    if PROGRAM.encode() in head:
         return False
     file = McapFile(path, lenient=True)
     try:
-        return not any(name == RECORDING for name, _ in file.metadata)
+        return not file.own
     finally:
         file.close()
 
 
 def is_ros_bag(path: Path) -> bool:
     """Tells whether a file is a ROS 1 bag or a database of a ROS 2 bag, whole or not."""
-    return path.is_file() and _head(path).startswith((ROS1_MAGIC, SQLITE_MAGIC))
+    return path.is_file() and head_of(path).startswith((ROS1_MAGIC, SQLITE_MAGIC))
 
 
 def _ros_bag(path: Path, files: list[Path], strict: bool) -> Bag:
@@ -115,11 +105,6 @@ def _ros_bag(path: Path, files: list[Path], strict: bool) -> Bag:
     if len({found[1] if (found := _PART.fullmatch(file.name)) else file.name for file in files}) > 1:
         raise BagError(f"{path} holds {len(files)} .bag files, which are separate recordings; name one")
     return RosBag(path, files, strict=strict)
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(len(SQLITE_MAGIC))
 
 
 def _with_suffix(path: Path, suffix: str) -> Path:
@@ -156,13 +141,15 @@ def _open_folder(path: Path, strict: bool) -> Bag:
 
 
 def _of_files(path: Path, suffix: str, files: list[Path], strict: bool, *, compressed: bool = False) -> Bag:
-    """Opens MCAP files or databases as one bag. Those compressed as files are unpacked for as long as it is open; of
-    several, those that cannot be opened are left out."""
+    """Opens MCAP files, databases or a ROS 1 bag as one bag. Those compressed as files are unpacked for as long as it
+    is open; of several, those that cannot be opened are left out."""
     from dataflow.interop.db3_bag import Db3Bag
 
     unpacked = unpack(files, strict=strict)
 
     def opened(some: list[Path]) -> Bag:
+        if suffix == ".bag":
+            return _ros_bag(path, some, strict)
         return (McapBag if suffix == ".mcap" else Db3Bag)(path, some, compressed=compressed, strict=strict)
 
     try:

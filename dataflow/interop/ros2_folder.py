@@ -12,7 +12,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 METADATA = "metadata.yaml"
-COMPRESSED = ".zstd"
+COMPRESSED = (".zstd", ".zst")
+"""Ends of the names of compressed files: as rosbag2 and as zstd's own program give them."""
 
 
 @dataclass(slots=True)
@@ -77,11 +78,11 @@ def bag_files(path: Path, suffix: str, folder: Folder) -> list[Path]:
     Files that metadata.yaml names and that are not there are noted; where some of those named are there, others are
     left out with a note.
     """
-    found = sorted([*path.glob(f"*{suffix}"), *path.glob(f"*{suffix}{COMPRESSED}")], key=natural)
-    plain = {file.name for file in found if file.suffix != COMPRESSED}
-    found = [file for file in found if file.suffix != COMPRESSED or file.name.removesuffix(COMPRESSED) not in plain]
+    found = sorted((file for end in ("", *COMPRESSED) for file in path.glob(f"*{suffix}{end}")), key=natural)
+    plain = {file.name for file in found if file.suffix not in COMPRESSED}
+    found = [file for file in found if file.suffix not in COMPRESSED or _uncompressed(file.name) not in plain]
     there = {file.name: file for file in found}
-    named = [name for name in folder.named if name.removesuffix(COMPRESSED).endswith(suffix)]
+    named = [name for name in folder.named if _uncompressed(name).endswith(suffix)]
     present = [there[n] for n in (_held(name, there) for name in named) if n is not None]
     missing = [name for name in named if _held(name, there) is None]
     if found and missing:
@@ -96,5 +97,10 @@ def bag_files(path: Path, suffix: str, folder: Folder) -> list[Path]:
 
 
 def _held(name: str, there: Mapping[str, Path]) -> str | None:
-    options = (name, f"{name}{COMPRESSED}", name.removesuffix(COMPRESSED))
+    plain = _uncompressed(name)
+    options = (name, *(f"{plain}{end}" for end in COMPRESSED), plain)
     return next((option for option in options if option in there), None)
+
+
+def _uncompressed(name: str) -> str:
+    return Path(name).stem if Path(name).suffix in COMPRESSED else name

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.interop.account import Account, Unread
+from dataflow.interop.account import Account
 from dataflow.interop.bag import Bag, BagError, Lost, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
 from dataflow.interop.conversions import NARROWING, convert, in_units, offers
@@ -24,6 +24,7 @@ from dataflow.interop.transform_sets import joined, other_parents, places_of
 from dataflow.messages import DepthImage, Message, MessageError, Transforms, message_type
 from dataflow.messages.depth_units import MILLIMETRES, DepthSpan
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
+from dataflow.recording.streams.streams import Unread
 
 MAX_HELD = 1 << 30
 """Bytes of messages that wait for earlier ones, which the log has later."""

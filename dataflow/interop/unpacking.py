@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,6 +12,8 @@ import zstandard
 
 from dataflow.interop.bag import Bag, BagError, Stored, Topic
 from dataflow.interop.mcap_bag import McapBag
+from dataflow.interop.ros2_folder import COMPRESSED
+from dataflow.recording.beginnings import HEAD_BYTES, ZSTD_MAGIC, head_of
 from dataflow.recording.mcap.index import McapFile
 
 
@@ -60,17 +63,18 @@ class Unpacked:
 
 
 def unpack(files: Sequence[Path], *, strict: bool = False) -> Plain:
-    """Returns files as they are, those that end in `.zstd` unpacked: one that is not whole, as far as it goes.
+    """Returns files as they are, those that are compressed unpacked: one that is not whole, as far as it goes.
 
     Raises `BagError` for one of which nothing can be unpacked, and where it is `strict` for one that is not whole.
     """
-    if all(file.suffix != ".zstd" for file in files):
+    packed = [file for file in files if file.suffix in COMPRESSED or head_of(file).startswith(ZSTD_MAGIC)]
+    if not packed:
         return Plain(list(files))
     folder = TemporaryDirectory(prefix="dataflow-bag-")
     found = Plain([], folder)
     for file in files:
-        copy = Path(folder.name) / file.stem if file.suffix == ".zstd" else file
-        reason = _unpacked(file, copy) if file.suffix == ".zstd" else ""
+        copy = Path(folder.name) / (file.stem if file.suffix in COMPRESSED else file.name) if file in packed else file
+        reason = _unpacked(file, copy) if file in packed else ""
         if reason and (strict or not copy.stat().st_size):
             folder.cleanup()
             raise BagError(f"{file} is not a whole zstd file: {reason}")
@@ -94,3 +98,10 @@ def _unpacked(file: Path, copy: Path) -> str:
         except zstandard.ZstdError as error:
             return str(error)
     return "it is cut off" if begun else ""
+
+
+def unpacked_head(path: Path) -> bytes:
+    """The first `HEAD_BYTES` of what a compressed file holds, as far as they unpack."""
+    with path.open("rb") as file, suppress(zstandard.ZstdError):
+        return zstandard.ZstdDecompressor().stream_reader(file).read(HEAD_BYTES)
+    return b""

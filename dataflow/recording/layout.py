@@ -9,6 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Final
 
 FORMAT: Final = "1"
+PROGRAM: Final = "robot-dataflow/"
+"""Begins the name of the library in the header of our files."""
 RECORDING: Final = "recording"
 DIGESTS: Final = "digests"
 GRAPH: Final = "dataflow:graph"
@@ -72,9 +74,9 @@ EVENT_SCHEMA: Final = json.dumps(
 def library() -> str:
     """Returns the name of this program in the header of its files."""
     try:
-        return f"robot-dataflow/{version('robot-dataflow')}"
+        return f"{PROGRAM}{version('robot-dataflow')}"
     except PackageNotFoundError:
-        return "robot-dataflow/unknown"
+        return f"{PROGRAM}unknown"
 
 
 def firings_topic(namespace: str, operator: str) -> str:

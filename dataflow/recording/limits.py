@@ -26,3 +26,6 @@ UNINDEXED_BYTES = 2**31
 """Expanded bytes of another program's chunks without an index whose ratio is not looked at."""
 MAX_RATIO = 300
 """Ratio of further ones: beyond what LZ4 can do and what zstd does on sensor data."""
+LIKELY_RATIO = 32
+MAX_IN_VAIN = 2**29
+"""Bytes beyond that ratio to which chunks of another program may expand and then not be read, before all is refused."""

@@ -2,26 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import CompressedDepth, CompressedImage, DepthImage, Image
+from dataflow.messages import CompressedDepth, CompressedImage, DepthImage, Diagnostics, Image, Level, Message
 from dataflow.operator import In, Operator, Out, Param
+from operators.status import counted_status
+
+
+class UndecodableError(ValueError):
+    """A file that is damaged or cut short."""
 
 
 class ImageDecoder(Operator):
-    """Decodes JPEG, PNG or WebP files to images: grey files to grey images, all others to RGB."""
+    """Decodes JPEG, PNG or WebP files to images: grey files to grey images, all others to RGB.
+
+    A file that is damaged or cut short is passed over, and reported. JPEG has no checksums: a file that is whole and
+    has wrong bytes in the middle decodes to wrong pixels.
+    """
 
     stateless = True
 
     compressed: In[CompressedImage] = In(doc="the encoded file")
     image: Out[Image] = Out(doc="its pixels, of the same stamp and frame")
+    status: Out[Diagnostics] = Out(doc="a warning for each file that cannot be decoded, with the reason")
 
     max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
 
-    def process(self, compressed: CompressedImage) -> Image:
-        """Raises ValueError where the bytes are not a whole image."""
+    def process(self, compressed: CompressedImage) -> Mapping[str, Message]:
+        """Raises ValueError for a file of more than `max_pixels`."""
+        try:
+            return {"image": self.decode(compressed)}
+        except UndecodableError as error:
+            return {"status": _passed_over(self, "image_decoder", compressed, error)}
+
+    def decode(self, compressed: CompressedImage) -> Image:
+        """Returns the image. Raises ValueError where the bytes are not a whole one."""
         # Without IMREAD_ANYDEPTH OpenCV answers with bytes, whatever the file holds.
         flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
         pixels = _decoded(compressed, flags, self.max_pixels).astype(np.uint8, copy=False)
@@ -34,23 +53,37 @@ class DepthDecoder(Operator):
     """Decodes 16-bit PNG files to depth images in metres.
 
     The pixel value 0 is no return. Where the depths were multiples of the quantiser's step, as from a camera that
-    measures in such steps, the result is bit by bit the depth image that was compressed.
+    measures in such steps, the result is bit by bit the depth image that was compressed. A file that is damaged or cut
+    short is passed over, and reported.
     """
 
     stateless = True
 
     compressed: In[CompressedDepth] = In(doc="the encoded file and what its numbers mean")
     depth: Out[DepthImage] = Out(doc="metres, 0 for no return, of the same stamp and frame")
+    status: Out[Diagnostics] = Out(doc="a warning for each file that cannot be decoded, with the reason")
 
     max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
 
-    def process(self, compressed: CompressedDepth) -> DepthImage:
-        """Raises ValueError where the bytes are not a whole image."""
+    def process(self, compressed: CompressedDepth) -> Mapping[str, Message]:
+        """Raises ValueError for a file of more than `max_pixels`."""
+        try:
+            return {"depth": self.decode(compressed)}
+        except UndecodableError as error:
+            return {"status": _passed_over(self, "depth_decoder", compressed, error)}
+
+    def decode(self, compressed: CompressedDepth) -> DepthImage:
+        """Returns the depth image. Raises ValueError where the bytes are not a whole file of one."""
         levels = _decoded(compressed, cv2.IMREAD_UNCHANGED, self.max_pixels)
         metres = depth_in_metres(
             levels.astype(np.uint16, copy=False), compressed.quantizer, compressed.scale, compressed.offset
         )
         return DepthImage(stamp=compressed.stamp, frame=compressed.frame, data=metres)
+
+
+def _passed_over(operator: Operator, name: str, message: Message, error: UndecodableError) -> Diagnostics:
+    operator.log.warning("passed over: %s", error)
+    return counted_status(name, message.stamp, f"passed over: {error}", Level.WARN, {})
 
 
 def depth_in_metres(levels: NDArray[np.uint16], quantizer: str, scale: float, offset: float) -> NDArray[np.float32]:
@@ -69,7 +102,7 @@ def _decoded(message: CompressedImage | CompressedDepth, flags: int, max_pixels:
     # A file that was cut short is decoded as far as it goes, without a word: its end must be looked for.
     pixels = cv2.imdecode(message.data, flags) if _is_whole(message.data.tobytes()) else None
     if pixels is None:
-        raise ValueError(
+        raise UndecodableError(
             f"{message.SCHEMA} at stamp {message.stamp} ({len(message.data)} bytes) cannot be decoded: "
             f"the file is damaged or cut short"
         )
@@ -82,9 +115,19 @@ def _decoded(message: CompressedImage | CompressedDepth, flags: int, max_pixels:
 
 
 def _is_whole(data: bytes) -> bool:
-    """Tells whether a PNG, JPEG or WebP file goes on to its end mark or its declared length."""
+    """Tells whether a PNG, JPEG or WebP file goes on to its end mark or its declared length; bytes may follow, as
+    cameras pad their files."""
     if data.startswith(b"\x89PNG"):
-        return data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82")
+        return b"IEND\xaeB`\x82" in data
     if data.startswith(b"\xff\xd8"):
-        return data.rstrip(b"\0").endswith(b"\xff\xd9")
-    return len(data) >= 8 + int.from_bytes(data[4:8], "little")
+        return data.find(b"\xff\xd9", _scan_of(data)) >= 0
+    return not data.startswith(b"RIFF") or len(data) >= 8 + int.from_bytes(data[4:8], "little")
+
+
+def _scan_of(data: bytes) -> int:
+    """The place of the pixels of a JPEG, behind its segments: the preview in one of them has an end mark, too."""
+    at = 2
+    while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] not in (b"\xda", b""):
+        fill = data[at + 1] == 0xFF
+        at += 1 if fill else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return at

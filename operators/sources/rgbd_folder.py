@@ -39,7 +39,8 @@ class RgbdFolder(Source):
     Image and depth of a frame carry one stamp: the colour image's in TUM, first_stamp + N / rate for frame N of
     7-Scenes, exact in nanoseconds and the same for any start, stop and stride. Ground truth is the depth camera's pose
     and absent at frames that have none. A frame whose files are missing, cannot be decoded or have another size than
-    the first is passed over with a warning, and so is a pose that is none.
+    the first is passed over with a warning, and so is a pose that is none and a line of a list that cannot be read.
+    Colour images of TUM's layout without depth within 20 ms are counted.
 
     Without `depth_scale`, a unit is the layout's, unless depth images from all over the folder show that it is the
     other common one: a depth camera sees little that is nearer than 0.3 m or farther than 10 m. That is logged as a
@@ -192,7 +193,8 @@ class RgbdFolder(Source):
         return len(self._frames) if hasattr(self, "_frames") else None
 
     def summary(self) -> Mapping[str, int]:
-        return {"passed_over": self._passed.number}
+        unpaired = {"without_depth": self._dataset.unpaired} if self._dataset.unpaired else {}
+        return {"passed_over": self._passed.number, **unpaired}
 
     def _list(self, folder: Path) -> Dataset:
         layout = detect_layout(folder) if self.layout == "auto" else self.layout

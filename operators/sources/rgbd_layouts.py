@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from operators.sources.pacing import frame_stamp
 
 Matrix = NDArray[np.float64]
 LayoutName = Literal["7scenes", "tum"]
+T = TypeVar("T")
 Place = tuple[float, float, float, float, float, float, float]
 
 _TUM_GAP = 20_000_000  # ns: images farther apart than this are no pair, as in the dataset's own associate.py
@@ -58,6 +59,8 @@ class Frame:
             return None
         if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6 or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 0.05:
             raise SourceError(f"{self.pose}: frame {self.name}: not a rigid motion:\n{T}")
+        if np.linalg.det(T[:3, :3]) < 0:
+            raise SourceError(f"{self.pose}: frame {self.name}: a reflection, as of left-handed axes:\n{T}")
         return orthonormalised(T)
 
 
@@ -66,7 +69,8 @@ class Dataset:
     """A listed folder, as its layout has it. One unit of a depth image is `1 / depth_scale` metres.
 
     `T_depth_image` is x, y, z (m), qx, qy, qz, qw of the colour camera in the depth camera's frame; None: depth is
-    registered to colour, so that one camera took both. `lacking`: what is there of frames that are not whole.
+    registered to colour, so that one camera took both. `lacking`: what is there of frames that are not whole, and lines
+    of lists that cannot be read; `unpaired`: colour images without a depth image near in time.
     """
 
     frames: Sequence[Frame]
@@ -75,6 +79,7 @@ class Dataset:
     depth_intrinsics: Intrinsics
     T_depth_image: Place | None
     lacking: Sequence[str] = ()
+    unpaired: int = 0
 
     @property
     def registered(self) -> bool:
@@ -138,15 +143,15 @@ def list_tum(folder: Path) -> Dataset:
     `camera-intrinsics.txt` both have the dataset's default of 525 px around (319.5, 239.5). Rows of NaN in
     `groundtruth.txt` are moments without a known pose; a truth of which no row is near an image is an error.
     """
-    images, depths = _tum_list(folder / "rgb.txt", 1), _tum_list(folder / "depth.txt", 1)
-    truth = _tum_list(folder / "groundtruth.txt", 7) if (folder / "groundtruth.txt").is_file() else []
-    truth = [(stamp, words) for stamp, words in truth if "nan" not in " ".join(words).lower()]
+    lacking: list[str] = []
+    images = _tum_list(folder / "rgb.txt", _file, lacking)
+    depths = _tum_list(folder / "depth.txt", _file, lacking)
+    path = folder / "groundtruth.txt"
+    rows = _tum_list(path, _tum_pose, lacking) if path.is_file() else []
+    truth = [(stamp, T) for stamp, T in rows if np.isfinite(T).all()]
     stamps = [stamp for stamp, _ in images]
-    try:
-        poses = dict(mutually_nearest(stamps, [stamp for stamp, _ in truth], _TUM_GAP))
-        pairs = mutually_nearest(stamps, [stamp for stamp, _ in depths], _TUM_GAP)
-    except ValueError as error:
-        raise SourceError(f"{folder}: {error}") from None
+    poses = dict(mutually_nearest(stamps, [stamp for stamp, _ in truth], _TUM_GAP))
+    pairs = mutually_nearest(stamps, [stamp for stamp, _ in depths], _TUM_GAP)
     if not pairs:
         raise SourceError(f"{folder}: no image of rgb.txt is within 20 ms of one of depth.txt")
     if truth and not poses:
@@ -157,11 +162,11 @@ def list_tum(folder: Path) -> Dataset:
         )
     frames = []
     for i, j in pairs:
-        stamp, (image,) = images[i]
-        pose = _tum_pose(folder, *truth[poses[i]]) if i in poses else None
-        frames.append(Frame(image, stamp, folder / image, folder / depths[j][1][0], pose))
+        stamp, image = images[i]
+        pose = truth[poses[i]][1] if i in poses else None
+        frames.append(Frame(image, stamp, folder / image, folder / depths[j][1], pose))
     K = _intrinsics_file(folder) or Intrinsics(525.0, 525.0, 319.5, 239.5)
-    return Dataset(frames, FIFTHS, K, K, None)
+    return Dataset(frames, FIFTHS, K, K, None, lacking, len(images) - len(pairs))
 
 
 def read_matrix(file: Path, shape: tuple[int, int]) -> Matrix:
@@ -185,36 +190,67 @@ def _intrinsics_file(folder: Path) -> Intrinsics | None:
     return Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
 
 
-def _tum_list(file: Path, values: int) -> list[tuple[int, list[str]]]:
-    """The lines `seconds value...` of a TUM list file, stamps exact in nanoseconds."""
+def _tum_list(file: Path, read: Callable[[str], T], lacking: list[str]) -> list[tuple[int, T]]:
+    """The lines `seconds value...` of a TUM list file by stamp, which is exact in nanoseconds.
+
+    Lines that cannot be read, and further ones of a stamp, are added to `lacking`. Raises SourceError where none is
+    left.
+    """
     if not file.is_file():
         raise SourceError(f"the TUM RGB-D layout needs {file.name} (looked for {file.absolute()})")
-    rows = []
-    for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), 1):
-        words = line.split(maxsplit=1) if values == 1 else line.split()  # names of files may have spaces
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{file} is no text in UTF-8: {error}") from None
+    found: dict[int, tuple[str, T]] = {}
+    refused: list[str] = []
+    for number, line in enumerate(lines, 1):
+        words = line.split(maxsplit=1)
         if not words or words[0].startswith("#"):
             continue
         try:
-            stamp = int(Fraction(words[0]) * 10**9)
-        except (ValueError, ZeroDivisionError):
-            raise SourceError(f"{file}:{number}: {words[0]!r} is no time in seconds") from None
-        if not 0 <= stamp < LATEST:
-            units = next((name for name, scale in _SMALLER if 0 <= stamp // scale < LATEST), "")
-            hint = f": is it in {units}?" if units else ""
-            raise SourceError(f"{file}:{number}: {words[0]} s is no time from 1970 to 2262{hint}")
-        if len(words) != values + 1:
-            raise SourceError(f"{file}:{number}: expected a time and {values} values, found {line!r}")
-        rows.append((stamp, [word.rstrip() for word in words[1:]]))
-    rows.sort(key=lambda row: row[0])
-    return [row for k, row in enumerate(rows) if not k or row != rows[k - 1]]
+            stamp, rest = _tum_stamp(words[0]), " ".join(words[1:]).rstrip()
+            value = read(rest)
+        except ValueError as error:
+            refused.append(f"{file}:{number}: {error}")
+            continue
+        if found.setdefault(stamp, (rest, value))[0] != rest:
+            refused.append(f"{file}:{number}: a second line of the time {words[0]} s")
+    if refused and not found:
+        raise SourceError(refused[0])
+    lacking += refused
+    return [(stamp, value) for stamp, (_, value) in sorted(found.items(), key=lambda item: item[0])]
 
 
-def _tum_pose(folder: Path, stamp: int, words: Sequence[str]) -> Matrix:
+def _tum_stamp(word: str) -> int:
+    """Nanoseconds of a time in seconds. Raises ValueError."""
     try:
-        x, y, z, qx, qy, qz, qw = map(float, words)
-    except ValueError as error:
-        raise SourceError(f"{folder / 'groundtruth.txt'}: pose at {stamp} ns: {error}") from None
+        stamp = int(Fraction(word) * 10**9)
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"{word!r} is no time in seconds") from None
+    if not 0 <= stamp < LATEST:
+        units = next((name for name, scale in _SMALLER if 0 <= stamp // scale < LATEST), "")
+        hint = f": is it in {units}?" if units else ""
+        raise ValueError(f"{word} s is no time from 1970 to 2262{hint}")
+    return stamp
+
+
+def _file(name: str) -> str:
+    """The name of an image, which may have spaces. Raises ValueError."""
+    if not name:
+        raise ValueError("expected a time and the name of a file, found a time alone")
+    return name
+
+
+def _tum_pose(text: str) -> Matrix:
+    """The matrix of x, y, z, qx, qy, qz, qw, of NaN where one of them is. Raises ValueError."""
+    words = text.split()
+    if len(words) != 7:
+        raise ValueError(f"expected a time and 7 values, found {len(words)} values: {text!r}")
+    x, y, z, qx, qy, qz, qw = map(float, words)
+    if not np.isfinite([x, y, z, qx, qy, qz, qw]).all():
+        return np.full((4, 4), np.nan)
     norm = float(np.linalg.norm([qx, qy, qz, qw]))
     if not abs(norm - 1) < 0.01:
-        raise SourceError(f"{folder / 'groundtruth.txt'}: pose at {stamp} ns: quaternion of length {norm:.3g}, not 1")
+        raise ValueError(f"a quaternion of length {norm:.3g}, not 1")
     return transform_matrix([x, y, z], [qx, qy, qz, qw])

@@ -48,6 +48,19 @@ def test_headers_that_go_far_back_are_not_taken() -> None:
     assert choose_clock([times([*LOG[:5], *(LOG[:5] - 60 * S)])]).why == "the headers of /a go back by 60.4 s"
 
 
+def test_headers_of_a_clock_that_is_set_ahead_are_not_taken_unless_the_log_cannot_tell() -> None:
+    log = np.arange(60) * S // 10 + 1_700_000_000 * S
+    month = 30 * 86_400 * S
+    leaping = np.concatenate([log[:30] - month, log[30:]])
+    paused = np.concatenate([log[:30], log[30:] + 60 * S])
+
+    assert choose_clock([times(leaping, log=log)]).why == "the headers of /a leap ahead of the log by 2,592,000.0 s"
+    assert choose_clock([times(np.where(np.arange(60) == 30, log + 4 * S, log), log=log)]).kind == "header"
+    assert choose_clock([times(paused, log=paused)]).kind == "header"
+    assert choose_clock([times(paused, log=np.full(60, log[0]))]).kind == "header"
+    assert choose_clock([times(log[0] + np.arange(60) * S, log=log)]).kind == "header"  # ten times as fast
+
+
 def test_headers_of_a_clock_that_is_set_back_a_little_are_not_taken_and_late_messages_are_put_in_order() -> None:
     log = np.arange(60) * S // 10 + 1_700_000_000 * S
     late = log.copy()

@@ -28,7 +28,7 @@ class Drive:
         self.detections: list[Detections2D] = []
         self.truth: list[Detections2D] = []
         for compressed in list(streams["robot1/robot/image_jpeg"])[:60:6]:
-            self.images.append(decoder.process(compressed))
+            self.images.append(decoder.decode(compressed))
             self.detections.append(detector.process(self.images[-1]))
             self.truth.append(truth[compressed.stamp])
 

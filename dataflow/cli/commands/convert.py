@@ -302,8 +302,9 @@ def _opened(
 
     metadata: Mapping[str, Mapping[str, str]]
     with Material(path, clock=clock, wishes=wishes) as whole:
-        if not any(topic.count for topic in whole.bag.topics.values()) and whole.account.notes:
-            raise fail(f"{path} holds no message that can be read: {'; '.join(whole.account.notes)}")
+        found = [*whole.account.notes, *whole.account.short]
+        if not any(topic.count for topic in whole.bag.topics.values()) and found:
+            raise fail(f"{path} holds no message that can be read: {'; '.join(found)}")
         names = [*whole.streams, *(t.name for t in whole.untouched)]
         namespace, metadata = "", {}
         if not whole.foreign:

@@ -62,7 +62,7 @@ def cut(
     Exit codes:
 
       0    written
-      1    written, without messages that damage keeps from being read (of another program's file)
+      1    written, but damage keeps messages from being read, or the recording has no proper end
       2    could not cut: a wrong option, a file that cannot be read
 
     Examples:
@@ -106,7 +106,7 @@ def filter_(
     Exit codes:
 
       0    written
-      1    written, without messages that damage keeps from being read (of another program's file)
+      1    written, but damage keeps messages from being read, or the recording has no proper end
       2    could not filter: no stream matches, a file that cannot be read
 
     Examples:
@@ -152,7 +152,7 @@ def split(
     Exit codes:
 
       0    written
-      1    written, without messages that damage keeps from being read (of another program's file)
+      1    written, but damage keeps messages from being read, or the recording has no proper end
       2    could not split: a wrong option, a file that cannot be read
 
     Examples:
@@ -188,7 +188,7 @@ def _print_parts(done: Sequence[Edited], target: Path) -> None:
         row = (f"{(low - first) * 1e-9:.2f} s", seconds((high - low) * 1e-9), count(one.messages), size(one.bytes))
         made.add_row(Text(Path(one.path).name), *row)
     out.print(made)
-    for note in (note for one in done if one.lost for note in one.notes):
+    for note in (note for one in done if one.lost or one.lacking for note in one.notes):
         say(f"[yellow]{escape(note)}[/]")
     print_unknown({name for one in done for name in one.unknown})
     out.print(f"wrote {plural(len(done), 'part')} to {escape(str(target))}", soft_wrap=True)

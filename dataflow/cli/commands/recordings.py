@@ -206,7 +206,7 @@ def diff(
 ) -> None:
     """Compare two recordings, stream by stream.
 
-    Exit code 0: the same; 1: different; 2: could not compare.
+    Exit code 0: the same; 1: different, or messages of another program's file cannot be read; 2: could not compare.
 
     Examples:
 

@@ -102,10 +102,7 @@ def _say_what_was_not_read(
     }
     opened.look_for_unread(missing, begin, end)
     for topic, unread in opened.account.unread.items():
-        say(
-            f"[yellow]{escape(topic)}: {plural(unread.count, 'message')} that cannot be read passed over, the first: "
-            f"{escape(unread.reason)}[/]"
-        )
+        say(f"[yellow]{escape(f'{topic}: {unread}')}[/]")
 
 
 def say_what_is_played(matching: Matching, opened: BagStreams) -> None:

@@ -126,11 +126,9 @@ def say_account(opened: Recording | BagStreams, but: Collection[str] = ()) -> No
 def account_of(opened: Recording | BagStreams) -> Account:
     from dataflow.interop.account import Account
     from dataflow.recording import Recording
-    from dataflow.recording.mcap.index import NO_END
 
     if isinstance(opened, Recording):
-        name = opened.path.name
-        return Account([*([f"{name} {NO_END}"] if opened.torn else []), *(f"{name}: {what}" for what in opened.damage)])
+        return Account([f"{opened.path.name}: {what}" for what in opened.damage], list(opened.lacking))
     opened.recount()
     return opened.account
 

@@ -125,8 +125,8 @@ def tell_edited(done: Edited, *, json: bool) -> None:
 
 
 def fail_if_lost(done: Iterable[Edited]) -> None:
-    """The exit code is 1 where a file that was written lacks messages."""
-    if any(one.lost for one in done):
+    """The exit code is 1 where a file that was written lacks messages, or may lack some."""
+    if any(one.lost or one.lacking for one in done):
         raise typer.Exit(DIFFERENT)
 
 

@@ -64,7 +64,7 @@ class Material:
                     raise BagError(f"{self.path} is a recording: its depth is in metres, and no topic of it is made so")
                 self._source = Recording(self.path)
                 namespace = self._source.metadata.get(RECORDING, {}).get("namespace", "")
-                self.account = Account(list(self.bag.notes))
+                self.account = Account(list(self.bag.notes), shortfalls(self.bag))
             self.streams: dict[str, StreamInfo] = {
                 name: info
                 for name, info in self._source.streams.items()

@@ -194,7 +194,7 @@ def _copy(
         kind_of = kinds.get(stored.topic)
         data = bytes(stored.data) if kind_of is None else kind_of.to_cdr(stored.data)
         name = called[stored.topic]
-        log_time = stored.log_time - shift  # as it was: it all is of the recorder's clock
+        log_time = max(stored.log_time - shift, 0)  # as it was: it all is of the recorder's clock
         writer.write(name, schemas[stored.topic], data, log_time, latched=latched[stored.topic])
         done.count(name)
 

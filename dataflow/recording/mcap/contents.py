@@ -41,8 +41,8 @@ class Entries:
         """Times, chunks and offsets."""
         return self.times, self.chunks, self.offsets
 
-    def where(self, kept: npt.NDArray[np.bool_]) -> Entries:
-        """Those of them that are to be kept."""
+    def where(self, kept: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Entries:
+        """Those of them that are to be kept, by a mask or by their places."""
         return Entries(self.times[kept], self.chunks[kept], self.offsets[kept])
 
 

@@ -17,7 +17,9 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 from mcap.records import Header
 
+from dataflow.recording.beginnings import HEAD_BYTES, beginning
 from dataflow.recording.errors import DamagedError, RecordingError
+from dataflow.recording.layout import PROGRAM, RECORDING
 from dataflow.recording.limits import MAX_CHUNK_BYTES
 from dataflow.recording.mcap.attachments import Attachment, Place, read_attachment
 from dataflow.recording.mcap.cache import ChunkCache
@@ -91,6 +93,20 @@ class McapFile:
         """Closes the file. Idempotent."""
         self._file.close()
         self._chunks.cache.clear()
+
+    @property
+    def own(self) -> bool:
+        """Tells whether this program wrote the file, or another one made it of such a file."""
+        return self.header.library.startswith(PROGRAM) or any(name == RECORDING for name, _ in self.metadata)
+
+    @property
+    def lacking(self) -> list[str]:
+        """Missing parts of the file whose messages are not counted anywhere, for people."""
+        name = self.path.name
+        behind = f"{name}: messages behind byte {self.unread_from or 0:,} of {self.nbytes:,}, if there were any"
+        uncounted = f"{name}: chunks that cannot be read, and whose messages nothing counts: {self.left_out}"
+        found = ((self.torn, f"{name} {NO_END}"), (self.left_out, uncounted), (self.unread_from is not None, behind))
+        return [text for there, text in found if there]
 
     @property
     def nbytes(self) -> int:
@@ -198,11 +214,10 @@ class McapFile:
         return times, weights
 
     def _load(self) -> tuple[Contents, MessageIndex]:
-        head = self._file.read_up_to(0, 16)
+        head = self._file.read_up_to(0, HEAD_BYTES)
         if not head.startswith(MAGIC):
             path = self._file.path
-            bag = f"; of a ROS bag, `dataflow convert {path} OUT.mcap --to mcap` makes one" if _is_bag(head) else ""
-            raise RecordingError(f"{path} is not an MCAP file: it does not begin with the MCAP magic bytes{bag}")
+            raise RecordingError(f"{path} is not an MCAP file: {beginning(path, head)}")
         self._load_header()
         footer = read_footer(self._file)
         self.torn = footer is None
@@ -265,6 +280,14 @@ class McapFile:
         return self._file.damaged(f"its index points to byte {offset} of {within}, {where}")
 
 
-def _is_bag(head: bytes) -> bool:
-    """Tells whether a file begins as a ROS 1 bag does, or a ROS 2 bag in SQLite."""
-    return head.startswith((b"#ROSBAG V", b"SQLite format 3"))
+def opened(path: Path, *, watch: Watch | None = None) -> McapFile:
+    """Opens a file: of ours damage is an error, of another program's what cannot be read is left out."""
+    if path.is_dir():
+        raise RecordingError(
+            f"{path} is a folder, which does not hold the parts of one recording; name one of its files"
+        )
+    file = McapFile(path, lenient=True, watch=watch)
+    if not (file.own and (file.torn or file.damage)):
+        return file
+    file.close()
+    return McapFile(path, watch=watch)

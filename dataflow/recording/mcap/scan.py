@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from mcap.opcode import Opcode
 
 from dataflow.recording.errors import DamagedError
+from dataflow.recording.limits import LIKELY_RATIO, MAX_IN_VAIN
 from dataflow.recording.mcap.attachments import Place
 from dataflow.recording.mcap.chunks import CHUNK_HEAD, ChunkRef, size_in_head
 from dataflow.recording.mcap.contents import MESSAGE_BODY, Contents
@@ -36,7 +37,9 @@ class Scan:
         self.end = len(MAGIC)
         self.whole = False
         self.salvaged = ""
+        self.believed = False  # that messages lie where an index puts them
         self._file = file
+        self._in_vain = 0
         self._sealed, self._trusting, self._lenient = sealed, trusting, lenient
         self._pending: _Pending | None = None
 
@@ -124,6 +127,7 @@ class Scan:
         known = all(int.from_bytes(body[:2], "little") in contents.channels for body in pending.indexes)
         if self._trusting and not torn and pending.indexes and known:
             if contents.add_indexes(pending.number, pending.indexes):
+                self.believed = True
                 return
             contents.damage.append(f"a message index of {contents.chunks.where(pending.number)} is damaged")
         if not self._sealed:  # what our writer writes expands as it may: a damaged recording can be read whole
@@ -133,6 +137,10 @@ class Scan:
         except DamagedError as error:
             if not self._lenient:
                 raise
+            ref = contents.chunks.ref(pending.number)
+            self._in_vain += ref.uncompressed_size - LIKELY_RATIO * ref.length
+            if self._in_vain > MAX_IN_VAIN:
+                raise
             contents.damage.append(f"{error.what}; it is left out")
             contents.left_out += 1
 
@@ -141,7 +149,8 @@ def scan(file: RawFile, *, sealed: bool, trusting: bool, lenient: bool = False) 
     """Scans `file` and returns the scan: where a trusting one meets damage, one that reads every chunk."""
     found = Scan(file, sealed=sealed, trusting=trusting, lenient=lenient)
     found.run()
-    if trusting and found.contents.damage:
+    if found.believed and found.contents.damage:
+        found.contents.chunks.cache.clear()  # or both passes' chunks would be in memory
         first, found = found, Scan(file, sealed=sealed, trusting=False, lenient=lenient)
         found.run()
         found.contents.damage[:] = list(dict.fromkeys([*first.contents.damage, *found.contents.damage]))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,10 @@ from dataflow.messages.declaration import Declaration
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.entries import Recorded
 from dataflow.recording.streams.reader import Recording
+
+M = TypeVar("M")
+_LAST = (2**63, 0)
+"""Behind every message."""
 
 Outcome = Literal["same", "within tolerance", "different", "only in A", "only in B"]
 
@@ -48,7 +52,8 @@ class FieldDifference:
 
 @dataclass(slots=True)
 class StreamDiff:
-    """Comparison of one stream. `missing_in_a`, `missing_in_b`: messages without a partner of equal stamp.
+    """Comparison of one stream. `missing_in_a`, `missing_in_b`: messages without a partner of equal stamp, in files of
+    other programs also for the other one cannot be read: those are counted in `unread_in_a`, `unread_in_b`.
 
     `differing` counts the pairs that differ beyond the tolerance, `first` is the first difference of the first of them,
     or the first message without a partner where that comes earlier (field `(message)`). `max_difference` is over all
@@ -61,6 +66,8 @@ class StreamDiff:
     count_b: int
     missing_in_a: int = 0
     missing_in_b: int = 0
+    unread_in_a: int = 0
+    unread_in_b: int = 0
     differing: int = 0
     max_difference: float = 0.0
     first: FieldDifference | None = None
@@ -124,6 +131,7 @@ def diff(
             _compare_messages(result, a, b, tolerance)
         else:
             _compare_bytes(result, a, b)
+        _count_unread(result, a, b)
         if result.first is not None:
             result.outcome = "different"
         elif result.max_difference > 0:
@@ -133,8 +141,7 @@ def diff(
 
 
 def _compare_messages(result: StreamDiff, a: Recording, b: Recording, tolerance: float | None) -> None:
-    pairs = _paired(a.messages([result.stream]), b.messages([result.stream]))
-    for in_a, in_b in pairs:
+    for in_a, in_b in _paired(a.messages([result.stream]), b.messages([result.stream]), _by_stamp):
         if in_a is None or in_b is None:
             _count_missing(result, in_a, in_b)
         elif in_a.message.digest() != in_b.message.digest():
@@ -145,19 +152,31 @@ def _compare_messages(result: StreamDiff, a: Recording, b: Recording, tolerance:
                 result.first = result.first or found[0]
 
 
-def _paired(a: Iterator[Recorded], b: Iterator[Recorded]) -> Iterator[tuple[Recorded | None, Recorded | None]]:
-    """Messages of equal (incarnation, stamp) side by side; None stands for the one that is missing."""
+def _paired(
+    a: Iterator[M], b: Iterator[M], order: Callable[[M], tuple[int, int]]
+) -> Iterator[tuple[M | None, M | None]]:
+    """Messages of equal order side by side; None stands for the one that is missing."""
     in_a, in_b = next(a, None), next(b, None)
     while in_a is not None or in_b is not None:
-        key_a, key_b = _order(in_a), _order(in_b)
+        key_a, key_b = (_LAST if m is None else order(m) for m in (in_a, in_b))
         takes_a, takes_b = key_a <= key_b, key_b <= key_a
         yield (in_a if takes_a else None), (in_b if takes_b else None)
         in_a = next(a, None) if takes_a else in_a
         in_b = next(b, None) if takes_b else in_b
 
 
-def _order(recorded: Recorded | None) -> tuple[float, int]:
-    return (np.inf, 0) if recorded is None else (recorded.incarnation, recorded.stamp)
+def _by_stamp(recorded: Recorded) -> tuple[int, int]:
+    return recorded.incarnation, recorded.stamp
+
+
+def _count_unread(result: StreamDiff, a: Recording, b: Recording) -> None:
+    """What cannot be read cannot be the same."""
+    in_a, in_b = a.unread.get(result.stream), b.unread.get(result.stream)
+    for side, unread in (("A", in_a), ("B", in_b)):
+        if unread is not None:
+            stamp = (a if side == "A" else b).streams[result.stream].first or 0
+            result.first = result.first or FieldDifference(stamp, "(message)", f"{side}: {unread}", None)
+    result.unread_in_a, result.unread_in_b = (0 if unread is None else unread.count for unread in (in_a, in_b))
 
 
 def _count_missing(result: StreamDiff, in_a: Recorded | None, in_b: Recorded | None) -> None:
@@ -277,17 +296,16 @@ def _short(value: Any) -> str:
 
 
 def _compare_bytes(result: StreamDiff, a: Recording, b: Recording) -> None:
-    """Streams without a message type: the records side by side, in order."""
-    left, right = a.raw([result.stream]), b.raw([result.stream])
-    for number in range(max(result.count_a, result.count_b)):
-        in_a, in_b = next(left, None), next(right, None)
+    """Streams without a message type: the records of equal log time side by side."""
+    pairs = _paired(a.raw([result.stream]), b.raw([result.stream]), lambda record: (record.log_time, 0))
+    for number, (in_a, in_b) in enumerate(pairs):
         present = in_a or in_b
         assert present is not None
         if in_a is None or in_b is None:
             result.missing_in_a += in_a is None
             result.missing_in_b += in_b is None
             detail = f"message {number} is only in {'B' if in_a is None else 'A'}"
-        elif (in_a.log_time, in_a.data) != (in_b.log_time, in_b.data):
+        elif in_a.data != in_b.data:
             result.differing += 1
             detail = f"message {number} has other bytes ({len(in_a.data)} against {len(in_b.data)})"
         else:

@@ -115,6 +115,8 @@ def _from_json(schema: FoxgloveSchema, data: bytes) -> Any:
 
 def _proto_of(proto: Any, data: bytes) -> Any:
     value = decode_object(data)
+    if not isinstance(value, dict):
+        raise RecordingError(f"not a {proto.DESCRIPTOR.full_name}: the JSON is no object, but {type(value).__name__}")
     try:
         ParseDict(_with_proto_times(value), proto, ignore_unknown_fields=True)
     except ParseError as error:

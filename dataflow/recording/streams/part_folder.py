@@ -59,6 +59,8 @@ def parts_in(folder: Path) -> list[Path]:
 class PartedFile:
     """The parts of a recording as one file (see `McapFile`). Chunks and channels are numbered through all of them."""
 
+    own = True
+
     def __init__(self, path: Path, parts: Sequence[Path], *, watch: Watch | None = None) -> None:
         self.path = path
         self._files: list[McapFile] = []
@@ -82,6 +84,9 @@ class PartedFile:
             raise RecordingError(f"{path}: nothing is in any of its parts")
         self.header = self._files[0].header
         self.torn = self._files[-1].torn or parts[-1] in bare
+        self.lacking = [text for file in self._files for text in file.lacking]
+        if parts[-1] in bare:
+            self.lacking.append(f"{parts[-1].name} {NOTHING_IN_IT}")
         self.lost_bytes = sum(file.lost_bytes for file in self._files)
         self.nbytes = sum(file.nbytes for file in self._files)
         self.damage = [f"{f.path.name}: {note}" for f in self._files for note in f.damage]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -11,12 +12,13 @@ import numpy as np
 from mcap.records import Channel
 
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording.errors import RecordingError
+from dataflow.recording.errors import DamagedError, RecordingError
 from dataflow.recording.layout import FORMAT, RECORDING, Kind
 from dataflow.recording.mcap.attachments import Attachment
 from dataflow.recording.mcap.contents import Entries
-from dataflow.recording.mcap.index import McapFile, RawMessage
+from dataflow.recording.mcap.index import McapFile, RawMessage, opened
 from dataflow.recording.mcap.rawfile import Watch
+from dataflow.recording.notices import notice
 from dataflow.recording.streams.access import StreamIndex
 from dataflow.recording.streams.codecs import codec_for
 from dataflow.recording.streams.entries import Event, RawRecord, Recorded
@@ -30,6 +32,7 @@ from dataflow.recording.streams.streams import (
     StreamChannel,
     StreamFinder,
     StreamInfo,
+    Unread,
     decoded,
     unreadable,
 )
@@ -41,7 +44,8 @@ class Recording:
 
     Opens our own recordings, a folder of the parts of one (NAME_000.mcap and so on), and any other MCAP. A file without
     an index (torn by `kill -9`, or foreign) is indexed by a pass over it. Raises `RecordingError` for a file that is no
-    MCAP or is damaged.
+    MCAP, and for one of ours that is damaged; messages of other programs that cannot be read are passed over
+    (`unread`).
     """
 
     def __init__(self, path: str | Path, *, watch: Watch | None = None, file: McapFile | None = None) -> None:
@@ -50,7 +54,7 @@ class Recording:
         self.path = Path(path)
         parts = parts_in(self.path) if self.path.is_dir() else []
         self._file: McapFile | PartedFile = (
-            PartedFile(self.path, parts, watch=watch) if parts else file or McapFile(self.path, watch=watch)
+            PartedFile(self.path, parts, watch=watch) if parts else file or opened(self.path, watch=watch)
         )
         try:
             self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
@@ -81,6 +85,17 @@ class Recording:
         """Returns notes on damage in the file, for people: read by other means, or left out, as each note states.
         Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read."""
         return tuple(self._file.damage)
+
+    @property
+    def lacking(self) -> Sequence[str]:
+        """Missing parts of the file whose messages are not counted anywhere, for people."""
+        return self._file.lacking
+
+    @property
+    def unread(self) -> Mapping[str, Unread]:
+        """By stream the messages of other programs that were passed over, since they cannot be read; complete for those
+        streams that have been read."""
+        return {name: s.unread for name, s in self._streams.items() if s.unread is not None}
 
     def attachments(self) -> Iterator[Attachment]:
         """Yields the files that it carries, as far as they can be read; `damage` notes the others."""
@@ -142,8 +157,16 @@ class Recording:
     ) -> Iterator[RawRecord]:
         """Undecoded messages of any streams with start ≤ log time ≤ end, merged by (log time, stream)."""
         chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
+        damaged: Counter[str] = Counter()
         for stream, (_, owner, chunk, offset, time, _, _, _) in self._rows(chosen, start, end, by_log_time=True):
-            raw = self._file.read(stream.channels[owner].record.id, chunk, offset, time)
+            try:
+                raw = self._file.read(stream.channels[owner].record.id, chunk, offset, time)
+            except DamagedError as error:
+                if self._file.own:
+                    raise
+                damaged[stream.info.name] += 1
+                stream.pass_over(damaged[stream.info.name], error.what)
+                continue
             info, data = stream.info, bytes(raw.data)
             record = RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, data)
             del raw, data  # it holds its chunk in memory
@@ -223,7 +246,8 @@ class Recording:
         return None
 
     def close(self) -> None:
-        """Closes the file. Idempotent."""
+        """Closes the file, and announces what was passed over (`notices`). Idempotent."""
+        notice(self.path, [f"{self.path.name}: {name}: {unread}" for name, unread in self.unread.items()])
         self._file.close()
 
     def __repr__(self) -> str:

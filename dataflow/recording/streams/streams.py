@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,18 @@ from dataflow.recording.mcap.message_index import MessageIndex
 from dataflow.recording.streams.codecs import SchemaText, codec_for, declaration_digest, recorded_declaration
 from dataflow.recording.streams.foreign import foreign_decoder
 from dataflow.recording.streams.part_folder import PartedFile
+
+
+@dataclass(slots=True)
+class Unread:
+    """Messages that cannot be read and were passed over: how many, and what is wrong with the first."""
+
+    count: int
+    reason: str
+
+    def __str__(self) -> str:
+        messages = f"{self.count:,} message{'' if self.count == 1 else 's'}"
+        return f"{messages} that cannot be read passed over, the first: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +91,8 @@ class StreamInfo:
 Decode = Callable[[RawMessage, memoryview | None], Message]
 File = McapFile | PartedFile
 """A recording in one file or in parts."""
+PEEKED = 64
+"""Messages of a foreign stream, evenly spaced, among which its type is looked for."""
 TypeOf = Callable[[], type[Message] | None]
 
 
@@ -92,8 +107,10 @@ class StreamChannel:
     companion: int | None
     """Id of the companion."""
     decode: Decode | None
+    readable: Entries | None = None
+    """Those of a foreign channel's messages that can be read, and
+    `stamps`, theirs: only known after a pass."""
     stamps: npt.NDArray[np.int64] | None = None
-    """By entry; of foreign channels only known after a pass."""
     by_log_time: bool = False
     """Foreign messages whose own times are not usable."""
 
@@ -126,6 +143,12 @@ class IndexedStream:
     info: StreamInfo
     own: bool
     channels: list[StreamChannel] = field(default_factory=list)
+    unread: Unread | None = None
+
+    def pass_over(self, count: int, reason: str) -> None:
+        """Notes messages that cannot be read; of several passes the one that found most counts."""
+        known = self.unread or Unread(0, reason)
+        self.unread = Unread(max(known.count, count), known.reason)
 
 
 class StreamFinder:
@@ -214,14 +237,16 @@ class StreamFinder:
         return StreamChannel(record, 0, 0, self._file.index, None, None if decoder is None else decode)
 
     def _peek(self, name: str, channels: list[StreamChannel]) -> type[Message] | None:
-        """The type of a foreign stream's first message; None when it does not decode."""
+        """The type of a foreign stream's first message that can be read, as far as it is looked for; None when none
+        can."""
         for channel in channels:
             if channel.decode is None or not channel.count:
                 continue
-            try:
-                return type(next(unordered(self._file, name, channel)))
-            except RecordingError:
-                channel.decode = None
+            entries = channel.entries
+            for at in np.unique(np.linspace(0, len(entries) - 1, PEEKED).astype(np.int64)).tolist():
+                with suppress(RecordingError):
+                    return type(message_at(self._file, name, channel, entries, at))
+            channel.decode = None
         return None
 
     def _schema(self, channel: Channel) -> SchemaText:
@@ -229,12 +254,10 @@ class StreamFinder:
         return SchemaText("", "", b"") if schema is None else SchemaText(schema.name, schema.encoding, schema.data)
 
 
-def unordered(file: File, stream: str, channel: StreamChannel) -> Iterator[Message]:
-    """The messages of a foreign channel in the order of its entries."""
-    entries = channel.entries
-    for i in range(len(entries)):
-        place = int(entries.chunks[i]), int(entries.offsets[i]), int(entries.times[i])
-        yield decoded(file.path, stream, channel, file.read(channel.record.id, *place), None)
+def message_at(file: File, stream: str, channel: StreamChannel, entries: Entries, at: int) -> Message:
+    """One message of a foreign channel, by its entry. Raises `RecordingError`."""
+    place = int(entries.chunks[at]), int(entries.offsets[at]), int(entries.times[at])
+    return decoded(file.path, stream, channel, file.read(channel.record.id, *place), None)
 
 
 def decoded(path: Path, stream: str, channel: StreamChannel, raw: RawMessage, extra: memoryview | None) -> Message:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.recording.errors import RecordingError
+from dataflow.recording.errors import DamagedError, RecordingError
 from dataflow.recording.mcap.contents import Entries
 from dataflow.recording.streams.ordering import Block, Pairs, Track, companions_of
-from dataflow.recording.streams.streams import File, IndexedStream, StreamChannel, unordered
+from dataflow.recording.streams.streams import File, IndexedStream, StreamChannel, message_at
 
 
 def tracks(
@@ -21,8 +22,8 @@ def tracks(
         for channel in stream.channels:
             yield Track(channel.span, 1, _blocks(file, stream, channel, by_log_time, start, end))
         return
-    entries = [c.entries for c in stream.channels]
-    times = [c.entries.times if by_log_time else _stamps(file, stream, c) for c in stream.channels]
+    found = [(c.entries, c.entries.times) if by_log_time else _stamped(file, stream, c) for c in stream.channels]
+    entries, times = [e for e, _ in found], [t for _, t in found]
     if any(map(len, times)):
         span = min(int(t.min()) for t in times if len(t)), max(int(t.max()) for t in times if len(t))
         yield Track(span, len(entries), [Block(entries, times, [None] * len(entries))])
@@ -53,15 +54,23 @@ def _companions(file: File, stream: IndexedStream, channel: StreamChannel, entri
     return found
 
 
-def _stamps(file: File, stream: IndexedStream, channel: StreamChannel) -> npt.NDArray[np.int64]:
-    """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass.
+def _stamped(file: File, stream: IndexedStream, channel: StreamChannel) -> tuple[Entries, npt.NDArray[np.int64]]:
+    """The messages of a foreign channel that can be read, and their stamps, which lie within them: that takes one pass.
 
-    Foreign messages of which two carry the same time are stamped with their log times instead.
+    Messages of which two carry the same time are stamped with their log times instead.
     """
-    if channel.stamps is None:
-        count = len(channel.entries)
-        decoded = (message.stamp for message in unordered(file, stream.info.name, channel))
-        channel.stamps = np.fromiter(decoded, np.int64, count)
-        if len(np.unique(channel.stamps)) < count:
-            channel.stamps, channel.by_log_time = channel.entries.times, True
-    return channel.stamps
+    if channel.readable is None or channel.stamps is None:
+        entries, stamps, kept = channel.entries, array("q"), array("q")
+        before = sum(len(c.entries) - len(c.readable) for c in stream.channels if c.readable is not None)
+        for i in range(len(entries)):
+            try:
+                stamps.append(message_at(file, stream.info.name, channel, entries, i).stamp)
+                kept.append(i)
+            except RecordingError as error:
+                if isinstance(error, DamagedError) and file.own:
+                    raise
+                stream.pass_over(before + i + 1 - len(kept), getattr(error, "what", "") or str(error))
+        channel.readable, channel.stamps = entries.where(np.array(kept, np.int64)), np.array(stamps, np.int64)
+        if len(np.unique(channel.stamps)) < len(channel.stamps):
+            channel.stamps, channel.by_log_time = channel.readable.times, True
+    return channel.readable, channel.stamps

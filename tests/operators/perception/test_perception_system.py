@@ -57,7 +57,7 @@ def room() -> Room:
     for stream, name in ports.items():
         for message in whole.between(0, END)[stream]:
             decoder = decoders.get(name)
-            steps.setdefault(message.stamp, {})[name] = message if decoder is None else decoder.process(message)
+            steps.setdefault(message.stamp, {})[name] = message if decoder is None else decoder.decode(message)
     infos: Any = (whole[name][0] for name in ("image_info", "depth_info", "extrinsics"))
     return Room(dict(sorted(steps.items())), *infos)
 

@@ -171,11 +171,11 @@ def test_stamps_lie_on_each_sensors_grid_and_strictly_increase() -> None:
 def test_compressed_streams_decode_to_the_raw_ones(everything: dict[str, list[Message]]) -> None:
     for raw, packed in zip(everything["depth"], everything["depth_png"], strict=True):
         assert isinstance(packed, CompressedDepth)
-        assert DepthDecoder().process(packed) == raw
+        assert DepthDecoder().decode(packed) == raw
     for raw, packed in zip(everything["image"], everything["image_jpeg"], strict=True):
         assert isinstance(raw, Image)
         assert isinstance(packed, CompressedImage)
-        decoded = ImageDecoder().process(packed)
+        decoded = ImageDecoder().decode(packed)
         assert np.abs(decoded.data.astype(int) - raw.data).mean() < 8
 
 

@@ -64,8 +64,8 @@ def first_second(recording: Recording) -> dict[str, list[Message]]:
 
 def decoded(message: Message) -> Message:
     if isinstance(message, CompressedImage):
-        return ImageDecoder().process(message)
-    return DepthDecoder().process(message) if isinstance(message, CompressedDepth) else message
+        return ImageDecoder().decode(message)
+    return DepthDecoder().decode(message) if isinstance(message, CompressedDepth) else message
 
 
 def alike(a: Message, b: Message) -> bool:

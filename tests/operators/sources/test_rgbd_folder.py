@@ -217,7 +217,7 @@ def test_spoiled_tum_lists_are_named_with_their_line(tmp_path: Path) -> None:
     write_tum(tmp_path)
     (tmp_path / "depth.txt").write_text("10.0 depth/0.png\nsoon depth/1.png\n")
     with pytest.raises(SourceError, match=r"depth\.txt:2: 'soon' is no time in seconds"):
-        read(tmp_path)
+        read(tmp_path, strict=True)
     (tmp_path / "depth.txt").write_text("10.0 depth/9.png\n")
     with pytest.raises(SourceError, match=r"no file .*depth/9\.png"):
         read(tmp_path, strict=True)
@@ -400,3 +400,42 @@ def test_real_millimetres_in_the_layout_of_tum_are_read_as_such(data_dir: Path, 
 
     assert 1.0 < np.median(depth.data[depth.data > 0]) < 3.0  # type: ignore[attr-defined]
     assert "depth_scale" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("rgb.txt", "10.15"),
+        ("rgb.txt", "now rgb/1.png"),
+        ("rgb.txt", "10.0 rgb/1.png"),
+        ("depth.txt", "1e30 depth/1.png"),
+        ("groundtruth.txt", "10.1 1 2 3 0 0"),
+        ("groundtruth.txt", "10.1 1 2 3 0 0 0 0"),
+        ("groundtruth.txt", "10.1 1 2 3 0 0 0 x"),
+    ],
+)
+def test_a_line_that_cannot_be_read_is_passed_over_and_counted(tmp_path: Path, file: str, line: str) -> None:
+    folder = write_tum(tmp_path)
+    with (folder / file).open("a") as list_:
+        list_.write(f"\n{line}\n")
+    source, frames = read(folder)
+
+    assert [frame["image"].stamp for frame in frames] == [10_000_000_000, 10_100_000_100]
+    assert source.summary() == {"passed_over": 1, "without_depth": 1}
+    with pytest.raises(SourceError, match=file):
+        read(folder, strict=True)
+
+
+def test_a_list_that_is_no_text_is_named(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path)
+    (folder / "rgb.txt").write_bytes("10.0 rgb/0.png".encode("utf-16"))
+    with pytest.raises(SourceError, match=r"rgb\.txt is no text in UTF-8"):
+        read(folder)
+
+
+def test_a_pose_of_left_handed_axes_is_none(tmp_path: Path) -> None:
+    folder = write_7scenes(tmp_path)
+    np.savetxt(folder / "frame-000001.pose.txt", np.diag([-1.0, 1, 1, 1]))
+    source, frames = read(folder)
+    assert ["ground_truth" in frame for frame in frames] == [True, False, True]
+    assert source.summary()["passed_over"] == 1
