@@ -53,6 +53,8 @@ from operators.fusion.sensors.settings import SensorSettings, errors_of, name_of
 
 Array = NDArray[np.float64]
 _DEFAULT = SensorSettings()
+_ANEW = 2_000_000_000
+"""Nanoseconds for which a filter that began anew is reported."""
 
 
 @dataclass(kw_only=True)
@@ -197,6 +199,7 @@ class EkfFusion(Operator):
         self.state.origin = around.origin
         if self.state.filter is None or not (felt or self.motion == "constant_velocity" or self._bridge(context.stamp)):
             return None
+        self.state.filter.look()
         return {"odometry": self._odometry(context.stamp), "status": self._status(context.stamp)}
 
     def summary(self) -> Mapping[str, float | int | str]:
@@ -348,6 +351,8 @@ class EkfFusion(Operator):
             others["filter"] = f"{count} headings in question"
         if self.state.filter.refuted_heading:
             others["heading"] = "the first heading that was told is wrong: measurements contradict it"
+        if stamp - self.state.filter.restarted < _ANEW:
+            others["filter"] = "begun anew: what was felt and measured of late contradicts the rotation"
         if (found := self.state.filter.suspicion) is not None:
             others |= suspicion_of(*found)
         if self.state.dropout.lasts(stamp):

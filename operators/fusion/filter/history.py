@@ -27,7 +27,15 @@ class Sample:
     noise: Noise
 
 
-Entry = Sample | Measurement | Command
+@dataclass(frozen=True, eq=False)
+class Restart:
+    """Holds an estimate of a time (ns) that takes the place of the one that measurements made."""
+
+    time: int
+    state: State
+
+
+Entry = Sample | Measurement | Command | Restart
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from dataflow.operator import Remembered
 from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import (
+    ROTATION,
     SIZE,
     Noise,
     State,
+    difference,
     mahalanobis,
     propagated,
     shifted,
@@ -33,6 +35,7 @@ from operators.fusion.filter.history import (
     Entry,
     Hypothesis,
     Node,
+    Restart,
     Sample,
 )
 from operators.fusion.filter.hypotheses import combined, likely, moves, reduced, refuted, with_errors
@@ -45,6 +48,8 @@ TOO_LATE = ": too late"
 """Suffix of a sensor's name in the counts of measurements that came after the window."""
 _STANDS = 60_000_000_000
 """Nanoseconds in motion until which a refuted first heading is reported."""
+_CONTRADICTS = 0.99
+"""Share of rotations that differ less by chance from a fit of the motion of late."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
 
@@ -82,13 +87,14 @@ class LateFilter(Remembered):
     _keys: list[tuple[int, int, str, int]]
     _count: int
     _suspicions: Suspicions
+    restarted: int  # when it last began anew, ns
 
     def __init__(self, config: FilterConfig, start: Node) -> None:
         self._config = config
         self._down = np.array([0.0, 0.0, -config.gravity])
         self._wander = config.errors.wander
         self._base, self._entries, self._keys, self._count = start, [], [], 0
-        self.ignored, self._suspicions = Counter(), self.new_part(Suspicions)
+        self.ignored, self.restarted, self._suspicions = Counter(), -_STANDS, self.new_part(Suspicions)
         self.restored()
 
     def prepare_snapshot(self) -> None:
@@ -129,8 +135,30 @@ class LateFilter(Remembered):
     @property
     def suspicion(self) -> tuple[str, str, float, float] | None:
         """The error that a sensor was not told to have, as `Suspicions.found`."""
+        return self._suspicions.found
+
+    def look(self) -> None:
+        """Fits the motion of late anew, once a second: shows errors of sensors, or that the estimate is wrong.
+
+        An estimate that was linearised about what it is not may be sure of a wrong rotation: it begins anew at the fit.
+        """
         node = self._newest()
-        return self._suspicions.found(node.time, node.window)
+        fit = self._suspicions.look(node.time, node.window)
+        if fit is None or fit.end is None:
+            return
+        key = (fit.until, 3, "", 0)
+        node = self._nodes[bisect_right(self._keys, key)]
+        if node.time != fit.until:
+            return
+        own = combined(node.hypotheses)
+        off = difference(own, fit.end)[ROTATION]
+        spread = own.covariance[ROTATION, ROTATION] + fit.end.covariance[ROTATION, ROTATION]
+        if float(off @ np.linalg.solve(spread, off)) > threshold(_CONTRADICTS, 3):
+            covariance = own.covariance.copy()
+            covariance[:SIZE, SIZE:], covariance[SIZE:, :SIZE] = 0.0, 0.0
+            covariance[:SIZE, :SIZE] = fit.end.covariance
+            self._insert(Restart(fit.until, replace(fit.end, errors=own.errors, covariance=covariance)), key)
+            self.restarted = node.time
 
     def feel(self, sample: Sample) -> None:
         """Takes an inertial sample, later than the last one."""
@@ -227,6 +255,8 @@ class LateFilter(Remembered):
             else:
                 gyro, accel, noise = node.gyro, node.accel, self._config.unknown
             node = self._moved(node, entry.time, gyro, accel, noise)
+        if isinstance(entry, Restart):
+            return replace(node, hypotheses=(Hypothesis(0.0, entry.state),))
         if isinstance(entry, Command):
             return replace(node, command=entry)
         return self._measured(node, entry)

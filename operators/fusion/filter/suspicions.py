@@ -63,7 +63,8 @@ _MOMENT = 1e-3
 class Fit:
     """Holds the motion that fits a window best: the state at its first step, and sensors' errors (S,).
 
-    `cost`: squared residuals by their covariance; `sigmas` (S,) of the errors; `freedom`: how many were measured.
+    `cost`: squared residuals by their covariance; `sigmas` (S,) of the errors; `freedom`: how many were measured;
+    `end`: the state at the last step, of the time `until` (ns), with its covariance.
     """
 
     time: int
@@ -72,6 +73,8 @@ class Fit:
     cost: float = 0.0
     sigmas: Array = field(default_factory=lambda: np.zeros(0))
     freedom: int = 0
+    until: int = 0
+    end: State | None = None
 
 
 class Suspicions(Remembered):
@@ -87,19 +90,25 @@ class Suspicions(Remembered):
         self._loose = np.repeat([*_LOOSE, *biases], 3)
         self._looked, self._found, self._suspected, self._fits = 0, None, [], []
 
-    def found(self, time: int, window: Window) -> tuple[str, str, float, float] | None:
+    @property
+    def found(self) -> tuple[str, str, float, float] | None:
         """Returns sensor, kind, size and standard deviation (s, or a share) of the error that explains most, if any."""
+        return self._found
+
+    def look(self, time: int, window: Window) -> Fit | None:
+        """Looks, once a second; returns the motion that was fitted if no error was found, None if none was."""
         if time - self._looked < _EVERY:
-            return self._found
+            return None
         self._looked = time
         suspected = self._suspects(window)
         enough = len(window.steps) - window.first >= _FEWEST and bool(suspected)
         if suspected != self._suspected or not enough:
             self._suspected, self._fits, self._found = suspected, [], None
-        if enough:
-            self._fits = [self._fitted(window, erring) for erring in (False, True)]
-            self._found = self._judged(*self._fits)
-        return self._found
+        if not enough:
+            return None
+        self._fits = [self._fitted(window, erring) for erring in (False, True)]
+        self._found = self._judged(*self._fits)
+        return self._fits[0] if self._found is None else None
 
     def _suspects(self, window: Window) -> list[tuple[str, str]]:
         """Returns sensors and the kinds of error that are looked for: those that are not estimated."""
@@ -127,7 +136,7 @@ class Suspicions(Remembered):
         prior, size = self._prior(steps[0]), SIZE + len(errors) * erring
         spread = np.diag([_SPREAD[kind] ** -2.0 for _, kind in self._suspected])
         for _ in range(_ROUNDS):
-            information, score, cost, freedom = self._linear(steps, state, errors)
+            information, score, cost, freedom, end, effects = self._linear(steps, state, errors)
             away = difference(state, steps[0].start)
             information[:SIZE, :SIZE] += prior
             score[:SIZE] += prior @ away
@@ -141,7 +150,10 @@ class Suspicions(Remembered):
             if np.abs(change[ROTATION.start :]).max() < _SETTLED:
                 break
         sigmas = np.sqrt(np.diag(np.linalg.inv(information))[SIZE:])
-        return Fit(steps[0].time, state, errors, cost, sigmas, freedom)
+        known = effects[:SIZE, :size]
+        covariance = end.covariance + known @ np.linalg.solve(information[:size, :size], known.T)
+        end = moved(end, known @ change, covariance)
+        return Fit(steps[0].time, state, errors, cost, sigmas, freedom, steps[-1].time, end)
 
     def _begun(self, window: Window, erring: bool) -> tuple[State, Array]:
         """Returns the state at the window's first step and the errors (S,) from which a fit begins."""
@@ -164,10 +176,11 @@ class Suspicions(Remembered):
         information[ROTATION, ROTATION] += np.outer(up, up) * (_TURNED**-2.0 - self._loose[ROTATION.start] ** -2.0)
         return information
 
-    def _linear(self, steps: Sequence[Step], x: State, errors: Array) -> tuple[Array, Array, float, int]:
+    def _linear(self, steps: Sequence[Step], x: State, errors: Array) -> tuple[Array, Array, float, int, State, Array]:
         """Returns information (15 + S, 15 + S) and score (15 + S,) of the first state and of the sensors' errors.
 
-        Beside them the sum of squared residuals, and how many. The noise of the motion is filtered out.
+        Beside them the sum of squared residuals, and how many; the state at the last step, and how it changes with
+        these. The noise of the motion is filtered out.
         """
         K, count = len(self._known.sigmas), len(errors)
         wander = self._known.wander
@@ -201,7 +214,8 @@ class Suspicions(Remembered):
                 freedom += len(residual)
                 gain = white[:, SIZE + count + 1 :].T
                 mean, effects, P = mean + gain @ residual, effects - gain @ A, P - gain @ PH.T
-        return information, score, cost, freedom
+        end = moved(replace(x, errors=np.zeros(0)), mean[:SIZE], P[:SIZE, :SIZE])
+        return information, score, cost, freedom, end, effects
 
     def _row(self, entry: Measurement, x: State, step: Step, errors: Array) -> tuple[Array, Array, Array]:
         """Returns residual (M,), Jacobian (M, 15 + K), and what each error adds to the residual (M, S)."""
