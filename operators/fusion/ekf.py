@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -28,11 +29,20 @@ from operators.fusion.alarms import Alarms
 from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import Noise
 from operators.fusion.filter.gate import GateConfig
-from operators.fusion.filter.history import Measurement
 from operators.fusion.filter.imu_dropout import ImuDropout
-from operators.fusion.filter.initialisation import Prior, coasting_node, prior_of
+from operators.fusion.filter.initialisation import COASTING, Prior, coasting_node, prior_of
 from operators.fusion.filter.late_filter import FilterConfig, LateFilter
-from operators.fusion.output import diagnostics, figures, odometry_of, suspicion_of, unmeasured, well_known
+from operators.fusion.filter.measurements import Measurement
+from operators.fusion.filter.suspicions import LATE
+from operators.fusion.output import (
+    diagnostics,
+    figures,
+    odometry_of,
+    suspicion_of,
+    unmeasured,
+    unsure_of_time,
+    well_known,
+)
 from operators.fusion.sensors.constraints import Constraints
 from operators.fusion.sensors.covariances import Unusable
 from operators.fusion.sensors.inertial import InertialConfig, InertialSensor
@@ -43,6 +53,8 @@ from operators.fusion.sensors.settings import SensorSettings, errors_of, name_of
 
 Array = NDArray[np.float64]
 _DEFAULT = SensorSettings()
+_ANEW = 2_000_000_000
+"""Nanoseconds for which a filter that began anew is reported."""
 
 
 @dataclass(kw_only=True)
@@ -80,7 +92,8 @@ class EkfFusion(Operator):
     A sensor's time offset is a setting, `offset`; with `offset_sigma` it is a state of the filter and estimated, as far
     as the motion makes it observable. So are a position's error that changes slowly, as satellites have (`drift`), and
     the scale of wheels (`scale_sigma`): taken for white noise, these would make the covariance too small. Late stamps
-    of places and speeds of a wrong scale that were not told are looked for in the innovations, and warned of.
+    of places and speeds of a wrong scale that were not told are looked for in the last 20 s, and warned of; while
+    stamps are late, the covariance holds what that may do.
 
     `standstill` and `slip` say what is known of the motion without a sensor of it (wheels say both by themselves).
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
@@ -186,6 +199,7 @@ class EkfFusion(Operator):
         self.state.origin = around.origin
         if self.state.filter is None or not (felt or self.motion == "constant_velocity" or self._bridge(context.stamp)):
             return None
+        self.state.filter.look()
         return {"odometry": self._odometry(context.stamp), "status": self._status(context.stamp)}
 
     def summary(self) -> Mapping[str, float | int | str]:
@@ -222,6 +236,7 @@ class EkfFusion(Operator):
             gates=self._gates,
             errors=errors_of(self.sensors),
             unfelt=self._prior().unfelt(self.gravity) if inertial else None,
+            biases=(self.gyro_bias, self.accel_bias) if inertial else COASTING,
         )
 
     def _unknown(self) -> Noise:
@@ -322,6 +337,9 @@ class EkfFusion(Operator):
         self.state.sure = self.state.sure or well_known(state.covariance, self.sure)
         if not self.state.sure:
             return None
+        found = self.state.filter.suspicion
+        if found is not None and found[1] == LATE:
+            state = unsure_of_time(state, rate, math.hypot(*found[2:]))
         T_body_base = self.state.lever_arms.of(self.base_frame)
         return odometry_of(state, rate, T_body_base, stamp, self.world_frame, self.base_frame)
 
@@ -333,6 +351,8 @@ class EkfFusion(Operator):
             others["filter"] = f"{count} headings in question"
         if self.state.filter.refuted_heading:
             others["heading"] = "the first heading that was told is wrong: measurements contradict it"
+        if stamp - self.state.filter.restarted < _ANEW:
+            others["filter"] = "begun anew: what was felt and measured of late contradicts the rotation"
         if (found := self.state.filter.suspicion) is not None:
             others |= suspicion_of(*found)
         if self.state.dropout.lasts(stamp):

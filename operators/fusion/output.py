@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,13 @@ def suspicion_of(sensor: str, kind: str, size: float, sigma: float) -> dict[str,
         return {sensor: text}
     side = "fast" if size > 0 else "slow"
     return {sensor: f"its speeds are {abs(size):.1%} ± {sigma:.1%} too {side} (scale_sigma)"}
+
+
+def unsure_of_time(state: State, rate: Array, seconds: float) -> State:
+    """Returns the state with a covariance that holds a delay of the whole (s); `rate` is the gyroscope's reading."""
+    moves = np.zeros(len(state.covariance))
+    moves[POSITION], moves[ROTATION] = state.velocity, rate - state.gyro_bias
+    return replace(state, covariance=state.covariance + seconds**2 * np.outer(moves, moves))
 
 
 def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame: str, child_frame: str) -> Odometry:

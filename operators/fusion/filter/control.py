@@ -45,5 +45,4 @@ class Command:
             velocity=(1.0 - share) * turned @ state.velocity + share * state.rotation @ self.linear,
             gyro_bias=(1.0 - share) * state.gyro_bias - share * self.angular,
             covariance=F @ state.covariance @ F.T,
-            effects=F @ state.effects if state.effects.size else state.effects,
         )

@@ -28,7 +28,7 @@ class State:
     """An estimate: position (3,) and velocity (3,) in the world, R_world_body (3, 3), biases (3,), covariance.
 
     `errors` (K,): lasting errors of sensors, such as time offsets; `covariance` is (15 + K, 15 + K). `effects`
-    (15 + K, S): by how much the estimate is wrong for each unit of S suspected errors, which it does not contain. A
+    (15 + K, S): how it changes with S things before, which is carried along with the motion. A
     body without inertial sensor has the angular velocity -gyro_bias: it is an inertial body whose sensor reads 0.
     """
 
@@ -185,7 +185,6 @@ def moved(state: State, error: Array, covariance: Array | None = None) -> State:
         accel_bias=state.accel_bias + error[ACCEL_BIAS],
         covariance=state.covariance if covariance is None else covariance,
         errors=state.errors + error[SIZE:],
-        effects=state.effects,
     )
 
 
@@ -203,11 +202,8 @@ def difference(state: State, other: State) -> Array:
     )
 
 
-def updated(state: State, residual: Array, H: Array, R: Array, suspected: Array | None = None) -> State:
-    """Corrects the state by a residual (M,) with Jacobian (M, 15 + K) and covariance (M, M); Joseph's form.
-
-    `suspected` (M, S): the part of the residual that each unit of a suspected error makes; None for no part.
-    """
+def updated(state: State, residual: Array, H: Array, R: Array) -> State:
+    """Corrects the state by a residual (M,) with Jacobian (M, 15 + K) and covariance (M, M); Joseph's form."""
     P = state.covariance
     PH = P @ H.T
     K = np.linalg.solve(H @ PH + R, PH.T).T
@@ -218,9 +214,6 @@ def updated(state: State, residual: Array, H: Array, R: Array, suspected: Array 
     reset = unit.copy()  # the error is from now on one of the corrected rotation
     reset[ROTATION, ROTATION] -= 0.5 * skew(error[ROTATION])
     P = reset @ P @ reset.T
-    if state.effects.size:
-        effects = A @ state.effects + (0.0 if suspected is None else K @ suspected)
-        state = replace(state, effects=reset @ effects)
     return moved(state, error, 0.5 * (P + P.T))
 
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import Noise, State
 from operators.fusion.filter.gate import Health
-from operators.fusion.filter.measurements import Model
-from operators.fusion.filter.suspicions import Suspicions
+from operators.fusion.filter.measurements import Measurement
+from operators.fusion.filter.window import Window
 
 Array = NDArray[np.float64]
 
@@ -28,42 +28,34 @@ class Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
-    """Holds a sensor's measurement of a time (ns), with covariance (M, M).
-
-    `clock`: which of the state's time offsets is the sensor's, -1 for none; `assumed`: seconds taken for it in `time`.
-    """
+class Restart:
+    """Holds an estimate of a time (ns) that takes the place of the one that measurements made."""
 
     time: int
-    sensor: str
-    model: Model
-    noise: Array
-    clock: int = -1
-    assumed: float = 0.0
+    state: State
 
 
-Entry = Sample | Measurement | Command
+Entry = Sample | Measurement | Command | Restart
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """One of several estimates, with the logarithm of its weight.
 
-    `against`: what was told of the first heading, which it is followed against for a time in motion; `suspicions`: of
-    errors that its sensors were not told to have.
+    `against`: what was told of the first heading, which it is followed against for a time in motion.
     """
 
     weight: float
     state: State
     against: bool = False
-    suspicions: Suspicions = field(default_factory=Suspicions)
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
     """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor.
 
-    `refuted`: measurements contradict what was told of the first heading; `moving`: nanoseconds in motion so far.
+    `refuted`: measurements contradict what was told of the first heading; `moving`: nanoseconds in motion so far;
+    `window`: what was felt and measured of late.
     """
 
     time: int
@@ -74,3 +66,4 @@ class Node:
     command: Command | None = None
     refuted: bool = False
     moving: int = 0
+    window: Window = field(default_factory=Window)

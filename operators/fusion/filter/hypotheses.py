@@ -26,9 +26,7 @@ def with_errors(node: Node, sigmas: Sequence[float]) -> Node:
         fresh = range(known, len(covariance))
         covariance[fresh, fresh] = np.square(sigmas[known - SIZE :])
         errors = np.concatenate([h.state.errors, np.zeros(len(fresh))])
-        effects = np.zeros((len(covariance), h.state.effects.shape[1]))
-        effects[:known] = h.state.effects
-        made.append(replace(h, state=replace(h.state, covariance=covariance, errors=errors, effects=effects)))
+        made.append(replace(h, state=replace(h.state, covariance=covariance, errors=errors)))
     return replace(node, hypotheses=tuple(made))
 
 

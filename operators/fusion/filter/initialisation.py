@@ -25,6 +25,8 @@ from operators.fusion.filter.measurements import AngularRate, RestingForce
 from operators.geometry.se3 import skew
 
 Array = NDArray[np.float64]
+COASTING = (1.0, 1e-3)
+"""Standard deviations of the first biases (rad/s, m/s²) of a body without inertial sensor."""
 TILT = 0.1
 """Standard deviation of the first level, rad."""
 _MISTOLD = -7.0
@@ -132,7 +134,8 @@ def coasting_node(stamp: int, prior: Prior, gravity: float) -> Node:
     samples = [Sample(stamp - 1, np.zeros(3), up, quiet), Sample(stamp, np.zeros(3), up, quiet)]
     if prior.heading is None:
         prior = replace(prior, heading=0.0, heading_sigma=math.pi)
-    prior = replace(prior, gyro_bias=1.0, accel_bias=1e-3, moving_velocity=10.0, moving_accel=1.0)
+    gyro_bias, accel_bias = COASTING
+    prior = replace(prior, gyro_bias=gyro_bias, accel_bias=accel_bias, moving_velocity=10.0, moving_accel=1.0)
     return first_node(samples, prior, gravity, at_rest=False)
 
 

@@ -11,6 +11,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +19,11 @@ from numpy.typing import NDArray
 from dataflow.operator import Remembered
 from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import (
+    ROTATION,
     SIZE,
     Noise,
     State,
+    difference,
     mahalanobis,
     propagated,
     shifted,
@@ -31,20 +34,22 @@ from operators.fusion.filter.gate import Doubt, GateConfig, Health, judge, leap,
 from operators.fusion.filter.history import (
     Entry,
     Hypothesis,
-    Measurement,
     Node,
+    Restart,
     Sample,
 )
 from operators.fusion.filter.hypotheses import combined, likely, moves, reduced, refuted, with_errors
-from operators.fusion.filter.measurements import Velocity
+from operators.fusion.filter.measurements import Measurement
 from operators.fusion.filter.sensor_errors import SensorErrors
-from operators.fusion.filter.suspicions import LATE, suspected
+from operators.fusion.filter.suspicions import Suspicions
 
 Array = NDArray[np.float64]
 TOO_LATE = ": too late"
 """Suffix of a sensor's name in the counts of measurements that came after the window."""
 _STANDS = 60_000_000_000
 """Nanoseconds in motion until which a refuted first heading is reported."""
+_CONTRADICTS = 0.99
+"""Share of rotations that differ less by chance from a fit of the motion of late."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
 
@@ -58,7 +63,7 @@ class FilterConfig:
     Without them velocity and angular velocity stay but for the noise `unknown`. `gates`: those of single sensors, by
     the first word of their name. `errors`: those of sensors that are estimated. `unfelt`: standard deviation (m/s²) of
     what an inertial sensor as little known as at first may fail to feel, which is what the gates grant it; None where
-    there is none.
+    there is none. `biases`: standard deviations (rad/s, m/s²) of the first biases.
     """
 
     window: float = 1.0
@@ -70,6 +75,7 @@ class FilterConfig:
     gates: Mapping[str, GateConfig] = field(default_factory=dict)
     errors: SensorErrors = field(default_factory=SensorErrors)
     unfelt: float | None = None
+    biases: tuple[float, float] = (0.02, 0.2)
 
 
 class LateFilter(Remembered):
@@ -80,18 +86,24 @@ class LateFilter(Remembered):
     _entries: list[Entry]
     _keys: list[tuple[int, int, str, int]]
     _count: int
+    _suspicions: Suspicions
+    restarted: int  # when it last began anew, ns
 
     def __init__(self, config: FilterConfig, start: Node) -> None:
         self._config = config
         self._down = np.array([0.0, 0.0, -config.gravity])
         self._wander = config.errors.wander
         self._base, self._entries, self._keys, self._count = start, [], [], 0
-        self.ignored = Counter()
+        self.ignored, self.restarted, self._suspicions = Counter(), -_STANDS, self.new_part(Suspicions)
         self.restored()
 
     def prepare_snapshot(self) -> None:
         self._newest()
         self._base = self._nodes[0]
+
+    def new_part(self, kind: type[Any]) -> Suspicions:
+        gravity = self._down if self._config.inertial else np.zeros(3)
+        return Suspicions(self._config.errors, gravity, self._config.biases)
 
     def restored(self) -> None:
         self._nodes = [with_errors(self._base, self._config.errors.sigmas)]
@@ -122,9 +134,31 @@ class LateFilter(Remembered):
 
     @property
     def suspicion(self) -> tuple[str, str, float, float] | None:
-        """The error that a sensor was not told to have, as `Suspicions.found`; None while several estimates stand."""
-        hypotheses = likely(self._newest().hypotheses)
-        return hypotheses[0].suspicions.found if len(hypotheses) == 1 else None
+        """The error that a sensor was not told to have, as `Suspicions.found`."""
+        return self._suspicions.found
+
+    def look(self) -> None:
+        """Fits the motion of late anew, once a second: shows errors of sensors, or that the estimate is wrong.
+
+        An estimate that was linearised about what it is not may be sure of a wrong rotation: it begins anew at the fit.
+        """
+        node = self._newest()
+        fit = self._suspicions.look(node.time, node.window)
+        if fit is None or fit.end is None:
+            return
+        key = (fit.until, 3, "", 0)
+        node = self._nodes[bisect_right(self._keys, key)]
+        if node.time != fit.until:
+            return
+        own = combined(node.hypotheses)
+        off = difference(own, fit.end)[ROTATION]
+        spread = own.covariance[ROTATION, ROTATION] + fit.end.covariance[ROTATION, ROTATION]
+        if float(off @ np.linalg.solve(spread, off)) > threshold(_CONTRADICTS, 3):
+            covariance = own.covariance.copy()
+            covariance[:SIZE, SIZE:], covariance[SIZE:, :SIZE] = 0.0, 0.0
+            covariance[:SIZE, :SIZE] = fit.end.covariance
+            self._insert(Restart(fit.until, replace(fit.end, errors=own.errors, covariance=covariance)), key)
+            self.restarted = node.time
 
     def feel(self, sample: Sample) -> None:
         """Takes an inertial sample, later than the last one."""
@@ -221,6 +255,8 @@ class LateFilter(Remembered):
             else:
                 gyro, accel, noise = node.gyro, node.accel, self._config.unknown
             node = self._moved(node, entry.time, gyro, accel, noise)
+        if isinstance(entry, Restart):
+            return replace(node, hypotheses=(Hypothesis(0.0, entry.state),))
         if isinstance(entry, Command):
             return replace(node, command=entry)
         return self._measured(node, entry)
@@ -235,10 +271,12 @@ class LateFilter(Remembered):
                 replace(h, state=propagated(h.state, mean_gyro, mean_accel, seconds, noise, self._down, self._wander))
                 for h in node.hypotheses
             )
+            window = node.window.felt(mean_gyro, mean_accel, seconds, noise)
         else:
             hypotheses = tuple(replace(h, state=self._coasted(h.state, seconds, gyro, node)) for h in node.hypotheses)
+            window = node.window.broken() if inertial or node.command else node.window.coasted(seconds, noise)
         moving = node.moving + (time - node.time) * moves(max(hypotheses, key=lambda h: h.weight).state)
-        return replace(node, time=time, hypotheses=hypotheses, gyro=gyro, accel=accel, moving=moving)
+        return replace(node, time=time, hypotheses=hypotheses, gyro=gyro, accel=accel, moving=moving, window=window)
 
     def _coasted(self, state: State, seconds: float, gyro: Array, node: Node) -> State:
         """Goes on at the same velocities, or those that the body was told: what is felt is gravity alone."""
@@ -286,37 +324,18 @@ class LateFilter(Remembered):
         else:
             hypotheses = reduced(
                 [
-                    self._updated(
-                        replace(h, weight=h.weight - 0.5 * (nis + spread)), entry, r, J, node, verdict == "used"
-                    )
+                    replace(h, weight=h.weight - 0.5 * (nis + spread), state=updated(h.state, r, J, entry.noise))
                     for h, (r, J), (nis, spread) in zip(hypotheses, found, scores, strict=True)
                 ],
                 node.moving,
             )
-        told_wrongly = refuted(hypotheses, node.refuted)
-        return replace(node, hypotheses=hypotheses, health={**node.health, entry.sensor: after}, refuted=told_wrongly)
-
-    def _updated(
-        self, h: Hypothesis, entry: Measurement, residual: Array, H: Array, node: Node, counts: bool
-    ) -> Hypothesis:
-        """Returns a hypothesis after a measurement, which `counts` as evidence of errors that were not told."""
-        state, suspicions, model = h.state, h.suspicions, entry.model
-        kind = suspected(model)
-        if entry.clock >= 0 if kind == LATE else entry.sensor in dict(self._config.errors.scales):
-            kind = None  # it is estimated
-        if kind is not None:
-            suspicions = suspicions.of(entry.sensor, kind)
-            new = len(suspicions.sensors) - state.effects.shape[1]
-            state = replace(state, effects=np.pad(state.effects, ((0, 0), (0, new)))) if new else state
-        if not suspicions.sensors:
-            return replace(h, state=updated(state, residual, H, entry.noise))
-        signature = np.zeros((len(residual), len(suspicions.sensors)))
-        if kind is not None:
-            own = model.value if isinstance(model, Velocity) else -self._change(entry, state, node)
-            signature[:, suspicions.sensors.index(entry.sensor)] = own
-        if counts:
-            suspicions = suspicions.after(entry.time, state, residual, H, entry.noise, signature)
-        return replace(h, state=updated(state, residual, H, entry.noise, signature), suspicions=suspicions)
+        window = node.window
+        if verdict == "used":
+            before = combined(node.hypotheses)
+            accel = node.accel if self._config.inertial else before.accel_bias
+            window = window.measured(entry, before, node.gyro, accel)
+        told_wrongly, healths = refuted(hypotheses, node.refuted), {**node.health, entry.sensor: after}
+        return replace(node, hypotheses=hypotheses, health=healths, refuted=told_wrongly, window=window)
 
     def _found(
         self, entry: Measurement, hypotheses: Sequence[Hypothesis], node: Node

@@ -178,6 +178,21 @@ Model = Position | Orientation | FullPose | Velocity | AngularRate | RestingForc
 `widening(residual, seconds)` variances (15,) that make room for a residual which arose in a time."""
 
 
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Holds a sensor's measurement of a time (ns), with covariance (M, M).
+
+    `clock`: which of the state's time offsets is the sensor's, -1 for none; `assumed`: seconds taken for it in `time`.
+    """
+
+    time: int
+    sensor: str
+    model: Model
+    noise: Array
+    clock: int = -1
+    assumed: float = 0.0
+
+
 def _left_inverse(w: Array) -> Array:
     """The inverse of SO(3)'s left Jacobian (3, 3)."""
     angle = float(np.linalg.norm(w))

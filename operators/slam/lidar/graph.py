@@ -53,13 +53,12 @@ class LidarSettings(PlaceSettings):
 class Search:
     """A scan that is looked for in the map: views that it is yet to be compared with, and those that it saw again.
 
-    Once it is `found`, what is left are the `rivals`: views elsewhere that may explain it as well.
+    Once these give a place, what is left are the `rivals`: views elsewhere that may explain the scan as well.
     """
 
     number: int
     candidates: list[int]
     sights: list[tuple[int, LidarSight]] = field(default_factory=list)
-    found: bool = False
     rivals: list[int] = field(default_factory=list)
 
 
@@ -84,11 +83,13 @@ class LidarGraph(PlaceGraph[LidarView]):
 
     graph: KeyframeGraph[LidarView]
     search: Search | None  # of a scan in the map, while the place is not known
+    place: Search | None  # the scan that a place was found for, of which rivals are looked at
+    again: Search | None  # a later scan that found that place too
 
     def __init__(self, settings: LidarSettings, eyes: LidarEyes) -> None:
         super().__init__(settings, _Contexts, between)
         self._eyes = eyes
-        self.search = None
+        self.search = self.place = self.again = None
 
     def add(
         self, stamp: int, T_odom: Matrix, covariance: Matrix, view: LidarView, segment: int, found_again: bool
@@ -121,47 +122,57 @@ class LidarGraph(PlaceGraph[LidarView]):
         self, number: int, candidates: Sequence[int], eyes: Eyes[LidarView], added: Added
     ) -> list[tuple[int, Sighting]]:
         """Begins to look for a scan in views that look alike, unless another is looked for: see `_continue`."""
-        if self.search is None and candidates:
+        if self.search is None and self.again is None and candidates:
             self.search = Search(number, list(candidates))
         return []
 
     def _continue(self, added: Added) -> None:
-        """Goes on with the search, by a bounded number of views: each look takes a good part of a second."""
+        """Goes on with the search, by a bounded number of views: each look takes a good part of a second.
+
+        Rivals of a place are looked at while the sensor is on its way to the scan that confirms it.
+        """
+        searches = [one for one in (self.search, self.place, self.again) if one is not None]
+        if self.newest is None or any(self.nodes[one.number].island != self.newest.island for one in searches):
+            self.search = self.place = self.again = None  # the odometry began anew
         for _ in range(LOOKS):
             if self.search is not None:
-                self._advance(self.search, added)
+                self._compare(self.search, added)
+            elif self.place is not None and self.place.rivals and self._fits(self.place, self.place.rivals.pop(0)):
+                added.refused.append(AMBIGUOUS)
+                self.place = self.again = None
+            if self.again is not None and self.place is not None and not self.place.rivals:
+                self._take(self.again, added)
 
-    def _advance(self, search: Search, added: Added) -> None:
-        """Looks at one more view, and ends the search where that decides it."""
+    def _compare(self, search: Search, added: Added) -> None:
+        """Compares a scan with one more view; after the last, decides whether they give a place."""
+        seen = self._sights(search.number, [search.candidates.pop(0)], self._eyes, False, added)
+        search.sights += [(k, sight) for k, sight in seen if isinstance(sight, LidarSight)]
         if search.candidates:
-            seen = self._sights(search.number, [search.candidates.pop(0)], self._eyes, False, added)
-            search.sights += [(k, sight) for k, sight in seen if isinstance(sight, LidarSight)]
-        elif search.rivals and self._fits(search, search.rivals.pop(0)):
-            self._refuse(added)
             return
-        if search.candidates or search.rivals:
-            return
-        if search.found:
-            self.search = None
-            self._take(search, added)
+        self.search = None
+        if not search.sights:
             return
         poses = [self.nodes[k].T @ seen.T_known_seen for k, seen in search.sights]
         if not all(alike(poses[0], T) for T in poses[1:]):
-            self._refuse(added)
+            added.refused.append(AMBIGUOUS)
             return
-        search.found = bool(self._weighed(search.number, search.sights[:1]))
-        search.rivals = self._rivals(search) if search.found else []
-        if not search.rivals:
-            self.search = None
-            if search.found:
-                self._take(search, added)
+        confirmed = bool(self._weighed(search.number, search.sights[:1]))
+        if not (confirmed and self._same_place(search)):
+            search.rivals = self._rivals(search)
+            self.place = search
+        self.again = search if confirmed else None
 
-    def _refuse(self, added: Added) -> None:
-        added.refused.append(AMBIGUOUS)
-        self.search = None
+    def _same_place(self, search: Search) -> bool:
+        """Returns whether a scan was found where the place is whose rivals are looked at, by the odometry."""
+        if self.place is None or self.nodes[self.place.number].island != self.nodes[search.number].island:
+            return False
+        (known, best), (other, seen) = self.place.sights[0], search.sights[0]
+        way = invert(self.nodes[self.place.number].T_odom) @ self.nodes[search.number].T_odom
+        return alike(self.nodes[known].T @ best.T_known_seen @ way, self.nodes[other].T @ seen.T_known_seen)
 
     def _take(self, search: Search, added: Added) -> None:
         """Closes the loop to the view that looks most alike: all that are believed say the same, and none elsewhere."""
+        self.search = self.place = self.again = None
         loops = search.sights[:1]
         added.loops += len(loops)
         self.loops += len(loops)

@@ -24,13 +24,14 @@ from operators.fusion.filter.error_state import (
     propagated,
     updated,
 )
-from operators.fusion.filter.history import Measurement, Sample
+from operators.fusion.filter.history import Sample
 from operators.fusion.filter.initialisation import Prior, first_node, rests
 from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import (
     AngularRate,
     FullPose,
     MagneticHeading,
+    Measurement,
     Model,
     Orientation,
     Position,

@@ -11,11 +11,11 @@ from made_motion import Motion
 from dataflow.execution.snapshots import pack_state, unpack_state
 from operators.fusion.filter.error_state import Noise
 from operators.fusion.filter.gate import GateConfig
-from operators.fusion.filter.history import Measurement, Sample
+from operators.fusion.filter.history import Sample
 from operators.fusion.filter.hypotheses import reduced
 from operators.fusion.filter.initialisation import Prior, first_node
 from operators.fusion.filter.late_filter import FilterConfig, LateFilter
-from operators.fusion.filter.measurements import Position
+from operators.fusion.filter.measurements import Measurement, Position
 
 NOISE = Noise(gyro=2e-3, accel=2e-2, gyro_walk=1e-4, accel_walk=1e-3)
 RATE = 50

@@ -11,10 +11,10 @@ from made_motion import GRAVITY, Motion
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import NavSatFix
 from operators.fusion.filter.error_state import SIZE, Noise, State
-from operators.fusion.filter.history import Measurement, Sample
+from operators.fusion.filter.history import Sample
 from operators.fusion.filter.initialisation import Prior, first_node
 from operators.fusion.filter.late_filter import FilterConfig, LateFilter
-from operators.fusion.filter.measurements import Position, Velocity
+from operators.fusion.filter.measurements import Measurement, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
 from operators.fusion.sensors.interpretation import Surroundings, measurements
 from operators.fusion.sensors.settings import SensorSettings, errors_of

@@ -14,10 +14,10 @@ from dataflow.messages import Diagnostics
 from dataflow.operator import Context
 from operators.fusion import EkfFusion
 from operators.fusion.filter.error_state import Noise
-from operators.fusion.filter.history import Measurement, Sample
+from operators.fusion.filter.history import Sample
 from operators.fusion.filter.initialisation import Prior, first_node
 from operators.fusion.filter.late_filter import FilterConfig, LateFilter
-from operators.fusion.filter.measurements import AngularRate, Model, Orientation, Position, Velocity
+from operators.fusion.filter.measurements import AngularRate, Measurement, Model, Orientation, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
 
 MOTION = Motion()

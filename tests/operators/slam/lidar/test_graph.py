@@ -66,3 +66,22 @@ def test_a_map_is_not_found_where_another_part_of_it_explains_the_scan_as_well(b
     assert [one.found for one in added].count(True) == (not both)
     assert any("ambiguous" in reason for one in added for reason in one.refused) is both
     assert np.allclose(graph.T_map_odom[:2, 3], (0.0, 0.0) if both else (1.0, 0.3), atol=1e-6)
+
+
+def test_rivals_of_a_place_are_looked_at_before_the_scan_that_confirms_it() -> None:
+    """Four views of the place, and a dozen views elsewhere; a keyframe at every fifth scan."""
+    places = [0.5 * k for k in range(4)] + [20.0 + 1.5 * k for k in range(12)]
+    nodes = [
+        Node(k, at(x, 0, 0), SMALL, at(x, 0, 0), SMALL, 0.0, SAVED, view(k, 0.01 if x < 10 else 1.0))
+        for k, x in enumerate(places)
+    ]
+    eyes = Corridor(both=False)
+    graph = LidarGraph(LidarSettings(), eyes)  # type: ignore[arg-type]
+    graph.begin_in(nodes)
+    looks, found = [0], list[bool]()
+    for k in range(12):
+        found.append(graph.add(100 + k, at(0.06 * k, 0, 0), SMALL, view(50, 0.01), 0, False).found)
+        looks.append(eyes.looks)
+    assert np.diff(looks).max() == LOOKS
+    assert eyes.looks == 3 + 12 + 3  # views of two scans, and rivals of the first
+    assert found.index(True) == 8
