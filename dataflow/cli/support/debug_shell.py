@@ -15,7 +15,6 @@ from rich.text import Text
 from dataflow.cli.support.output import out, plural, print_json_line, say
 from dataflow.cli.support.verdicts import difference_text
 from dataflow.debugging.fired import described
-from dataflow.execution.snapshots import changes
 from dataflow.messages.base import Message
 from dataflow.messages.display.text import field_text
 from dataflow.sync.entries import entries_of
@@ -148,7 +147,7 @@ class Shell(cmd.Cmd):
             raise WrongCommand(self._debugger.no_state())
         if line and line not in {*before, *after}:
             raise WrongCommand(f"no part {line!r}; there are: {', '.join(sorted({*before, *after}))}")
-        pairs = [(line, before.get(line), after.get(line))] if line else changes(before, after)
+        pairs = [(line, before.get(line), after.get(line))] if line else fired.changes()
         for name, was, now in pairs:
             out.print(Text.assemble((f"{name}\n", "bold"), f"  before  {_plain(was)}"), soft_wrap=True)
             out.print(Text(f"  after   {_plain(now)}"), soft_wrap=True)
