@@ -100,6 +100,7 @@ def test_a_value_that_nothing_changes_is_not_said_to_be_decided_by_nothing(spiky
     assert told.exit_code == 1
     assert "decided by" not in words
     assert "not known what decided brake #30: nothing that was tried there changes the value" in words
+    assert "several inputs together, of which no one alone changes it" in words
     assert "nudged" in words
     answer = json.loads(CliRunner().invoke(app, ["blame", str(spiky), "--field", asked, "--json"]).stdout)
     assert (answer["whole"], answer["sensed"], answer["no_change_shows_at"]) == (False, [], [["brake", 30]])

@@ -237,9 +237,9 @@ def _print_ends(chain: Chain) -> None:
     if chain.loose:
         names = ", ".join(map(_call, chain.loose[:5])) + (", …" if len(chain.loose) > 5 else "")
         text = (
-            f"not known what decided {names}: nothing that was tried there changes the value, so it may be made by the"
+            f"not known what decided {names}: nothing that was tried there changes the value, so it may be made by "
+            "several inputs together, of which no one alone changes it, by the code, or by the call's time"
         )
-        text += " code or the call's time alone"
         what = f"{plural(chain.tried.total(), 'change')} tried in all: {tried}"
         out.print(Text(f"{text} ({what})", style="yellow"), soft_wrap=True)
     for each in chain.untried:
