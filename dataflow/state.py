@@ -203,6 +203,42 @@ def take_over(target: Any, hints: Mapping[str, Any], state: Any, new_part: NewPa
         setattr(target, attribute, typed(hint, state[attribute], f"{name}.{attribute}", current, new_part))
 
 
+def legible(hint: Any, value: Any) -> Any:
+    """Returns what `plain` made of a value of type `hint` with mappings and queues in it as such, for expressions and
+    to be shown; what does not fit its type, and what an object gives by `snapshot()`, stays as it is."""
+    origin, arguments = typing.get_origin(hint) or hint, typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return next((other for each in arguments if (other := legible(each, value)) is not value), value)
+    if origin is typing.Annotated:
+        return legible(arguments[0], value)
+    if origin is deque and isinstance(value, list) and len(value) == 2 and isinstance(value[1], list):
+        return [legible(arguments[0] if arguments else Any, item) for item in value[1]]
+    if origin in _MAPPINGS and isinstance(value, list):
+        return _legible_pairs(arguments, value)
+    if isinstance(value, list) and (origin in _SEQUENCES or origin is tuple):
+        each_its_own = origin is tuple and len(arguments) == len(value)
+        kinds = arguments if each_its_own else itertools.repeat(arguments[0] if arguments else Any)
+        return [legible(kind, item) for kind, item in zip(kinds, value, strict=False)]
+    if isinstance(value, Mapping) and isinstance(origin, type) and _has_fields(origin):
+        bound = dict(zip(getattr(origin, "__parameters__", ()), arguments, strict=False))
+        hints = {name: _with_arguments(each, bound) for name, each in _hints(origin).items()}
+        return {name: legible(hints.get(name, Any), item) for name, item in value.items()}
+    return value
+
+
+def _has_fields(kind: type) -> bool:
+    """Returns whether a snapshot holds its attributes by name."""
+    return dataclasses.is_dataclass(kind) or issubclass(kind, Remembered)
+
+
+def _legible_pairs(arguments: Sequence[Any], value: list[Any]) -> Any:
+    kind, of = (*arguments, Any, Any)[:2] if len(arguments) != 1 else (arguments[0], int)  # a Counter's
+    try:
+        return {typed(kind, key): legible(of, item) for key, item in value}
+    except (StateError, TypeError, ValueError):  # no pairs: a state of another version
+        return value
+
+
 _HINTS: dict[type, dict[str, Any]] = {}
 
 

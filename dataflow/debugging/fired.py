@@ -14,6 +14,7 @@ from dataflow.execution.snapshots import changes, unpack_state
 from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import FieldDifference
 from dataflow.records.firing import FiringRecord
+from dataflow.state import legible
 from dataflow.sync import Firing
 
 States = tuple[bytes | None, bytes | None]
@@ -72,6 +73,8 @@ class Fired:
     """Outputs and the error are the recorded ones, as verification compares them."""
     takes: Sequence[str] = ()
     """All that the operator declares for its inputs."""
+    state: Any = None
+    """The class of the state, if it is declared."""
 
     @property
     def outputs(self) -> Mapping[str, Message | None]:
@@ -89,8 +92,9 @@ class Fired:
         return self.packed()[1]
 
     def states(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
-        """The state before and after, as `snapshot()` gives it."""
-        before, after = (None if state is None else unpack_state(state) for state in self.packed())
+        """The state before and after, as `snapshot()` gives it; mappings and queues of a declared state as such."""
+        unpacked = (None if state is None else unpack_state(state) for state in self.packed())
+        before, after = (state if self.state is None else legible(self.state, state) for state in unpacked)
         return before, after
 
     def changed(self) -> tuple[str, ...]:

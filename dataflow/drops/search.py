@@ -278,7 +278,7 @@ class Drops:
 
         # The longest at first; of those that suffice the last: a replay makes the calls behind its first difference.
         suffice = shortest_end(sorted(bursts, key=len), heal, GROWS)
-        named = _flat(needed(sorted(suffice), heal))
+        named = _flat(needed(sorted(suffice, key=lambda burst: burst[0]), heal))
         if in_time and len(named) > 1:
             named = _reduced(named, heals)
         undone = self._replay(branch, named)

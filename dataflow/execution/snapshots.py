@@ -9,7 +9,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from dataflow.state import StateError
+from dataflow.state import StateError, plain
 
 _ARRAY = 1
 _LONGEST_HEADER = 1024
@@ -80,9 +80,9 @@ def _other_version(before: Any, now: Any, place: str = "") -> str | None:
 def changes(before: Any, after: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Place, value before and after of what differs in two unpacked states, as deep as mappings go."""
     if isinstance(before, Mapping) and isinstance(after, Mapping):
-        for name in sorted({*before, *after}):
+        for name in sorted({*before, *after}, key=str):
             yield from changes(before.get(name), after.get(name), f"{place}.{name}" if place else name)
-    elif pack_state({"": before}) != pack_state({"": after}):
+    elif pack_state({"": plain(before)}) != pack_state({"": plain(after)}):
         yield place, before, after
 
 

@@ -7,7 +7,7 @@ import json
 import random
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from dataflow.cli.support.debug_shell import Shell, WrongCommand
 from dataflow.debugging.debugger import DebugError, Debugger, Unmade
 from dataflow.debugging.fired import SPACING, Fired, Probe, Process
 from dataflow.execution.failure import OperatorFailure
+from dataflow.execution.snapshots import changes, pack_state
 from dataflow.graph import Graph, load_graph, load_text
 from dataflow.graph.sections import Record
 from dataflow.messages.base import Message
@@ -29,6 +30,7 @@ from dataflow.records import reading
 from dataflow.records.firing import CALLS, FiringRecord, Rows
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import graph_that_is_here
+from dataflow.state import plain
 from dataflow.supervision.run import run
 from dataflow.sync import Firing
 
@@ -530,6 +532,23 @@ def test_an_expression_is_not_true_of_a_call_without_what_it_names(
     shell.onecmd("until inp.x.stampp < 0")
     assert shell.failed
     assert "inp.x.stampp < 0 at call 0: AttributeError" in capsys.readouterr().out
+
+
+@dataclass
+class Keyed:
+    tracks: dict[int, float] = field(default_factory=dict)
+    count: int = 0
+
+
+def test_a_mapping_of_a_state_goes_by_its_keys(added: Recording) -> None:
+    packed = tuple(pack_state(plain(Keyed({9: 0.5, 1: age}))) for age in (2.0, 3.0))
+    fired = replace(Debugger(added, "adder").goto(2), state=Keyed, packed=lambda: packed)
+
+    before, after = fired.states()
+    assert before is not None
+    assert (before["tracks"][1], before["tracks"][9]) == (2.0, 0.5)
+    assert fired.changed() == ("tracks",)
+    assert list(changes(before, after)) == [("tracks.1", 2.0, 3.0)]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Number, Odometry
 from dataflow.operator import KEPT, In, Operator, Out, Param, Remembered
-from dataflow.state import Counts, StateError, of_another_version, plain, state_hints, take_over, typed
+from dataflow.state import Counts, StateError, legible, of_another_version, plain, state_hints, take_over, typed
 
 V = TypeVar("V")
 
@@ -369,3 +369,39 @@ def test_a_state_of_another_version_is_taken_over_as_far_as_there_are_defaults()
         operator.restore({**snapshot, "tracks": [[1, {"id": 1}]]})
     with pytest.raises(StateError, match="has no kind, spare, which the class has now; it has older, which"):
         operator.restore(former)
+
+
+@dataclass
+class Seen:
+    mean: float = 0.0
+    names: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass
+class Many:
+    tracks: dict[int, Seen] = field(default_factory=dict)
+    last: deque[float] = field(default_factory=lambda: deque(maxlen=3))
+    counts: Counter[str] = field(default_factory=Counter)
+    cells: dict[tuple[int, int], list[Seen | None]] = field(default_factory=dict)
+    best: Seen | None = None
+    pair: tuple[int, dict[int, int]] = (0, {})
+    loose: dict = field(default_factory=dict)  # type: ignore[type-arg]
+
+
+def test_mappings_and_queues_of_a_state_are_legible_as_such() -> None:
+    seen = Seen(0.5, {"a": 1})
+    state = Many({7: seen, 1: Seen()}, deque([1.0, 2.0], 3), Counter(x=2), {(1, 2): [None, seen]}, seen, (1, {4: 5}))
+    state.loose = {3: 4}
+    plain_seen = {"mean": 0.5, "names": {"a": 1}}
+
+    assert legible(Many, plain(state)) == {
+        "tracks": {7: plain_seen, 1: {"mean": 0.0, "names": {}}},
+        "last": [1.0, 2.0],
+        "counts": {"x": 2},
+        "cells": {(1, 2): [None, plain_seen]},
+        "best": plain_seen,
+        "pair": [1, {4: 5}],
+        "loose": {3: 4},
+    }
+    assert legible(Many, {"tracks": 3, "other": [[1, 2]]}) == {"tracks": 3, "other": [[1, 2]]}, "of another version"
+    assert legible(Many, None) is None
