@@ -512,6 +512,7 @@ class Blame:
                     effects = fewer
                     del left[stream]
             runs = [(taken, effects) for taken in left.values()]
+        runs = runs or [run for taken in by_stream.values() for run in split(taken, self._sensed_elsewhere)]
         for taken, effects in runs:
             call, name, entry = taken[0]
             place, last = place_of(entry), taken[-1].entry.seq if len(taken) > 1 else None
@@ -568,6 +569,19 @@ class Blame:
                 if len(taken) > 1:
                     break
         return tuple(effects.values())
+
+    def _sensed_elsewhere(self, taken: Sequence[Taken]) -> tuple[Effect, ...]:
+        """The effect of sensors' messages that are others of their streams for all calls that take them, each another
+        one: an operator may know one that comes twice, such as a picture of a camera that hangs."""
+        there = [list(self._messages.elsewhere(*each)) for each in taken]
+        if not all(there):
+            return ()
+        for k in range(ANOTHER):
+            chosen = [others[(k + n) % len(others)] for n, others in enumerate(there)]
+            messages = {place_of(each.entry): message for each, message in zip(taken, chosen, strict=True)}
+            if (found := self._changed("another", {}, messages=messages)) is not None:
+                return (Effect("another", (), found[0], len(taken)),)
+        return ()
 
     # ------------------------------------------------------------------------------------------------- the effect
 
