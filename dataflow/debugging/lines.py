@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 import sysconfig
 from collections import Counter
@@ -102,6 +103,20 @@ def own_frames(frame: FrameType | None, homes: Homes) -> Iterator[FrameType]:
 def lines_of(file: str) -> set[int]:
     """The lines of a source file that hold code. Raises OSError, SyntaxError."""
     return set(_lines(compile(Path(file).read_bytes(), file, "exec")))
+
+
+def functions_of(file: str) -> dict[int, set[str]]:
+    """The functions of a source file by the lines that run in them, not when it is loaded. Raises OSError,
+    SyntaxError."""
+    found: dict[int, set[str]] = {}
+    left = [compile(Path(file).read_bytes(), file, "exec")]
+    while left:
+        code = left.pop()
+        left += [inner for inner in code.co_consts if isinstance(inner, CodeType)]
+        for _, _, line in code.co_lines() if code.co_flags & inspect.CO_OPTIMIZED else ():
+            if line:
+                found.setdefault(line, set()).add(code.co_name)
+    return found
 
 
 def _lines(code: CodeType) -> Iterator[int]:

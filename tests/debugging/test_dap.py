@@ -20,7 +20,7 @@ import dataflow
 from dataflow.debugging.dap.session import Session, listen
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Abandoned, Probe
-from dataflow.debugging.lines import homes_of, is_own, lines_of
+from dataflow.debugging.lines import functions_of, homes_of, is_own, lines_of
 from dataflow.messages.base import Message
 from dataflow.recording import Recorded, Recording
 from dataflow.sync import Firing
@@ -394,7 +394,18 @@ def test_variables_that_are_assigned_by_hand_are_those_of_the_frame(recorded: tu
 def test_a_breakpoint_that_cannot_be_says_why(recorded: tuple[Recording, Path]) -> None:
     with editing(recorded) as client:
         doc = LINES['"""Adds up."""']
-        assert client.breakpoints(doc + 1)[0]["verified"]
+        (loaded,) = client.breakpoints(doc + 1)
+        assert (loaded["verified"], loaded["message"]) == (
+            False,
+            "it runs when the module is loaded, before the recorded calls",
+        )
+        assert client.breakpoints(ADDED)[0]["verified"]
+        for more in ({"hitCondition": "3"}, {"logMessage": "{value}"}):
+            (told,) = client.ask(
+                "setBreakpoints", source={"path": str(recorded[1])}, breakpoints=[{"line": ADDED} | more]
+            )["breakpoints"]
+            assert not told["verified"]
+            assert "hit counts and log points are not there" in told["message"]
         (beyond,) = client.breakpoints(4000)
         assert not beyond["verified"]
         told = client.ask("setBreakpoints", source={"path": np_file()}, breakpoints=[{"line": 1}])
@@ -578,6 +589,20 @@ def test_a_client_that_sends_nothing_ends_the_session(
         session = Session(ours, Debugger(recorded[0], "adder"), 0)
         session.serve()
         assert session._over
+
+
+def test_lines_go_by_the_functions_in_which_they_run(tmp_path: Path) -> None:
+    file = tmp_path / "op.py"
+    file.write_text(
+        "class A:\n    x = 1\n\n    def setup(self):\n        self.f = lambda: (\n            2)\n        return 3\n"
+    )
+
+    assert {line: sorted(names) for line, names in functions_of(str(file)).items()} == {
+        4: ["setup"],
+        5: ["<lambda>", "setup"],
+        6: ["<lambda>"],
+        7: ["setup"],
+    }
 
 
 def test_a_line_behind_the_end_of_the_file_names_the_last_one(recorded: tuple[Recording, Path]) -> None:

@@ -21,7 +21,7 @@ from dataflow.debugging.dap.variables import Variables
 from dataflow.debugging.dap.wire import Gone, Wire
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Abandoned, Fired, Process, Through
-from dataflow.debugging.lines import Lines, Spot, homes_of, is_own, lines_of, own_frames
+from dataflow.debugging.lines import Lines, Spot, functions_of, homes_of, is_own, lines_of, own_frames
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.messages.base import Message
 from dataflow.reexecution.recorded_run import ReplayError
@@ -441,9 +441,7 @@ class Session:
             try:
                 line = _line_with_code(file, each["line"])
                 condition = compile(text, "<condition>", "eval") if text else None
-                problem = (
-                    "" if is_own(file, self._homes) else "breakpoints are for the operator's source, not for libraries"
-                )
+                problem = self._why_not(file, line, each)
             except LookupError as error:
                 problem = str(error)
             except (OSError, SyntaxError, ValueError) as error:
@@ -455,6 +453,17 @@ class Session:
             told.append({"verified": True, "line": line})
         self._breakpoints[file] = set_here
         return {"breakpoints": told}
+
+    def _why_not(self, file: str, line: int, wanted: Mapping[str, Any]) -> str:
+        """Returns why a breakpoint would stop nowhere, or not as it is wanted; nothing where it does."""
+        if not is_own(file, self._homes):
+            return "breakpoints are for the operator's source, not for libraries"
+        if wanted.get("hitCondition") or wanted.get("logMessage"):
+            return "hit counts and log points are not there: a condition, or dataflow debug --do 'until EXPRESSION'"
+        functions = functions_of(file).get(line, set())
+        if not functions:
+            return "it runs when the module is loaded, before the recorded calls"
+        return "" if functions != {"setup"} else "setup() runs before the recorded calls, which are what is stepped"
 
     def _set_exceptions(self, arguments: Mapping[str, Any]) -> None:
         self._stops_raised = UNCAUGHT in arguments.get("filters", ())
