@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from tampering import Kept, as_it_is, tampered
 import dataflow
 from dataflow.api.local import LocalRun
 from dataflow.capture.capture import capture
+from dataflow.cli.commands.debug import _converse
 from dataflow.cli.support.debug_shell import Shell, WrongCommand
 from dataflow.debugging.debugger import DebugError, Debugger, Unmade
 from dataflow.debugging.fired import SPACING, Fired, Probe, Process
@@ -596,6 +598,40 @@ def test_an_expression_that_could_be_tried_in_no_call_is_an_error(
         "not so where there is nothing, in 26 calls: number > 3 and inp.x.stamp < 0 at call 4"
         in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "found"),
+    [
+        ("until inp.x.sta", "inp.x.sta", ["inp.x.stamp"]),
+        ('print before["to', "to", ['total"]']),
+        ("print after['to", "to", ["total']"]),
+        ('print before["la', "la", []),  # no name of the state, and no keyword of Python
+        ('until out.total == "whi', "whi", []),
+    ],
+)
+def test_names_are_completed_in_expressions(line: str, text: str, found: list[str], added: Recording) -> None:
+    shell = Shell(debugger := Debugger(added, "adder"), 0)
+    debugger.goto(2)
+
+    assert shell.complete_until(text, line, len(line) - len(text), len(line)) == found
+
+
+def test_an_interrupt_at_the_prompt_drops_the_line_that_was_begun(
+    added: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shell, intros = Shell(Debugger(added, "adder"), 0), list[str]()
+
+    def loop(intro: str) -> None:
+        intros.append(intro)
+        if len(intros) < 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(shell, "cmdloop", loop)
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    _converse(shell, [], interactive=True)
+
+    assert [bool(intro) for intro in intros] == [True, False, False]
 
 
 def test_an_operator_that_was_not_called_has_no_call(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:

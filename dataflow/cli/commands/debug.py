@@ -284,8 +284,14 @@ def _converse(shell: Shell, lines: list[str], *, interactive: bool) -> None:
         shell.onecmd(line)
         failed = failed or shell.failed
     if interactive and sys.stdin.isatty():
-        shell.cmdloop(f"{plural(shell.calls, 'call')}; help lists the commands")
-        return
+        intro = f"{plural(shell.calls, 'call')}; help lists the commands"
+        while True:
+            try:
+                shell.cmdloop(intro)
+                return
+            except KeyboardInterrupt:  # the line that was begun is dropped, as at other prompts
+                out.print()
+                intro = ""
     for line in sys.stdin if interactive else ():
         if shell.onecmd(line.strip()):
             break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cmd
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from itertools import chain, count, takewhile
@@ -220,7 +221,11 @@ class Shell(cmd.Cmd):
         states = (None, None) if self._debugger.at is None else self._debugger.at.states()
         return sorted(n for n in {*(states[0] or ()), *(states[1] or ())} if n.startswith(text))
 
-    def _complete_expression(self, text: str, *ignored: Any) -> list[str]:
+    def _complete_expression(self, text: str, line: str = "", begin: int = 0, *ignored: Any) -> list[str]:
+        if (key := re.search(r"\b(before|after)\[(['\"])$", line[:begin])) is not None:
+            return [f"{word}{key[2]}]" for word in self._complete_part(text)]
+        if line[:begin].count('"') % 2 or line[:begin].count("'") % 2:
+            return []  # inside a text
         names = {} if self._debugger.at is None else self._debugger.at.names() | dict.fromkeys(("before", "after"))
         completer = Completer(names)
         found = takewhile(bool, (completer.complete(text, n) for n in count()))
