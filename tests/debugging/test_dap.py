@@ -694,7 +694,9 @@ def edited(recorded: tuple[Recording, Path]) -> Iterator[Path]:
     exec(compile(SOURCE, str(recorded[1]), "exec"), vars(module))
 
 
-def test_a_call_that_raises_is_stopped_at_where_it_raises_once(recorded: tuple[Recording, Path], edited: Path) -> None:
+def test_a_call_that_raises_is_stopped_at_where_it_raises_once_on_each_way_there(
+    recorded: tuple[Recording, Path], edited: Path
+) -> None:
     with editing(recorded, 5) as client:
         assert client.ask("setExceptionBreakpoints", filters=["uncaught"]) == {}
         client.ask("configurationDone")
@@ -707,6 +709,8 @@ def test_a_call_that_raises_is_stopped_at_where_it_raises_once(recorded: tuple[R
         assert (reason, line, client.call()) == ("exception", CLIPS, 8)
         assert client.variables() == {"value": "64.0", "most": "50.0"}
         assert client.go("stepBack") == ("step", CLIPS - 1)
+        assert client.go("continue") == ("exception", CLIPS)
+        assert client.call() == 8
         client.ask("continue")
         assert client.stopped()[0] == "end of the recording"
         assert any("IndexError: list index out of range" in text for text in client.told)

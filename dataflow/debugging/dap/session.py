@@ -325,6 +325,11 @@ class Session:
             call += 1
         return found
 
+    def _gone_back(self, call: int, spot: Spot | None, wanted: Stops, why: str) -> Going:
+        """As `_back`; what the call raises further on is stopped at again."""
+        self._raises = -1
+        return self._back(call, spot, wanted, why)
+
     def _back(self, call: int, spot: Spot | None, wanted: Stops, why: str) -> Going:
         """The last line event before, in this call or in earlier ones, at which `wanted` would stop; else the beginning
         of the first one. A pause leads to the calls that are being looked at."""
@@ -410,8 +415,8 @@ class Session:
             "stepOut": self._over_from(frame, out=True),
         }
         away = {
-            "stepBack": partial(self._back, call, spot, _everywhere, "step"),
-            "reverseContinue": partial(self._back, call, spot, self._breaks, "breakpoint"),
+            "stepBack": partial(self._gone_back, call, spot, _everywhere, "step"),
+            "reverseContinue": partial(self._gone_back, call, spot, self._breaks, "breakpoint"),
             "restart": partial(self._anew, call),
         }
         if name in on:
