@@ -22,7 +22,7 @@ from dataflow.debugging.ring import MOST_BYTES as MOST_HELD
 from dataflow.debugging.ring import Held, Ring
 from dataflow.debugging.sources import Sources
 from dataflow.execution.calls import value_of
-from dataflow.execution.failure import OperatorFailure, readable
+from dataflow.execution.failure import RESTORE, OperatorFailure, readable
 from dataflow.execution.feeds.playable import span_of
 from dataflow.execution.ports import Emitter
 from dataflow.execution.recorded import RecordedRunner
@@ -46,8 +46,6 @@ REACH = 3 * 10**9
 """Span (ns) before a call in which a state is looked for at first."""
 NEAR = 16
 """Calls to a state further on, beyond which an operator is set up anew and begins there."""
-RESTORE = "restore()"
-"""The call in which an operator fails that is given a state of another version of its class."""
 MOST_BYTES = 2**28
 """Of the states that are kept; beyond it every other one is let go."""
 

@@ -12,13 +12,14 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def shortest_end(items: Sequence[T], shows: Callable[[Sequence[T]], bool]) -> Sequence[T]:
-    """The shortest end of `items`, of 0, 1, 2, 4, 8... of them, that shows it; all where none of these does."""
+def shortest_end(items: Sequence[T], shows: Callable[[Sequence[T]], bool], grows: int = 2) -> Sequence[T]:
+    """The shortest end of `items`, of 0, 1, `grows`, its square... of them, that shows it; all where none of these
+    does."""
     size = 0
     while size < len(items):
         if shows(items[len(items) - size :]):
             return items[len(items) - size :]
-        size = 2 * size or 1
+        size = grows * size or 1
     return items
 
 

@@ -19,7 +19,8 @@ from dataflow.debugging.lines import Lines, homes_of, is_own
 from dataflow.debugging.reduce import needed, smallest
 from dataflow.execution.failure import OperatorFailure
 from dataflow.graph.code import ReloadError, code_now, digest_of, other_texts, stored
-from dataflow.graph.model import OperatorImportError
+from dataflow.graph.model import Node, OperatorImportError
+from dataflow.operator import Operator, ParameterError, validate_parameters
 from dataflow.recording import Recording
 from dataflow.records.cuts import code_in
 from dataflow.records.reading import FiringLog
@@ -181,14 +182,23 @@ def _without(undone: Iterable[Change], texts: Mapping[str, list[str]]) -> dict[s
 
 def _mends(recording: Recording, debugger: Debugger, fired: Fired, texts: Mapping[str, bytes]) -> bool | None:
     """Returns whether the call gives what was recorded with other texts of modules."""
+    node, here = debugger.node, debugger.node.operator
     try:
-        with (
-            other_texts(debugger.node, texts),
-            closing(Debugger(recording, debugger.node.name, debugger.graph)) as again,
-        ):
-            return again.goto(fired.number).same
-    except (ReloadError, OperatorImportError, ReplayError, OperatorFailure):  # it cannot be made with them
+        with other_texts(node, texts):
+            nodes = {**debugger.graph.nodes, node.name: _with_defaults(node, here)}
+            with closing(Debugger(recording, node.name, replace(debugger.graph, nodes=nodes))) as again:
+                return again.goto(fired.number).same
+    except (ParameterError, ReloadError, OperatorImportError, ReplayError, OperatorFailure):  # it cannot be made so
         return None
+
+
+def _with_defaults(node: Node, before: type[Operator]) -> Node:
+    """Returns a node with the defaults of its class as it is now where it has those of the class before."""
+    fields = before.spec.parameters.model_fields
+    needed = {name: value for name, value in node.params.items() if fields[name].is_required()}
+    defaults = validate_parameters(before, needed).model_dump(mode="json")
+    given = {name: value for name, value in node.params.items() if name in needed or value != defaults[name]}
+    return replace(node, params=validate_parameters(node.operator, given).model_dump(mode="json"))
 
 
 def _raised(fired: Fired, homes: tuple[Path, ...]) -> Place | None:

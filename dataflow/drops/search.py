@@ -14,7 +14,7 @@ from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
-from dataflow.debugging.reduce import needed, none_to_spare, smallest, thinned
+from dataflow.debugging.reduce import needed, none_to_spare, shortest_end, smallest, thinned
 from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, Sent, bursts_of, losses_of, sent_by
 from dataflow.drops.player import Player
@@ -31,6 +31,8 @@ from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here, s
 from dataflow.sync import FOREVER, NEVER
 
 SECONDS = 60.0
+GROWS = 4
+"""Times as many bursts are tried next, where some do not suffice."""
 FUNCTIONS: Mapping[str, Callable[..., Any]] = {f.__name__: f for f in (abs, min, max, round, sum, len, any, all)}
 """Functions that an expression may call."""
 
@@ -174,8 +176,10 @@ class Drops:
         self._log = FiringLog.read(recording)
         names = [name for name in self.graph.nodes if name in self._log.operators]
         self._recorded = recorded_summaries(recording, names)
-        self.worse = Worse(worse, self._recorded)
         self._records = {name: list(self._log.ordered(self.graph.nodes[name])) for name in names}
+        if not any(record.kind == "finish" for records in self._records.values() for record in records):
+            raise DropsError("no figures are recorded: the run was ended before its operators' finish(), which sums up")
+        self.worse = Worse(worse, self._recorded)
         self.replays = 0
         self._known: dict[frozenset[Loss], Figures | OperatorFailure | ReplayError] = {}
         """By what was undone, what a replay gave."""
@@ -274,8 +278,9 @@ class Drops:
         def heal(part: Sequence[Sequence[Loss]]) -> bool:
             return heals(_flat(part))
 
-        longest = max(bursts, key=len)  # else from the last on: a replay makes the calls behind its first difference
-        named = list(longest) if heal([longest]) else _flat(needed(bursts, heal))
+        # The longest at first; of those that suffice the last: a replay makes the calls behind its first difference.
+        suffice = shortest_end(sorted(bursts, key=len), heal, GROWS)
+        named = _flat(needed(sorted(suffice, key=lambda burst: burst[0]), heal))
         if in_time and len(named) > 1:
             named = _reduced(named, heals)
         undone = self._replay(branch, named)

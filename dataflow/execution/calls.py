@@ -17,7 +17,7 @@ import numpy as np
 from dataflow.execution.completion import complete_outputs, require_complete
 from dataflow.execution.effects.answers import EffectError
 from dataflow.execution.effects.journal import Journal
-from dataflow.execution.failure import RAISED, OperatorFailure
+from dataflow.execution.failure import RAISED, RESTORE, OperatorFailure
 from dataflow.execution.generators.loading import LOADS
 from dataflow.execution.generators.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
 from dataflow.execution.generators.shared_generators import AT_WORK
@@ -129,7 +129,7 @@ class Calls:
                 self._seed_change("restore", place)
                 self.operator.restore(unpack_state(state))
         except RAISED as error:
-            raise OperatorFailure(self.node.name, "restore()", error) from error
+            raise OperatorFailure(self.node.name, RESTORE, error) from error
 
     def summary(self, place: Place) -> dict[str, float | int | str]:
         """Returns what the operator sums up, as plain values. Raises `OperatorFailure`."""

@@ -8,6 +8,8 @@ from types import TracebackType
 
 RAISED = BaseException
 """The errors that an operator may raise: it has no right to end its process, whatever it derives its errors from."""
+RESTORE = "restore()"
+"""The call in which an operator fails that is given a state of another version of its class."""
 MOST_OF_A_TRACEBACK = 20_000
 """Characters of a traceback that are kept."""
 _ENGINE = Path(__file__).parent.parent

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
+from dataflow.execution.failure import RESTORE, OperatorFailure
 from dataflow.graph.model import Graph, Node
 from dataflow.operator import Operator
 from dataflow.recording import Recorded, Recording
@@ -51,22 +52,35 @@ def fresh_because(recording: Recording, graph: Graph, node: Node, stamp: int) ->
 def warm_start(path: Path, graph: Graph, node: Node, stamp: int) -> WarmStart | None:
     """The operator with the state it had before `stamp`: its last recorded snapshot, and the firings since repeated.
 
-    Without snapshots, or where its inputs were not recorded, everything before is repeated. None where it begins with
+    Without snapshots, where its inputs were not recorded, or where the snapshot does not fit the class as it is now,
+    everything before is repeated. None where it begins with
     fresh state. Raises `OperatorFailure`.
     """
     with Recording(path) as recording:
         if node.operator.stateless or fresh_because(recording, graph, node, stamp) is not None:
             return None
         feeding = plan_feeding(recording, graph, [node.name])
-        begin = stamp - 1 if feeding.operators == (node.name,) else None  # a state at `stamp` has seen its messages
         log = FiringLog.read(recording)
-        work = Recomputation(recording, graph, feeding, log, made=lambda stream, entry: None, begin=begin, end=stamp)
-        result = work.run(close=False)[node.name]
-        work.close(besides=node.name)
-        if result.unverifiable or result.lost_records or result.unknown:
-            work.runners[node.name].operator.close()
-            return None
-        return WarmStart(work.runners[node.name].operator, result.began)
+
+        def repeated(begin: int | None) -> WarmStart | None:
+            work = Recomputation(
+                recording, graph, feeding, log, made=lambda stream, entry: None, begin=begin, end=stamp
+            )
+            result = work.run(close=False)[node.name]
+            work.close(besides=node.name)
+            if result.unverifiable or result.lost_records or result.unknown:
+                work.runners[node.name].operator.close()
+                return None
+            return WarmStart(work.runners[node.name].operator, result.began)
+
+        if feeding.operators != (node.name,):
+            return repeated(None)
+        try:
+            return repeated(stamp - 1)  # a state at `stamp` has seen its messages
+        except OperatorFailure as failure:
+            if failure.when != RESTORE:
+                raise
+            return repeated(None)  # the class has other fields now
 
 
 def _is_unknown(records: Iterable[FiringRecord], stamp: int) -> bool:

@@ -21,7 +21,7 @@ from dataflow.blame.nudge import made_finite, nudged
 from dataflow.cli.commands.blame import _in_runs
 from dataflow.cli.main import app
 from dataflow.debugging.debugger import Debugger
-from dataflow.graph import load_text
+from dataflow.graph import load_graph, load_text
 from dataflow.messages import FeatureVector, RangeReading
 from dataflow.recording import Recording
 
@@ -100,7 +100,7 @@ def test_a_value_that_nothing_changes_is_not_said_to_be_decided_by_nothing(spiky
     assert told.exit_code == 1
     assert "decided by" not in words
     assert "not known what decided brake #30: nothing that was tried there changes the value" in words
-    assert "several inputs together, of which no one alone changes it" in words
+    assert "by inputs or earlier calls that only change it together, by the code, or by the call's time" in words
     assert "nudged" in words
     answer = json.loads(CliRunner().invoke(app, ["blame", str(spiky), "--field", asked, "--json"]).stdout)
     assert (answer["whole"], answer["sensed"], answer["no_change_shows_at"]) == (False, [], [["brake", 30]])
@@ -123,6 +123,45 @@ def test_changes_that_a_recorded_answer_does_not_fit_could_not_be_tried(spiky: P
     assert "decided by" not in words
     assert "could not be tried: range of describe #30: describe #30 raises EffectMiss" in words
     assert "changes made a call raise, which shows nothing" in words
+
+
+def test_outputs_of_nested_graphs_go_by_their_names_and_so_do_the_calls_behind_them(tmp_path: Path) -> None:
+    (tmp_path / "inner.yaml").write_text(
+        "graph: inner\ninputs: {r: RangeReading}\noutputs: {smooth: filter/out}\n"
+        'operators:\n  filter: {use: "rangers:Smooth", inputs: {range: r}}\n'
+    )
+    (tmp_path / "outer.yaml").write_text(
+        'graph: outer\noperators:\n  finder: {use: "rangers:Finder"}\n'
+        "  a: {use: inner.yaml, inputs: {r: finder/range}}\n"
+        '  guard: {use: "rangers:Guard", inputs: {value: a/smooth}}\n'
+    )
+    path = tmp_path / "run.mcap"
+    dataflow.run(load_graph(tmp_path / "outer.yaml"), record=path)
+
+    exported, inner = found(path, "a/smooth.value@2"), found(path, "a/filter/out.value@2")
+    assert exported.target == inner.target == ("a/filter", 20)
+    assert sensed(exported) == sensed(inner)
+    behind = found(path, "guard/stop.on@5")
+    assert {link.call.operator for link in behind.links} == {"guard", "a/filter"}
+
+
+def test_readings_behind_calls_that_decide_together_are_tried_as_others(tmp_path: Path) -> None:
+    graph = load_text(
+        "graph: hung\noperators:\n  source: {use: 'rangers:Beaten'}\n"
+        "  watch: {use: 'rangers:Watch', inputs: {reading: source/reading}}\n"
+        "  any: {use: 'rangers:AnyHigh', inputs: {fresh: watch/fresh, beat: source/beat}}\n"
+    )
+    path = tmp_path / "run.mcap"
+    dataflow.run(graph, record=path)
+
+    chain = found(path, "any/high.on@1")
+
+    (row,) = [link for link in chain.links if not link.input]
+    assert (row.maker, row.last) == (("any", 5), 6)
+    (read,) = chain.sensed  # the one before twice is known by the watch, as what a sensor that hangs gives
+    assert [number for _, _, number in read.messages] == [5, 6]
+    assert [(effect.way, effect.together) for effect in read.effects] == [("another", 2)]
+    assert chain.whole
 
 
 def test_a_time_behind_the_end_is_told(spiky: Path) -> None:

@@ -739,7 +739,9 @@ def edited(recorded: tuple[Recording, Path]) -> Iterator[Path]:
     exec(compile(SOURCE, str(recorded[1]), "exec"), vars(module))
 
 
-def test_a_call_that_raises_is_stopped_at_where_it_raises_once(recorded: tuple[Recording, Path], edited: Path) -> None:
+def test_a_call_that_raises_is_stopped_at_where_it_raises_once_on_each_way_there(
+    recorded: tuple[Recording, Path], edited: Path
+) -> None:
     with editing(recorded, 5) as client:
         assert client.ask("setExceptionBreakpoints", filters=["uncaught"]) == {}
         client.ask("configurationDone")

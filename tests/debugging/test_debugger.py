@@ -602,6 +602,23 @@ def test_an_expression_that_could_be_tried_in_no_call_is_an_error(
     )
 
 
+@pytest.mark.parametrize(
+    ("line", "text", "found"),
+    [
+        ("until inp.x.sta", "inp.x.sta", ["inp.x.stamp"]),
+        ('print before["to', "to", ['total"]']),
+        ("print after['to", "to", ["total']"]),
+        ('print before["la', "la", []),  # no name of the state, and no keyword of Python
+        ('until out.total == "whi', "whi", []),
+    ],
+)
+def test_names_are_completed_in_expressions(line: str, text: str, found: list[str], added: Recording) -> None:
+    shell = Shell(debugger := Debugger(added, "adder"), 0)
+    debugger.goto(2)
+
+    assert shell.complete_until(text, line, len(line) - len(text), len(line)) == found
+
+
 def test_an_operator_that_was_not_called_has_no_call(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     debugger = Debugger(added, "adder")
     monkeypatch.setattr(debugger, "calls", [])

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from dataflow.chaos.plan import plan_of
+from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.recorded import RecordedRunner
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
@@ -18,7 +19,8 @@ from dataflow.records.reading import FiringLog, recorded_firings
 from dataflow.reexecution import engine
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError
-from dataflow.reexecution.warm_start import _taken_from, held_before
+from dataflow.reexecution.warm_start import _taken_from, held_before, warm_start
+from dataflow.state import StateError
 from dataflow.supervision.run import replay, run
 from dataflow.sync import Entry, MessageRef
 from dataflow.verification.verify import verify
@@ -117,6 +119,28 @@ def test_a_tolerance_for_messages_is_none_for_the_states_between_them(recorded: 
     assert exact.culprits == ("tuned",)
     assert exact.operators[0].states > 0
     assert tolerant.within_tolerance, tolerant.as_json()
+
+
+def test_a_replay_passes_over_states_that_do_not_fit_the_class_as_it_is_now(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = load_graph(HERE / "chaos.yaml", settings=["count=120"])
+    stamp = [r.stamp for r in recorded_firings(Recording(recorded), "tuned") if r.kind == "fire"][80]
+    by_state = warm_start(recorded, graph, graph.nodes["tuned"], stamp)
+
+    def misfits(operator: Any, state: Any) -> None:
+        raise StateError("it has no total, which the class has now")
+
+    monkeypatch.setattr("runtime_operators.Tuned.restore", misfits)
+    repeated = warm_start(recorded, graph, graph.nodes["tuned"], stamp)
+
+    assert by_state is not None
+    assert repeated is not None
+    assert (by_state.began, repeated.began) == ("snapshot", "start")
+    assert by_state.operator.snapshot() == repeated.operator.snapshot()
+    monkeypatch.setattr("runtime_operators.Tuned.setup", misfits)
+    with pytest.raises(OperatorFailure, match=r"failed in setup\(\)"):
+        warm_start(recorded, graph, graph.nodes["tuned"], stamp)
 
 
 def test_a_start_beyond_the_end_is_refused(recorded: Path) -> None:

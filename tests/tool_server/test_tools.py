@@ -128,6 +128,38 @@ def test_the_changed_line_that_made_a_call_differ_is_named_first(
     assert told["alone"] == {str(file): [[wrong, wrong]]}
 
 
+@pytest.mark.long
+def test_a_changed_default_of_a_parameter_is_a_change_that_is_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, right = (
+        tmp_path / "gained_operators.py",
+        SCALED.replace("x.vectors * 2", "x.vectors * self.gain")
+        .replace("    x: In[", '    gain: float = Param(2.0, doc="gain")\n    x: In[')
+        .replace("Operator, Out", "Operator, Out, Param"),
+    )
+    file.write_text(right)
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=robot", "-c", "user.email=robot@localhost"]
+    for words in (["init", "-q"], ["add", file.name], ["commit", "-qm", "Right"]):
+        subprocess.run([*git, *words], check=True, timeout=60)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    graph = load_text(
+        "graph: gained\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 8}}\n"
+        "  scaled: {use: 'gained_operators:Scaled', inputs: {x: src/x}}\n"
+    )
+    recording = str(tmp_path / "right.mcap")
+    dataflow.run(graph, record=recording)
+    file.write_text(right.replace("2.0, doc", "3.0, doc").replace("vectors + 1", "1 + vectors"))
+    monkeypatch.delitem(sys.modules, "gained_operators")
+
+    told = ask("lines", recording, operator="scaled")
+
+    assert [("gain: float" in each["here"], each["mends"]) for each in told["changes"]] == [
+        (True, True),
+        (False, False),
+    ]
+
+
 def test_the_state_before_and_after_a_call(bugs: dict[str, str]) -> None:
     told = ask("state", bugs["wrong"], operator="sum", call="5")
 

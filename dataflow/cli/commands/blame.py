@@ -236,10 +236,8 @@ def _print_ends(chain: Chain) -> None:
     tried = ", ".join(f"{count(n)} {way}" for way, n in chain.tried.items())
     if chain.loose:
         names = ", ".join(map(_call, chain.loose[:5])) + (", …" if len(chain.loose) > 5 else "")
-        text = (
-            f"not known what decided {names}: nothing that was tried there changes the value, so it may be made by "
-            "several inputs together, of which no one alone changes it, by the code, or by the call's time"
-        )
+        text = f"not known what decided {names}: nothing that was tried there changes the value, so it may be made by"
+        text += " inputs or earlier calls that only change it together, by the code, or by the call's time"
         what = f"{plural(chain.tried.total(), 'change')} tried in all: {tried}"
         out.print(Text(f"{text} ({what})", style="yellow"), soft_wrap=True)
     for each in chain.untried:
