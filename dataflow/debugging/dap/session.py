@@ -84,7 +84,7 @@ class Session:
         self._going = Going(first, self._first_line)
         self._breakpoints: dict[str, dict[int, Breakpoint]] = {}
         self._passes: Counter[Breakpoint] = Counter()
-        """How often the call under way has come to breakpoints with `hits`."""
+        """Passes of the call under way at breakpoints with `hits`."""
         self._variables, self._frames = Variables(), list[FrameType]()
         self._homes = homes_of(debugger.node.operator.__module__)
         self._lines = Lines(self._at_line, self._homes)
