@@ -543,8 +543,8 @@ class Keyed:
 
 
 def test_a_mapping_of_a_state_goes_by_its_keys(added: Recording) -> None:
-    packed = tuple(pack_state(plain(Keyed({9: 0.5, 1: age}))) for age in (2.0, 3.0))
-    fired = replace(Debugger(added, "adder").goto(2), state=Keyed, packed=lambda: packed)
+    first, second = (pack_state(plain(Keyed({9: 0.5, 1: age}))) for age in (2.0, 3.0))
+    fired = replace(Debugger(added, "adder").goto(2), state=Keyed, packed=lambda: (first, second))
 
     before, after = fired.states()
     assert before is not None
