@@ -24,7 +24,7 @@ import types
 import typing
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import Any, ClassVar
 
@@ -45,8 +45,6 @@ _SCALARS: dict[Any, tuple[type, ...]] = {
 }
 _SEQUENCES: dict[Any, Callable[[Iterable[Any]], Any]] = {
     list: list,
-    set: set,
-    frozenset: frozenset,
     collections.abc.Sequence: list,
 }
 _MAPPINGS = (dict, collections.abc.Mapping, collections.OrderedDict, Counter, defaultdict)
@@ -203,6 +201,20 @@ def take_over(target: Any, hints: Mapping[str, Any], state: Any, new_part: NewPa
         setattr(target, attribute, typed(hint, state[attribute], f"{name}.{attribute}", current, new_part))
 
 
+def seen(kind: type | None, state: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a state that `plain` made, for those who look at it: dicts, sets, tuples and queues as the fields of the
+    dataclass `kind` declare them; dataclasses and messages stay mappings, enums names.
+
+    What is declared nowhere, or does not fit, is as `plain` made it.
+    """
+    hints, seeing = {} if kind is None else state_hints(kind), _Seeing(lambda part: part())
+    found = dict(state)
+    for name in hints.keys() & found.keys():
+        with suppress(StateError):
+            found[name] = seeing.typed(hints[name], found[name], name, None)
+    return found
+
+
 _HINTS: dict[type, dict[str, Any]] = {}
 
 
@@ -226,6 +238,12 @@ def _with_arguments(hint: Any, bound: Mapping[Any, Any]) -> Any:
         return bound.get(hint, hint)
     open_ = () if isinstance(hint, type) else getattr(hint, "__parameters__", ())
     return hint[tuple(bound.get(each, each) for each in open_)] if open_ else hint
+
+
+def _bound_hints(kind: Any, arguments: Sequence[Any]) -> dict[str, Any]:
+    """Returns the fields of a class, generic or not, and their types."""
+    bound = dict(zip(getattr(kind, "__parameters__", ()), arguments, strict=False))
+    return {name: _with_arguments(hint, bound) for name, hint in _hints(kind).items()}
 
 
 _OF_ANOTHER_VERSION: ContextVar[bool] = ContextVar("_OF_ANOTHER_VERSION", default=False)
@@ -299,6 +317,9 @@ class _Typing:
             return self.typed(origin.__bound__ or Any, value, place, current)
         if origin in (Any, object, typing.Literal):
             return value
+        if origin in (set, frozenset):
+            kind = arguments[0] if arguments else Any
+            return origin(self._hashed(kind, item, place) for item in _listed(value, place))
         if origin in _SEQUENCES:
             return _SEQUENCES[origin](self._items(arguments[:1], value, place, current))
         if origin is tuple:
@@ -337,6 +358,10 @@ class _Typing:
         each = zip(arguments, items, there, strict=True)
         return tuple(self.typed(kind, item, place, old) for kind, item, old in each)
 
+    def _hashed(self, hint: Any, value: Any, place: str) -> Any:
+        """A key of a dict, or a member of a set."""
+        return self.typed(hint, value, place, None)
+
     def _mapping(self, origin: Any, arguments: Sequence[Any], value: Any, place: str, current: Any) -> Any:
         of_key, of_item = (arguments[0] if arguments else Any), (arguments[1] if len(arguments) > 1 else int)
         pairs = [_listed(pair, place, 2) for pair in _listed(value, place)]
@@ -345,7 +370,7 @@ class _Typing:
             made = defaultdict(typing.get_origin(of_item) or of_item)
         there = current if isinstance(current, Mapping) else {}
         for plain_key, item in pairs:
-            key = self.typed(of_key, plain_key, place, None)
+            key = self._hashed(of_key, plain_key, place)
             made[key] = self.typed(of_item, item, f"{place}[{plain_key!r}]", there.get(key))
         return made
 
@@ -375,8 +400,7 @@ class _Typing:
         raise StateError(f"{place}: a {kind.__name__} cannot be restored")
 
     def _dataclass(self, kind: Any, arguments: Sequence[Any], value: Any, place: str, current: Any) -> Any:
-        bound = dict(zip(getattr(kind, "__parameters__", ()), arguments, strict=False))
-        hints = {name: _with_arguments(hint, bound) for name, hint in _hints(kind).items()}
+        hints = _bound_hints(kind, arguments)
         fields = dataclasses.fields(kind)
         missing = dataclasses.MISSING
         able = [f.name for f in fields if not f.init or (f.default, f.default_factory) != (missing, missing)]
@@ -390,3 +414,24 @@ class _Typing:
             if not each.init and each.name in restored:
                 object.__setattr__(made, each.name, restored[each.name])
         return made
+
+
+class _Seeing(_Typing):
+    """Values as `seen` gives them."""
+
+    def _hashed(self, hint: Any, value: Any, place: str) -> Any:
+        made = typed(hint, value, place)
+        return made.name if isinstance(made, enum.Enum) else made
+
+    def _object(self, kind: type, arguments: Sequence[Any], value: Any, place: str, current: Any) -> Any:
+        if issubclass(kind, np.ndarray | np.generic | tuple):
+            return super()._object(kind, arguments, value, place, current)
+        fields = dataclasses.is_dataclass(kind) and not issubclass(kind, Message) and not hasattr(kind, "restore")
+        if not fields and not issubclass(kind, Remembered):
+            if value is None:
+                raise StateError(f"{place}: expected a {kind.__name__}, got none")
+            return value
+        hints = _bound_hints(kind, arguments)
+        if not isinstance(value, Mapping) or value.keys() != hints.keys():
+            raise StateError(f"{place}: expected the fields of a {kind.__name__}, got {value!r:.60}")
+        return {name: self.typed(hints[name], value[name], f"{place}.{name}", None) for name in value}

@@ -512,6 +512,7 @@ class Blame:
                     effects = fewer
                     del left[stream]
             runs = [(taken, effects) for taken in left.values()]
+        runs = runs or [run for taken in by_stream.values() for run in self._elsewhere(taken)]
         for taken, effects in runs:
             call, name, entry = taken[0]
             place, last = place_of(entry), taken[-1].entry.seq if len(taken) > 1 else None
@@ -568,6 +569,23 @@ class Blame:
                 if len(taken) > 1:
                     break
         return tuple(effects.values())
+
+    def _elsewhere(self, taken: Sequence[Taken]) -> Iterator[tuple[Sequence[Taken], tuple[Effect, ...]]]:
+        """Yields those of some sensors' messages that decide when they are others of their stream for all calls that
+        take them, each another one: an operator may know one that comes twice, such as a picture of a hanging camera.
+        """
+        there = {place_of(each.entry): list(self._messages.elsewhere(*each)) for each in taken}
+        for k in range(ANOTHER if all(there.values()) else 0):
+            chosen = {place: others[(k + n) % len(others)] for n, (place, others) in enumerate(there.items())}
+
+            def shows(part: Sequence[Taken], chosen: Mapping[Place, Message] = chosen) -> tuple[Effect, ...]:
+                messages = {place: chosen[place] for place in (place_of(each.entry) for each in part)}
+                found = self._changed("another", {}, messages=messages)
+                return () if found is None else (Effect("another", (), found[0], len(part)),)
+
+            if shows(taken):
+                yield from split(taken, shows)
+                return
 
     # ------------------------------------------------------------------------------------------------- the effect
 

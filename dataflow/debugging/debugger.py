@@ -516,6 +516,7 @@ class Debugger:
             ports=tuple(self.node.outputs),
             same=held.same,
             takes=tuple(self.node.inputs),
+            kept=self.node.operator.spec.state,
         )
 
     def _states(self, held: Held) -> States:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from dataflow.execution.calls import Calls
 from dataflow.execution.failure import RAISED
 from dataflow.execution.recorded import RecordedRunner
-from dataflow.execution.snapshots import changes, unpack_state
+from dataflow.execution.snapshots import changed_places, unpack_state
 from dataflow.messages.base import Message
 from dataflow.recording.streams.diff import FieldDifference
 from dataflow.records.firing import FiringRecord
+from dataflow.state import seen
 from dataflow.sync import Firing
 
 States = tuple[bytes | None, bytes | None]
@@ -72,6 +74,8 @@ class Fired:
     """Outputs and the error are the recorded ones, as verification compares them."""
     takes: Sequence[str] = ()
     """All that the operator declares for its inputs."""
+    kept: type | None = None
+    """The dataclass that it declares for its state."""
 
     @property
     def outputs(self) -> Mapping[str, Message | None]:
@@ -89,14 +93,29 @@ class Fired:
         return self.packed()[1]
 
     def states(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
-        """The state before and after, as `snapshot()` gives it."""
-        before, after = (None if state is None else unpack_state(state) for state in self.packed())
+        """Returns the state before and after, by field: its collections are those that the operator declares; None
+        where it gives none."""
+        before, after = (None if state is None else seen(self.kept, state) for state in self._unpacked())
         return before, after
+
+    def changes(self) -> Iterator[tuple[str, Any, Any]]:
+        """Yields what the call changed in the state: the place ("motion.speed"), the value before, and after."""
+        states = self.states()
+        for place in self._changed_places():
+            before, after = (reduce(_part, place, state) for state in states)
+            yield ".".join(place), before, after
 
     def changed(self) -> tuple[str, ...]:
         """Names of the parts of the state that the call changed."""
-        before, after = (state or {} for state in self.states())
-        return tuple(dict.fromkeys(place.partition(".")[0] for place, _, _ in changes(before, after)))
+        return tuple(dict.fromkeys(place[0] for place in self._changed_places()))
+
+    def _changed_places(self) -> Iterator[tuple[str, ...]]:
+        before, after = self._unpacked()
+        return changed_places(before or {}, after or {})
+
+    def _unpacked(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
+        before, after = (None if state is None else unpack_state(state) for state in self.packed())
+        return before, after
 
     def names(self) -> dict[str, Any]:
         """Names for an expression about the call: `inp` and `out` by input and port (None where it is silent, as inputs
@@ -157,6 +176,10 @@ def described(value: Any, origin: int) -> str:
         case _:
             last = f", the last {described(value[-1], origin)}" if value else ""
             return f"{len(value):,} message{'' if len(value) == 1 else 's'}{last}"
+
+
+def _part(value: Any, name: str) -> Any:
+    return value.get(name) if isinstance(value, Mapping) else None
 
 
 SPACING = 250_000_000

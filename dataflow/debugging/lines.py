@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 import sysconfig
 from collections import Counter
@@ -99,13 +100,42 @@ def own_frames(frame: FrameType | None, homes: Homes) -> Iterator[FrameType]:
         frame = frame.f_back
 
 
-def lines_of(file: str) -> set[int]:
-    """The lines of a source file that hold code. Raises OSError, SyntaxError."""
-    return set(_lines(compile(Path(file).read_bytes(), file, "exec")))
+class Part(NamedTuple):
+    """A function of a source file, or what runs when it is imported (`function` is False): `name` as `__qualname__`,
+    the line where it begins, and the lines of its body that hold code."""
+
+    name: str
+    function: bool
+    begins: int
+    lines: frozenset[int]
 
 
-def _lines(code: CodeType) -> Iterator[int]:
-    yield from (line for _, _, line in code.co_lines() if line)
+def source_parts(file: str) -> list[Part]:
+    """Returns the parts of a source file. Raises OSError, SyntaxError."""
+    return list(_parts(compile(Path(file).read_bytes(), file, "exec")))
+
+
+def _parts(code: CodeType) -> Iterator[Part]:
+    lines = {line for _, _, line in code.co_lines() if line}
+    function = bool(code.co_flags & inspect.CO_OPTIMIZED) or "<locals>" in code.co_qualname
+    body = lines - {code.co_firstlineno} if function else lines
+    yield Part(code.co_qualname, function, code.co_firstlineno, frozenset(body or lines))
     for inner in code.co_consts:
         if isinstance(inner, CodeType):
-            yield from _lines(inner)
+            yield from _parts(inner)
+
+
+def stoppable_line(file: str, wanted: int, setup: str) -> int:
+    """Returns the first line with code from `wanted` on, or that of the function whose head is there. Raises
+    LookupError where there is none, or it runs before the first call: in the function `setup`, a class, the module;
+    OSError, SyntaxError, ValueError."""
+    parts = source_parts(file)
+    lines = {n for part in parts for n in (*part.lines, part.begins)}
+    if (found := min((n for n in lines if n >= wanted), default=None)) is None:
+        raise LookupError(f"no code from line {wanted} on: the last line with code is {max(lines, default=0)}")
+    made = [part for part in parts if part.function and part.name != setup]
+    there = [found for part in made if found in part.lines]
+    there += [min(part.lines) for part in made if part.begins <= found < min(part.lines)]
+    if not there:
+        raise LookupError(f"line {found} runs before the first recorded call: breakpoints are for what the calls run")
+    return min(there)

@@ -35,7 +35,7 @@ LEAVE_WITHIN = 5.0
 
 
 class Raised(RuntimeError):
-    """What an operator raised in its process, in words."""
+    """Raised for what an operator raised in its own process, in words."""
 
 
 class Here:

@@ -176,8 +176,10 @@ class Drops:
         self._log = FiringLog.read(recording)
         names = [name for name in self.graph.nodes if name in self._log.operators]
         self._recorded = recorded_summaries(recording, names)
-        self.worse = Worse(worse, self._recorded)
         self._records = {name: list(self._log.ordered(self.graph.nodes[name])) for name in names}
+        if not any(record.kind == "finish" for records in self._records.values() for record in records):
+            raise DropsError("no figures are recorded: the run was ended before its operators' finish(), which sums up")
+        self.worse = Worse(worse, self._recorded)
         self.replays = 0
         self._known: dict[frozenset[Loss], Figures | OperatorFailure | ReplayError] = {}
         """By what was undone, what a replay gave."""
@@ -278,7 +280,7 @@ class Drops:
 
         # The longest at first; of those that suffice the last: a replay makes the calls behind its first difference.
         suffice = shortest_end(sorted(bursts, key=len), heal, GROWS)
-        named = _flat(needed(sorted(suffice), heal))
+        named = _flat(needed(sorted(suffice, key=lambda burst: burst[0]), heal))
         if in_time and len(named) > 1:
             named = _reduced(named, heals)
         undone = self._replay(branch, named)

@@ -77,13 +77,13 @@ def _other_version(before: Any, now: Any, place: str = "") -> str | None:
     return next((each for each in found if each), None)
 
 
-def changes(before: Any, after: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Place, value before and after of what differs in two unpacked states, as deep as mappings go."""
+def changed_places(before: Any, after: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Yields the places at which two unpacked states differ, as deep as mappings go: the names that lead there."""
     if isinstance(before, Mapping) and isinstance(after, Mapping):
         for name in sorted({*before, *after}):
-            yield from changes(before.get(name), after.get(name), f"{place}.{name}" if place else name)
+            yield from changed_places(before.get(name), after.get(name), (*place, name))
     elif pack_state({"": before}) != pack_state({"": after}):
-        yield place, before, after
+        yield place
 
 
 def _plain(value: Any, place: str) -> Any:

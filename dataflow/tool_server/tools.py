@@ -97,8 +97,6 @@ def state(
     path: list[str] | None = None,
 ) -> Any:
     """Show the state of an operator before and after a call (as in `goto`): the parts it changed, or the one named."""
-    from dataflow.execution.snapshots import changes
-
     with _debugger(recording, operator, graph) as (debugger, origin, _):
         fired = _at(debugger, origin, call)
         before, after = fired.states()
@@ -106,7 +104,7 @@ def state(
             raise ToolError(debugger.no_state())
         if part and part not in {*before, *after}:
             raise ToolError(f"no part {part!r} in the state; there are: {', '.join(sorted({*before, *after}))}")
-        pairs = [(part, before.get(part), after.get(part))] if part else list(changes(before, after))
+        pairs = [(part, before.get(part), after.get(part))] if part else list(fired.changes())
         shown = {name: {"before": _text(was), "after": _text(now)} for name, was, now in pairs}
         return {"call": fired.number, "parts": sorted({*before, *after}), "part" if part else "changed": shown}
 
@@ -545,7 +543,8 @@ def _names(fired: Fired) -> dict[str, Any]:
 
 
 def _text(value: Any) -> Any:
-    """A value as JSON has it: numbers as they are, those of numpy by their own digits, anything else in words."""
+    """A value as JSON has it: numbers as they are, those of numpy by their own digits, mappings of strings, anything
+    else in words."""
     import numpy as np
 
     from dataflow.messages.display.text import field_text
@@ -554,6 +553,8 @@ def _text(value: Any) -> Any:
         return float(str(value))
     if isinstance(value, np.bool_ | np.integer):
         return value.item()
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {key: _text(each) for key, each in value.items()}
     return value if value is None or isinstance(value, bool | int | float) else field_text(value)
 
 

@@ -145,6 +145,25 @@ def test_outputs_of_nested_graphs_go_by_their_names_and_so_do_the_calls_behind_t
     assert {link.call.operator for link in behind.links} == {"guard", "a/filter"}
 
 
+def test_readings_behind_calls_that_decide_together_are_tried_as_others(tmp_path: Path) -> None:
+    graph = load_text(
+        "graph: hung\noperators:\n  source: {use: 'rangers:Beaten'}\n"
+        "  watch: {use: 'rangers:Watch', inputs: {reading: source/reading}}\n"
+        "  any: {use: 'rangers:AnyHigh', inputs: {fresh: watch/fresh, beat: source/beat}}\n"
+    )
+    path = tmp_path / "run.mcap"
+    dataflow.run(graph, record=path)
+
+    chain = found(path, "any/high.on@1")
+
+    (row,) = [link for link in chain.links if not link.input]
+    assert (row.maker, row.last) == (("any", 5), 6)
+    (read,) = chain.sensed  # the one before twice is known by the watch, as what a sensor that hangs gives
+    assert [number for _, _, number in read.messages] == [5, 6]
+    assert [(effect.way, effect.together) for effect in read.effects] == [("another", 2)]
+    assert chain.whole
+
+
 def test_a_time_behind_the_end_is_told(spiky: Path) -> None:
     told = CliRunner().invoke(app, ["blame", str(spiky), "--field", "smooth/out.value@1000"])
 

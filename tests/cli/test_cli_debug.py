@@ -161,6 +161,42 @@ def test_expressions_and_parts_of_the_state_are_completed(prompt: tuple[Shell, D
     assert shell.complete_state("", "", 0, 0) == sorted(before or ())
 
 
+def test_keys_of_the_state_are_completed(prompt: tuple[Shell, Drawing]) -> None:
+    shell, _ = prompt
+    shell.onecmd("goto 4")
+    assert shell._debugger.at is not None
+    state = shell._debugger.at.states()[0] or {}
+    name = next(iter(state))
+
+    def completed(line: str, text: str) -> list[str]:
+        return shell.complete_print(text, line + text, len(line), len(line + text))
+
+    assert f'{name}"]' in completed('print before["', name[:1])
+    assert f"{name}']" in completed("print 1 + after['", "")
+    assert completed('print before["none"]["', "") == []
+    assert "lambda" in [word.strip() for word in completed("print ", "la")]
+
+
+def test_an_interrupt_clears_the_line_and_stays(
+    prompt: tuple[Shell, Drawing], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shell, _ = prompt
+    lines = iter([KeyboardInterrupt(), "print 6 * 7", KeyboardInterrupt(), "quit"])
+
+    def typed(prompt: str) -> str:
+        line = next(lines)
+        if isinstance(line, KeyboardInterrupt):
+            raise line
+        return line
+
+    monkeypatch.setattr("builtins.input", typed)
+    shell.onecmd("goto 0")
+    shell.converse("begins")
+
+    assert capsys.readouterr().out.endswith("42\n\n")
+    assert next(lines, None) is None
+
+
 @pytest.mark.long
 def test_what_cannot_begin_is_named() -> None:
     assert "there are: busy, look, smooth, tally" in debug("none", code=2)

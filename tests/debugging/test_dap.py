@@ -20,7 +20,7 @@ import dataflow
 from dataflow.debugging.dap.session import Session, listen
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Abandoned, Probe
-from dataflow.debugging.lines import homes_of, is_own, lines_of
+from dataflow.debugging.lines import homes_of, is_own, source_parts, stoppable_line
 from dataflow.messages.base import Message
 from dataflow.recording import Recorded, Recording
 from dataflow.sync import Firing
@@ -71,6 +71,7 @@ class Adder(Operator):
 LINES = {text.strip(): number for number, text in enumerate(SOURCE.splitlines(), 1)}
 ADDED = LINES["added += clipped(value, 50.0)"]
 CLIPS = LINES["value = most"]
+FIRST = LINES["added = 0.0"]
 TOTAL = LINES["self.state.total += added"]
 
 WATCHED = {"added", "value", "most"}
@@ -154,8 +155,8 @@ class Client:
         """The call, the line and the watched variables, as `printed` has them."""
         return self.call(), self.line(), {n: v for n, v in self.variables().items() if n in WATCHED}
 
-    def breakpoints(self, *lines: int, condition: str = "") -> list[dict[str, Any]]:
-        wanted = [{"line": line, "condition": condition} for line in lines]
+    def breakpoints(self, *lines: int, **more: str) -> list[dict[str, Any]]:
+        wanted = [{"line": line, **more} for line in lines]
         set_now: list[dict[str, Any]] = self.ask(
             "setBreakpoints", source={"path": str(self._file)}, breakpoints=wanted
         )["breakpoints"]
@@ -331,6 +332,34 @@ def test_a_condition_stops_where_it_is_true_forwards_and_back(recorded: tuple[Re
         assert client.seen() == expected[1]
 
 
+@pytest.mark.parametrize(("hits", "values"), [("2", [1.0, 4.0]), (">= 1", [0.0, 0.0, 1.0]), ("%2", [1.0, 4.0])])
+def test_a_hit_count_counts_the_passes_of_a_call_forwards_and_back(
+    recorded: tuple[Recording, Path], hits: str, values: list[float]
+) -> None:
+    with editing(recorded, 0 if hits == ">= 1" else 1) as client:
+        client.breakpoints(ADDED, condition="value >= 0", hitCondition=hits)
+        client.ask("configurationDone")
+        client.stopped()
+
+        stops = [client.go("continue") and float(client.value("value")) for _ in values]
+
+        assert stops == values
+        assert client.go("reverseContinue") == ("breakpoint", ADDED)
+        assert float(client.value("value")) == values[-2]
+
+
+def test_a_log_point_prints_once_and_does_not_stop(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, 2) as client:
+        client.breakpoints(ADDED, condition="value > 2", logMessage='adds {value:.2f} to "{added}"')
+        client.ask("configurationDone")
+        client.stopped()
+        assert client.go("stepOut") == ("entry", FIRST)  # of the next call
+        assert client.go("stepBack")[0] == "step"
+        assert [text for text in client.told if text.startswith("adds")] == ['adds 4.00 to "2.0"']
+        client.go("reverseContinue")
+        assert client.call() == 0
+
+
 def test_steps_over_and_out_stay_in_the_frame_and_leave_it(recorded: tuple[Recording, Path]) -> None:
     with editing(recorded, first=3) as client:
         client.ask("configurationDone")
@@ -394,15 +423,56 @@ def test_variables_that_are_assigned_by_hand_are_those_of_the_frame(recorded: tu
 def test_a_breakpoint_that_cannot_be_says_why(recorded: tuple[Recording, Path]) -> None:
     with editing(recorded) as client:
         doc = LINES['"""Adds up."""']
-        assert client.breakpoints(doc + 1)[0]["verified"]
+        for before in (doc + 1, LINES["class Adder(Operator):"]):
+            (told,) = client.breakpoints(before)
+            assert (told["verified"], "runs before the first recorded call" in told["message"]) == (False, True)
+        assert client.breakpoints(LINES["def clipped(value, most):"]) == [{"verified": True, "line": CLIPS - 1}]
         (beyond,) = client.breakpoints(4000)
         assert not beyond["verified"]
         told = client.ask("setBreakpoints", source={"path": np_file()}, breakpoints=[{"line": 1}])
         assert "not for libraries" in told["breakpoints"][0]["message"]
-        (wrong,) = client.breakpoints(ADDED, condition="value >")
-        assert not wrong["verified"]
+        for more in ({"condition": "value >"}, {"hitCondition": "often"}, {"hitCondition": "% 0"}, {"logMessage": "{"}):
+            (wrong,) = client.breakpoints(ADDED, **more)
+            assert not wrong["verified"]
+            assert next(iter(more.values())) in wrong["message"]
         client.ask("configurationDone")
         client.stopped()
+
+
+BEGUN = """LIMIT = 3
+
+
+class Robot:
+    size: int = 4
+
+    def setup(self):
+        self.limit = LIMIT
+        self.bound = lambda x: min(x, self.limit)
+
+    @property
+    def wide(
+        self,
+    ):
+        class Inner:
+            width = 3
+
+        return [
+            Inner.width,
+        ]
+"""
+
+
+@pytest.mark.parametrize(
+    ("wanted", "line"), [(1, 0), (4, 0), (5, 0), (7, 0), (8, 0), (9, 9), (11, 15), (12, 15), (16, 16), (19, 19)]
+)
+def test_breakpoints_are_for_lines_that_calls_run(tmp_path: Path, wanted: int, line: int) -> None:
+    file = tmp_path / "begun.py"
+    file.write_text(BEGUN)
+    if line:
+        assert stoppable_line(str(file), wanted, "Robot.setup") == line
+        return
+    with pytest.raises(LookupError, match=f"line {wanted} runs before the first recorded call"):
+        stoppable_line(str(file), wanted, "Robot.setup")
 
 
 def np_file() -> str:
@@ -586,7 +656,7 @@ def test_a_line_behind_the_end_of_the_file_names_the_last_one(recorded: tuple[Re
         client.ask("configurationDone")
         client.stopped()
     assert not told["verified"]
-    last = max(lines_of(str(recorded[1])))
+    last = max(line for part in source_parts(str(recorded[1])) for line in part.lines)
     assert told["message"] == f"no code from line 100000 on: the last line with code is {last}"
 
 
@@ -669,7 +739,9 @@ def edited(recorded: tuple[Recording, Path]) -> Iterator[Path]:
     exec(compile(SOURCE, str(recorded[1]), "exec"), vars(module))
 
 
-def test_a_call_that_raises_is_stopped_at_where_it_raises_once(recorded: tuple[Recording, Path], edited: Path) -> None:
+def test_a_call_that_raises_is_stopped_at_where_it_raises_once_on_each_way_there(
+    recorded: tuple[Recording, Path], edited: Path
+) -> None:
     with editing(recorded, 5) as client:
         assert client.ask("setExceptionBreakpoints", filters=["uncaught"]) == {}
         client.ask("configurationDone")
@@ -682,6 +754,7 @@ def test_a_call_that_raises_is_stopped_at_where_it_raises_once(recorded: tuple[R
         assert (reason, line, client.call()) == ("exception", CLIPS, 8)
         assert client.variables() == {"value": "64.0", "most": "50.0"}
         assert client.go("stepBack") == ("step", CLIPS - 1)
+        assert client.go("continue") == ("exception", CLIPS)  # it has come to the line anew
         client.ask("continue")
         assert client.stopped()[0] == "end of the recording"
         assert any("IndexError: list index out of range" in text for text in client.told)

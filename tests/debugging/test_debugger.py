@@ -361,6 +361,29 @@ def test_states_without_a_field_that_the_class_has_now_are_passed_by(with_states
     assert fresh.goto(25).states()[0] == {"total": sum(range(25)) + 5, "calls": 25}
 
 
+TRACKED = "k = int(x.vectors[0, 0]) % 4; self.state.tracks[k] = self.state.total = float(k * 10)"
+
+
+def test_expressions_see_the_dicts_of_a_state(
+    added: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    debugger = Debugger(added, "adder")
+    file = written(tmp_path, TRACKED)
+    text = file.read_text().replace("import dataclass\n", "import dataclass, field\n")
+    kept = "    total: float = 0.0\n    tracks: dict[int, float] = field(default_factory=dict)\n"
+    file.write_text(text.replace("    total: float = 0.0\n", kept))
+    debugger.reload()
+    shell = Shell(debugger, 0)
+    debugger.goto(7)
+
+    shell.onecmd('print after["tracks"][3]')
+    assert capsys.readouterr().out == "30\n"
+    at = debugger.goto(2)
+    shell.onecmd("state tracks")
+    assert "after   {0: 0.0, 1: 10.0, 2: 20.0}" in capsys.readouterr().out
+    assert ("tracks", {0: 0.0, 1: 10.0}, {0: 0.0, 1: 10.0, 2: 20.0}) in [*at.changes()]
+
+
 def test_source_that_does_not_run_leaves_the_old_one(added: Recording, tmp_path: Path) -> None:
     debugger = Debugger(added, "adder")
     debugger.goto(4)
@@ -577,6 +600,23 @@ def test_an_expression_that_could_be_tried_in_no_call_is_an_error(
         "not so where there is nothing, in 26 calls: number > 3 and inp.x.stamp < 0 at call 4"
         in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "found"),
+    [
+        ("until inp.x.sta", "inp.x.sta", ["inp.x.stamp"]),
+        ('print before["to', "to", ['total"]']),
+        ("print after['to", "to", ["total']"]),
+        ('print before["la', "la", []),  # no name of the state, and no keyword of Python
+        ('until out.total == "whi', "whi", []),
+    ],
+)
+def test_names_are_completed_in_expressions(line: str, text: str, found: list[str], added: Recording) -> None:
+    shell = Shell(debugger := Debugger(added, "adder"), 0)
+    debugger.goto(2)
+
+    assert shell.complete_until(text, line, len(line) - len(text), len(line)) == found
 
 
 def test_an_operator_that_was_not_called_has_no_call(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from dataflow.graph import Graph, load_text
 from dataflow.messages import FeatureVector, Message
 from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord
+from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.sync import FOREVER, TICK, Entry, Firing
 
@@ -199,6 +200,15 @@ def test_a_figure_that_is_missing_or_nan_heals_nothing(run: Path, score: str) ->
         found = Drops(recording, "end_error_m > 5", held_runs.graph(STEPS, score)).find()
 
     assert [loss.stamp for loss in found.named] == [STAMP + 1000 * MS, STAMP + 3000 * MS]
+
+
+def test_a_run_that_was_killed_has_no_figures(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ordered = FiringLog.ordered
+    unfinished = "dataflow.records.reading.FiringLog.ordered"
+    monkeypatch.setattr(unfinished, lambda log, node: (r for r in ordered(log, node) if r.kind != "finish"))
+
+    with pytest.raises(DropsError, match=r"no figures are recorded: the run was ended before"):
+        cost(run, "end_error_m > 5")
 
 
 def _firing(stamp: int, value: float, port: str) -> Firing:

@@ -259,7 +259,7 @@ def test_another_operator_is_judged_although_its_recorded_code_cannot_be_tried_h
 ) -> None:
     first = Difference(4, "fire", 0, "y", "aa", "bb")
     second = Verification("second", 20, 20, first=first, own_fault=True, code_changed=["env_operators"])
-    report = VerifyReport([second], (), (), 0, 0, 0.0, 0.0, repeated={"second": True})
+    report = VerifyReport((second,), (), (), 0, 0, 0.0, 0.0, repeated={"second": True})
     monkeypatch.setattr(proof, "recorded_code", lambda *given: {"env_operators": "abc"})
     monkeypatch.setattr(proof, "recorded_text", lambda code, file: (file.read_bytes(), "a commit"))
     with Recording(recorded) as recording:

@@ -13,6 +13,7 @@ from contextlib import nullcontext
 from email.message import Message as Headers
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -237,6 +238,46 @@ def test_what_a_call_changes_in_its_object_and_credentials_are_no_miss() -> None
         return asking
 
     assert again(recorded(body("of the robot")), body("of the desk")).result.first is None
+
+
+class Conversation:
+    """A client that keeps what was said, and since when it has been silent."""
+
+    def __init__(self, prompt: str) -> None:
+        self.messages, self.since = [{"role": "system", "content": prompt}], random.random()
+
+    def ask(self) -> Any:
+        self.messages.append({"role": "user", "content": "and now?"})
+        self.since = random.random()
+        return next(WORLD)
+
+
+def test_a_conversation_that_begins_with_another_prompt_is_a_miss() -> None:
+    def body(prompt: str) -> Body:
+        clients: list[Conversation] = []
+
+        def asking(operator: Asking, x: FeatureVector) -> float:
+            clients[:] = clients or [Conversation(prompt)]
+            return float(operator.effect(clients[0].ask))
+
+        return asking
+
+    ran = recorded(body("a?"))
+
+    assert again(ran, body("a?")).result.first is None
+    found = again(ran, body("b?")).result
+    assert found.first is not None
+    assert found.first.index == 1
+    assert "self.messages differs from the recorded call" in found.first.got
+
+
+def test_a_plain_namespace_is_looked_into() -> None:
+    def key(prompt: str) -> Key:
+        operator = Asking()
+        vars(operator).update(config=SimpleNamespace(prompt=prompt))
+        return Key.of(operator.setup, (), {})
+
+    assert key("b?").missing(key("a?")) == ["self.config.prompt"]
 
 
 def test_clocks_and_counts_of_an_operator_are_no_part_of_the_key_of_its_methods() -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Number, Odometry
 from dataflow.operator import KEPT, In, Operator, Out, Param, Remembered
-from dataflow.state import Counts, StateError, of_another_version, plain, state_hints, take_over, typed
+from dataflow.state import Counts, StateError, of_another_version, plain, seen, state_hints, take_over, typed
 
 V = TypeVar("V")
 
@@ -369,3 +369,52 @@ def test_a_state_of_another_version_is_taken_over_as_far_as_there_are_defaults()
         operator.restore({**snapshot, "tracks": [[1, {"id": 1}]]})
     with pytest.raises(StateError, match="has no kind, spare, which the class has now; it has older, which"):
         operator.restore(former)
+
+
+def test_a_state_is_seen_in_the_collections_that_it_declares() -> None:
+    state = State(
+        window=Window(2),
+        tracks={7: Track(7, np.zeros(2), None, Mode.FOLLOW)},
+        places=deque([Place(1, np.ones(3))], maxlen=2),
+        seen={"b", "a"},
+        pairs={(1, "x"): 0.5},
+        by_id=defaultdict(list, {3: [1.0]}),
+        last=Odometry(
+            stamp=5, frame="odom", child_frame="base", position=np.zeros(3), orientation=np.array([0.0, 0, 0, 1])
+        ),
+        phase=2j,
+    )
+    packed = unpack_state(pack_state(plain(state)))
+
+    found = seen(State, packed)
+
+    assert found["tracks"][7]["mode"] == "FOLLOW"
+    assert list(found["tracks"][7]) == sorted(["id", "mean", "label", "mode"])
+    assert found["places"][-1].stamp == 1
+    assert (found["seen"], found["pairs"], found["by_id"], found["phase"]) == (
+        {"a", "b"},
+        {(1, "x"): 0.5},
+        {3: [1.0]},
+        2j,
+    )
+    assert found["window"] == {"values": []}
+    assert found["last"]["stamp"] == 5
+    assert found["spare"] == ()
+
+
+def test_what_a_class_does_not_declare_is_seen_as_it_is() -> None:
+    packed = {"tracks": [[1, 2]], "other": [[1, 2]], "seen": ["a"]}
+
+    assert seen(State, packed) == {"tracks": [[1, 2]], "other": [[1, 2]], "seen": {"a"}}
+    assert seen(None, packed) == packed
+
+
+def test_keys_and_members_that_are_enums_are_seen_by_name() -> None:
+    @dataclass
+    class Modes:
+        since: dict[Mode, int] = field(default_factory=dict)
+        tried: set[Place] | None = None
+
+    kept = {"since": [["SEARCH", 4]], "tried": None}
+    Modes.__annotations__.update(since=dict[Mode, int], tried=set[str] | None)
+    assert seen(Modes, kept) == {"since": {"SEARCH": 4}, "tried": None}

@@ -93,3 +93,54 @@ class Describe(Operator):
 
     def process(self, range: RangeReading) -> Text:
         return Text(text=self.effect(told, range.range))
+
+
+READINGS = (2.0, 3.0, 4.0, 150.0, 1.0, 150.5, 160.0)
+
+
+class Beaten(Source):
+    """Readings, and a beat behind them."""
+
+    reading: Out[Number]
+    beat: Out[Number]
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        for k, value in enumerate(READINGS):
+            yield {"reading": Number(stamp=k * STEP, value=value)}
+        yield {"beat": Number(stamp=len(READINGS) * STEP, value=0.0)}
+
+
+@dataclass
+class Seen:
+    value: float | None = None
+
+
+class Watch(Operator):
+    """Passes on what is not the reading before: a sensor that hangs gives it again."""
+
+    reading: In[Number]
+    fresh: Out[Number]
+    state: Seen
+
+    def process(self, reading: Number) -> Number | None:
+        hangs, self.state.value = reading.value == self.state.value, reading.value
+        return None if hangs else reading
+
+
+@dataclass
+class LastTwo:
+    values: list[float] = field(default_factory=list)
+
+
+class AnyHigh(Operator, merge=True):
+    """Whether one of the last two values is high."""
+
+    fresh: In[Number]
+    beat: In[Number]
+    high: Out[Switch]
+    state: LastTwo
+
+    def process(self, fresh: Number | None, beat: Number | None) -> Switch:
+        if fresh is not None:
+            self.state.values = [*self.state.values, fresh.value][-2:]
+        return Switch(on=any(value > 100.0 for value in self.state.values))

@@ -195,6 +195,8 @@ def test_the_history_of_a_field_leaves_out_what_stays(bugs: dict[str, str]) -> N
         (np.bool_(True), True),
         (2**60, 2**60),
         (np.array([0.1, 2.0]), "[0.1, 2. ]"),
+        ({"k0": np.float32(9), "k1": {"x": "y"}}, {"k0": 9.0, "k1": {"x": "y"}}),
+        ({0: 9}, "{0: 9}"),
     ],
 )
 def test_numbers_of_numpy_are_numbers_with_all_their_digits(value: Any, shown: Any) -> None:

@@ -284,7 +284,7 @@ def _converse(shell: Shell, lines: list[str], *, interactive: bool) -> None:
         shell.onecmd(line)
         failed = failed or shell.failed
     if interactive and sys.stdin.isatty():
-        shell.cmdloop(f"{plural(shell.calls, 'call')}; help lists the commands")
+        shell.converse(f"{plural(shell.calls, 'call')}; help lists the commands")
         return
     for line in sys.stdin if interactive else ():
         if shell.onecmd(line.strip()):

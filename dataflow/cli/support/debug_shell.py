@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import cmd
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from itertools import chain, count, takewhile
@@ -15,7 +17,6 @@ from rich.text import Text
 from dataflow.cli.support.output import out, plural, print_json_line, say
 from dataflow.cli.support.verdicts import difference_text
 from dataflow.debugging.fired import described
-from dataflow.execution.snapshots import changes
 from dataflow.messages.base import Message
 from dataflow.messages.display.text import field_text
 from dataflow.sync.entries import entries_of
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
 
 MOST_FIELDS = 8
 """Fields that are shown of an output that differs."""
+
+
+_PART = re.compile(r"""\b(before|after)((?:\[[^\[\]]+\])*)\[(["'])$""")
+"""The beginning of a key of a state, or of a part of it, behind its quote."""
 
 
 class WrongCommand(ValueError):
@@ -148,7 +153,7 @@ class Shell(cmd.Cmd):
             raise WrongCommand(self._debugger.no_state())
         if line and line not in {*before, *after}:
             raise WrongCommand(f"no part {line!r}; there are: {', '.join(sorted({*before, *after}))}")
-        pairs = [(line, before.get(line), after.get(line))] if line else changes(before, after)
+        pairs = [(line, before.get(line), after.get(line))] if line else fired.changes()
         for name, was, now in pairs:
             out.print(Text.assemble((f"{name}\n", "bold"), f"  before  {_plain(was)}"), soft_wrap=True)
             out.print(Text(f"  after   {_plain(now)}"), soft_wrap=True)
@@ -181,6 +186,16 @@ class Shell(cmd.Cmd):
     do_q = do_exit = do_EOF = do_quit
 
     # ------------------------------------------------------------------------------------------------- the loop
+
+    def converse(self, intro: str) -> None:
+        """Asks for lines until one leaves; Ctrl-C clears a line."""
+        while True:
+            try:
+                self.cmdloop(intro)
+                return
+            except KeyboardInterrupt:
+                out.print()
+                intro = ""
 
     def onecmd(self, line: str) -> bool:
         """Does the command of a line. An error is printed, and the loop goes on."""
@@ -220,8 +235,16 @@ class Shell(cmd.Cmd):
         states = (None, None) if self._debugger.at is None else self._debugger.at.states()
         return sorted(n for n in {*(states[0] or ()), *(states[1] or ())} if n.startswith(text))
 
-    def _complete_expression(self, text: str, *ignored: Any) -> list[str]:
-        names = {} if self._debugger.at is None else self._debugger.at.names() | dict.fromkeys(("before", "after"))
+    def _complete_expression(self, text: str, line: str, begins: int, ends: int) -> list[str]:
+        at = self._debugger.at
+        head = line[:begins]
+        if (quoted := _PART.search(head)) is not None:
+            before, after = (None, None) if at is None else at.states()
+            keys = _keys(before if quoted[1] == "before" else after, quoted[2])
+            return [f"{key}{quoted[3]}]" for key in keys if key.startswith(text)]
+        if head.count('"') % 2 or head.count("'") % 2:
+            return []
+        names = {} if at is None else at.names() | dict.fromkeys(("before", "after"))
         completer = Completer(names)
         found = takewhile(bool, (completer.complete(text, n) for n in count()))
         return [word for word in found if word is not None and (text or word in names)]
@@ -335,6 +358,16 @@ def _evaluated(code: Any, text: str, names: dict[str, Any]) -> Any:
         return eval(code, names)
     except Exception as error:
         raise WrongCommand(f"{text}: {type(error).__name__}: {error}") from None
+
+
+def _keys(state: Any, path: str) -> list[str]:
+    """Returns the names in a part of a state, which the path leads to ('["motion"][3]')."""
+    try:
+        for key in re.findall(r"\[([^\[\]]+)\]", path):
+            state = state[ast.literal_eval(key)]
+    except (LookupError, TypeError, ValueError, SyntaxError):
+        return []
+    return [key for key in state if isinstance(key, str)] if isinstance(state, Mapping) else []
 
 
 def _plain(value: Any) -> str:

@@ -9,11 +9,14 @@ from __future__ import annotations
 import ast
 import ctypes
 import os
+import re
 import socket
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
+from operator import eq, ge, gt, le, lt
 from types import CodeType, FrameType, SimpleNamespace
 from typing import Any
 
@@ -21,7 +24,7 @@ from dataflow.debugging.dap.variables import Variables
 from dataflow.debugging.dap.wire import Gone, Wire
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.debugging.fired import Abandoned, Fired, Process, Through
-from dataflow.debugging.lines import Lines, Spot, homes_of, is_own, lines_of, own_frames
+from dataflow.debugging.lines import Lines, Spot, homes_of, is_own, own_frames, stoppable_line
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.messages.base import Message
 from dataflow.reexecution.recorded_run import ReplayError
@@ -34,6 +37,8 @@ CAPABILITIES = (
     "supportsConfigurationDoneRequest",
     "supportsConditionalBreakpoints",
     "supportsEvaluateForHovers",
+    "supportsHitConditionalBreakpoints",
+    "supportsLogPoints",
     "supportsRestartRequest",
     "supportsStepBack",
 )
@@ -50,11 +55,13 @@ Stops = Callable[[FrameType, int], str]
 
 @dataclass(frozen=True, slots=True)
 class Breakpoint:
-    """A line with its condition, if there is one."""
+    """A line with its condition, if there is one. `hits`: which passes of a call count, of those with a true condition;
+    `log`: the message, an f-string, that is printed in place of a stop."""
 
-    number: int
     text: str
     condition: CodeType | None
+    hits: Callable[[int], bool] | None
+    log: CodeType | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +83,8 @@ class Session:
         self._connection, self._wire, self._debugger, self._number = connection, Wire(connection), debugger, number
         self._going = Going(first, self._first_line)
         self._breakpoints: dict[str, dict[int, Breakpoint]] = {}
+        self._passes: Counter[Breakpoint] = Counter()
+        """Passes of the call under way at breakpoints with `hits`."""
         self._variables, self._frames = Variables(), list[FrameType]()
         self._homes = homes_of(debugger.node.operator.__module__)
         self._lines = Lines(self._at_line, self._homes)
@@ -206,6 +215,7 @@ class Session:
         """Finds where a command leads; of one that fails, prints the reason and begins the call again."""
         assert self._away is not None
         here, away, self._away = self._going.call, self._away, None
+        self._raises = -1  # who comes to that line anew is stopped at it anew
         try:
             return away()
         except Abandoned:
@@ -231,12 +241,14 @@ class Session:
             try:
                 if not count % LOOKS:
                     self._look()
+                self._count(frame)
                 at_line(frame, count)
             except Gone as error:
                 raise self._abandoned(error) from error
 
         def through(process: Process, firing: Firing) -> dict[str, Message]:
             self._touched = False
+            self._passes.clear()
             try:
                 self._look()
             except Gone as error:
@@ -273,6 +285,8 @@ class Session:
             self._say(fired.error, "stderr")
 
     def _at_line(self, frame: FrameType, count: int) -> None:
+        if not self._going.line:  # what is made again, to a line that it has come to, was printed
+            self._log(frame)
         why = "pause" if self._pauses else self._going.stops(frame, count)
         if why:
             self._stop(frame, why)
@@ -280,16 +294,36 @@ class Session:
     def _first_line(self, frame: FrameType, count: int) -> str:
         return "entry"
 
-    def _breaks(self, frame: FrameType, count: int) -> str:
-        found = self._breakpoints.get(_real(frame.f_code.co_filename), {}).get(frame.f_lineno)
-        if found is None:
-            return ""
+    def _breakpoint(self, frame: FrameType) -> Breakpoint | None:
+        return self._breakpoints.get(_real(frame.f_code.co_filename), {}).get(frame.f_lineno)
+
+    def _count(self, frame: FrameType) -> None:
+        found = self._breakpoint(frame)
+        if found is not None and found.hits is not None and self._is_so(found, frame):
+            self._passes[found] += 1
+
+    def _is_so(self, found: Breakpoint, frame: FrameType) -> bool:
         try:
-            hit = found.condition is None or eval(found.condition, frame.f_globals, frame.f_locals)
+            return found.condition is None or bool(eval(found.condition, frame.f_globals, frame.f_locals))
         except Exception as error:
             self._say(f"the condition {found.text} raises {readable(error)}", "stderr")
-            hit = True
-        return "breakpoint" if hit else ""
+            return True
+
+    def _is_hit(self, found: Breakpoint, frame: FrameType) -> bool:
+        return self._is_so(found, frame) and (found.hits is None or found.hits(self._passes[found]))
+
+    def _breaks(self, frame: FrameType, count: int) -> str:
+        found = self._breakpoint(frame)
+        return "breakpoint" if found is not None and found.log is None and self._is_hit(found, frame) else ""
+
+    def _log(self, frame: FrameType) -> None:
+        found = self._breakpoint(frame)
+        if found is None or found.log is None or not self._is_hit(found, frame):
+            return
+        try:
+            self._say(str(eval(found.log, frame.f_globals, frame.f_locals)).removesuffix(" "))
+        except Exception as error:
+            self._say(f"the log message of line {frame.f_lineno} raises {readable(error)}", "stderr")
 
     def _over_from(self, start: FrameType, *, out: bool) -> Stops:
         """Stops at the next line of a frame (unless `out`), or of one that it returns to."""
@@ -435,24 +469,18 @@ class Session:
     def _set_breakpoints(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         file = _real(arguments["source"]["path"])
         set_here: dict[int, Breakpoint] = {}
-        told = []
-        for number, each in enumerate(arguments.get("breakpoints", ()), 1):
-            text, problem = each.get("condition") or "", ""
+        told: list[dict[str, Any]] = []
+        for each in arguments.get("breakpoints", ()):
             try:
-                line = _line_with_code(file, each["line"])
-                condition = compile(text, "<condition>", "eval") if text else None
-                problem = (
-                    "" if is_own(file, self._homes) else "breakpoints are for the operator's source, not for libraries"
-                )
+                if not is_own(file, self._homes):
+                    raise LookupError("breakpoints are for the operator's source, not for libraries")
+                line = stoppable_line(file, each["line"], self._debugger.node.operator.setup.__qualname__)
+                set_here[line] = _breakpoint(each)
+                told.append({"verified": True, "line": line})
             except LookupError as error:
-                problem = str(error)
+                told.append({"verified": False, "line": each["line"], "message": str(error)})
             except (OSError, SyntaxError, ValueError) as error:
-                problem = f"no code there: {readable(error)}"
-            if problem:
-                told.append({"verified": False, "line": each["line"], "message": problem})
-                continue
-            set_here[line] = Breakpoint(number, text, condition)
-            told.append({"verified": True, "line": line})
+                told.append({"verified": False, "line": each["line"], "message": f"no code there: {readable(error)}"})
         self._breakpoints[file] = set_here
         return {"breakpoints": told}
 
@@ -536,13 +564,36 @@ class Session:
 _real = cache(os.path.realpath)
 
 
-def _line_with_code(file: str, wanted: int) -> int:
-    """Returns the first line from `wanted` on that holds code. Raises LookupError behind the last one, OSError,
-    SyntaxError, ValueError."""
-    lines = lines_of(file)
-    if (found := min((n for n in lines if n >= wanted), default=None)) is None:
-        raise LookupError(f"no code from line {wanted} on: the last line with code is {max(lines, default=0)}")
-    return found
+def _breakpoint(wanted: Mapping[str, Any]) -> Breakpoint:
+    """Returns a breakpoint as it is asked for. Raises LookupError for one that cannot be, with the reason."""
+    text, log = wanted.get("condition") or "", wanted.get("logMessage") or ""
+    return Breakpoint(
+        text,
+        _compiled("condition", text, text) if text else None,
+        _hits(wanted.get("hitCondition") or ""),
+        _compiled("log message", log, f'rf"""{log} """') if log else None,  # the space ends one that ends with a quote
+    )
+
+
+def _compiled(what: str, text: str, code: str) -> CodeType:
+    try:
+        return compile(code, f"<{what}>", "eval")
+    except (SyntaxError, ValueError) as error:
+        raise LookupError(f"the {what} {text} is no Python expression: {readable(error)}") from None
+
+
+def _hits(text: str) -> Callable[[int], bool] | None:
+    """Reads which passes are meant: "3" or "== 3" the third, "> 3", "% 3" each third. Raises LookupError."""
+    if not text.strip():
+        return None
+    found = re.fullmatch(r"\s*(==|>=|<=|>|<|%|)\s*(\d+)\s*", text)
+    if found is None or (found[1] == "%" and not int(found[2])):
+        raise LookupError(f"the hit count {text} is none of: 3, >= 3, > 3, <= 3, < 3, % 3")
+    number = int(found[2])
+    if found[1] == "%":
+        return lambda count: count % number == 0
+    compare = {"": eq, "==": eq, ">=": ge, "<=": le, ">": gt, "<": lt}[found[1]]
+    return lambda count: bool(compare(count, number))
 
 
 def _parsed(text: str, *, statements: bool) -> ast.Expression | ast.Module:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.execution.effects.answers import Answer, Call, EffectMiss, Key
+from dataflow.execution.effects.surroundings import texts_around
 from dataflow.recording.limits import MAX_EFFECT_BYTES
 
 EFFECTS = "effects"
@@ -33,12 +34,14 @@ class Journal:
     def ask(self, call: Call, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Returns the answer in the form that is recorded. Raises what the call raises, and `EffectError`."""
         key = Key.of(call, args, kwargs)
+        # What the call changes is in no key, but for the texts with which it begins, such as a conversation's.
+        texts = set() if key.function in self._moving else texts_around(call)
         self.asked += 1
         left = MAX_EFFECT_BYTES - sum(len(data) for *_, data in self.made)
         answer = Answer.of(key.name, call, args, kwargs, left)
         moving = self._moving[key.function]
         moving |= key.moved(call)
-        key = key.without(moving)
+        key = key.without(moving - texts)
         self.made.append([key.function, dict(key.arguments), answer.raised, answer.data])
         return answer.value()
 

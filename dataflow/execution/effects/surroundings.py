@@ -7,7 +7,7 @@ import sys
 import sysconfig
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from types import FunctionType, ModuleType
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,11 @@ def surroundings(call: Callable[..., Any]) -> dict[str, Any]:
     if isinstance(function, FunctionType):
         _look_into_function(function, "", found, DEPTH)
     return found
+
+
+def texts_around(call: Callable[..., Any]) -> set[str]:
+    """Returns the places of those that are texts, or hold nothing but texts: what a service may be told by them."""
+    return {place for place, value in surroundings(call).items() if _is_text(value) and value}
 
 
 def _look(value: Any, place: str, found: dict[str, Any], depth: int) -> None:
@@ -82,7 +87,7 @@ def _attributes(thing: Any) -> Iterator[tuple[str, Any]]:
         if _is_own(kind):
             constants |= vars(kind)
     held: Mapping[str, Any] = {}
-    if _is_own(cls) and thing is not cls:
+    if (_is_own(cls) or cls is SimpleNamespace) and thing is not cls:
         slots = (name for kind in cls.__mro__ for name in vars(kind).get("__slots__", ()))
         held = {name: getattr(thing, name, None) for name in slots} | getattr(thing, "__dict__", {})
         held = _of_operator(thing, held) if issubclass(cls, Operator) else held
