@@ -479,7 +479,8 @@ def test_a_stream_that_no_file_has_is_lost_a_flight_without_a_file_kept_nothing(
         check_losses_of_files(report, RUN, streams)
     monkeypatch.setattr("simulation.check.complete", lambda *_, **__: SimpleNamespace(whole=True))
     with pytest.raises(Violation, match="lacks messages of robot/nothing/out"):
-        checks._check_completion(RUN, RUN, PLAIN.load(), report)
+        checks._check_completion(RUN, RUN, PLAIN.load(), Outcome(report))
+    checks._check_completion(RUN, RUN, PLAIN.load(), Outcome(report, killed={"@recorder"}))
     graph = replace(PLAIN, keeping=Keeping(flight=True)).load()
     assert checks._check_flight(Outcome(report), graph, tmp_path) == "nothing kept"
     with pytest.raises(Violation, match="nothing is kept, though left failed"):
