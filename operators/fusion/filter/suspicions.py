@@ -88,18 +88,21 @@ class Suspicions(Remembered):
     def __init__(self, known: SensorErrors, gravity: Array, biases: tuple[float, float]) -> None:
         self._known, self._gravity = known, gravity
         self._loose = np.repeat([*_LOOSE, *biases], 3)
-        self._looked, self._found, self._suspected, self._fits = 0, None, [], []
+        self._looked, self._found, self._suspected, self._fits, self._sure = 0, None, [], [], True
 
     @property
     def found(self) -> tuple[str, str, float, float] | None:
         """Returns sensor, kind, size and standard deviation (s, or a share) of the error that explains most, if any."""
         return self._found
 
-    def look(self, time: int, window: Window) -> Fit | None:
-        """Looks, once a second; returns the motion that was fitted if no error was found, None if none was."""
+    def look(self, time: int, window: Window, sure: bool = True) -> Fit | None:
+        """Looks, once a second; returns the motion of late, None if it was not fitted or if speeds are wrong.
+
+        `sure`: nothing contradicts what was told of the first heading.
+        """
         if time - self._looked < _EVERY:
             return None
-        self._looked = time
+        self._looked, self._sure = time, sure
         suspected = self._suspects(window)
         enough = len(window.steps) - window.first >= _FEWEST and bool(suspected)
         if suspected != self._suspected or not enough:
@@ -108,7 +111,9 @@ class Suspicions(Remembered):
             return None
         self._fits = [self._fitted(window, erring) for erring in (False, True)]
         self._found = self._judged(*self._fits)
-        return self._fits[0] if self._found is None else None
+        if self._found is not None and self._found[1] == SCALE:
+            return None
+        return self._fits[self._found is not None]
 
     def _suspects(self, window: Window) -> list[tuple[str, str]]:
         """Returns sensors and the kinds of error that are looked for: those that are not estimated."""
@@ -168,7 +173,7 @@ class Suspicions(Remembered):
 
     def _prior(self, first: Step) -> Array:
         """Returns what is known (15, 15) of the first state of a window before anything is measured."""
-        if first.told:
+        if first.told and self._sure:
             scale = np.sqrt(np.diag(first.start.covariance))  # metres by the thousand beside biases: inverted without
             return np.asarray(np.linalg.inv(first.start.covariance / np.outer(scale, scale)) / np.outer(scale, scale))
         up = first.start.rotation[2]
@@ -221,7 +226,7 @@ class Suspicions(Remembered):
         """Returns residual (M,), Jacobian (M, 15 + K), and what each error adds to the residual (M, S)."""
         suspect = entry.sensor, suspected(entry.model)
         own = self._suspected.index(suspect) if suspect in self._suspected else -1
-        delay = float(errors[own]) if own >= 0 and suspect[1] == LATE else 0.0
+        delay = float(errors[own]) - entry.assumed if own >= 0 and suspect[1] == LATE else 0.0
         residual, there = entry.model.innovation(_back(x, step, delay, self._gravity), step.gyro)
         H = np.zeros((len(residual), SIZE + len(x.errors)))
         H[:, :SIZE] = there
