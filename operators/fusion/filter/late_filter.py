@@ -48,7 +48,7 @@ TOO_LATE = ": too late"
 """Suffix of a sensor's name in the counts of measurements that came after the window."""
 _STANDS = 60_000_000_000
 """Nanoseconds in motion until which a refuted first heading is reported."""
-_CONTRADICTS = 0.9999
+_CONTRADICTS = 0.999
 """Share of rotations that differ less by chance from a fit of the motion of late."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
