@@ -92,8 +92,8 @@ class EkfFusion(Operator):
     A sensor's time offset is a setting, `offset`; with `offset_sigma` it is a state of the filter and estimated, as far
     as the motion makes it observable. So are a position's error that changes slowly, as satellites have (`drift`), and
     the scale of wheels (`scale_sigma`): taken for white noise, these would make the covariance too small. Late stamps
-    of places and speeds of a wrong scale that were not told are looked for in the last 20 s, and warned of; while
-    stamps are late, the covariance holds what that may do.
+    of places and speeds of a wrong scale that were not told are looked for in the last 20 s, and warned of; what
+    stamps are late is taken off, and the covariance holds how little it is known.
 
     `standstill` and `slip` say what is known of the motion without a sensor of it (wheels say both by themselves).
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
@@ -309,7 +309,8 @@ class EkfFusion(Operator):
             self.state.dropout.saw(message.stamp, seen)
         try:
             for time, sensor, model, noise in measurements(name, message, before, settings, around):
-                self.state.filter.measure(Measurement(time - assumed, sensor, model, noise, clock, assumed * 1e-9))
+                taken = assumed if clock >= 0 else self._late(sensor)
+                self.state.filter.measure(Measurement(time - taken, sensor, model, noise, clock, taken * 1e-9))
         except Unusable as reason:
             self.state.ignored[f"{name}: {reason}"] += 1
 
@@ -318,6 +319,14 @@ class EkfFusion(Operator):
         assert self.state.filter is not None
         offsets = self.state.filter.offsets()
         return (list(offsets).index(name), round(offsets[name][0] * 1e9)) if name in offsets else (-1, 0)
+
+    def _late(self, sensor: str) -> int:
+        """Returns by how much (ns) a sensor's stamps are found to be late, without being told."""
+        assert self.state.filter is not None
+        found = self.state.filter.suspicion
+        if found is None or found[:2] != (sensor, LATE) or abs(found[2]) >= self.window:
+            return 0
+        return round(found[2] * 1e9)
 
     def _command(self, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> None:
         assert self.state.filter is not None
@@ -339,7 +348,7 @@ class EkfFusion(Operator):
             return None
         found = self.state.filter.suspicion
         if found is not None and found[1] == LATE:
-            state = unsure_of_time(state, rate, math.hypot(*found[2:]))
+            state = unsure_of_time(state, rate, math.hypot(found[2] - 1e-9 * self._late(found[0]), found[3]))
         T_body_base = self.state.lever_arms.of(self.base_frame)
         return odometry_of(state, rate, T_body_base, stamp, self.world_frame, self.base_frame)
 

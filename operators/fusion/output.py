@@ -41,7 +41,7 @@ def suspicion_of(sensor: str, kind: str, size: float, sigma: float) -> dict[str,
     """Returns a warning of a sensor's error that was not told: of its stamps (s), or of the scale of its speeds."""
     if kind == LATE:
         side = "late" if size > 0 else "early"
-        text = f"its stamps are {abs(size):.2f} ± {sigma:.2f} s {side} (offset), or its place on the robot is wrong"
+        text = f"its stamps are {abs(size):.2f} ± {sigma:.2f} s {side} (offset), if its place on the robot is right"
         return {sensor: text}
     side = "fast" if size > 0 else "slow"
     return {sensor: f"its speeds are {abs(size):.1%} ± {sigma:.1%} too {side} (scale_sigma)"}

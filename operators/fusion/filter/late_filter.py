@@ -48,7 +48,7 @@ TOO_LATE = ": too late"
 """Suffix of a sensor's name in the counts of measurements that came after the window."""
 _STANDS = 60_000_000_000
 """Nanoseconds in motion until which a refuted first heading is reported."""
-_CONTRADICTS = 0.99
+_CONTRADICTS = 0.999
 """Share of rotations that differ less by chance from a fit of the motion of late."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
@@ -142,9 +142,10 @@ class LateFilter(Remembered):
 
         An estimate that was linearised about what it is not may be sure of a wrong rotation: it begins anew at the fit.
         """
-        node = self._newest()
-        fit = self._suspicions.look(node.time, node.window)
-        if fit is None or fit.end is None:
+        node, before = self._newest(), self.suspicion
+        sure = len(likely(node.hypotheses)) == 1 and not node.refuted
+        fit = self._suspicions.look(node.time, node.window, sure)
+        if fit is None or fit.end is None or not sure:
             return
         key = (fit.until, 3, "", 0)
         node = self._nodes[bisect_right(self._keys, key)]
@@ -152,8 +153,9 @@ class LateFilter(Remembered):
             return
         own = combined(node.hypotheses)
         off = difference(own, fit.end)[ROTATION]
+        late = before is None and self.suspicion is not None  # stamps, which from now on are taken for what they are
         spread = own.covariance[ROTATION, ROTATION] + fit.end.covariance[ROTATION, ROTATION]
-        if float(off @ np.linalg.solve(spread, off)) > threshold(_CONTRADICTS, 3):
+        if late or float(off @ np.linalg.solve(spread, off)) > threshold(_CONTRADICTS, 3):
             covariance = own.covariance.copy()
             covariance[:SIZE, SIZE:], covariance[SIZE:, :SIZE] = 0.0, 0.0
             covariance[:SIZE, :SIZE] = fit.end.covariance

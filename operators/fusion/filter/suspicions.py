@@ -37,14 +37,14 @@ Array = NDArray[np.float64]
 _CHANCE = 6e-5
 """Probability of evidence as strong where nothing is wrong, that of four standard deviations."""
 _CEASES = 0.25
-"""Share of that evidence at which an error that was found no longer counts."""
+"""Share of that evidence at which an error that was found no longer counts, and from which one is looked for at all."""
 _EVERY = 1_000_000_000
 """Nanoseconds from one look to the next."""
 _FEWEST = 5
 """Steps that a fit needs."""
 _ROUNDS = 4
 """Linearisations of a fit at most; the next look goes on where they end."""
-_SETTLED = 3e-3
+_SETTLED = 1e-2
 """Change of rotations (rad), biases and errors (s, shares) that ends them."""
 LATE, SCALE = "late", "scale"
 _SPREAD = {LATE: 1.0, SCALE: 0.2}
@@ -64,7 +64,8 @@ class Fit:
     """Holds the motion that fits a window best: the state at its first step, and sensors' errors (S,).
 
     `cost`: squared residuals by their covariance; `sigmas` (S,) of the errors; `freedom`: how many were measured;
-    `end`: the state at the last step, of the time `until` (ns), with its covariance.
+    `end`: the state at the last step, of the time `until` (ns), with its covariance;
+    `promise`: by how much the cost would be less with errors, as far as it is linear.
     """
 
     time: int
@@ -75,6 +76,7 @@ class Fit:
     freedom: int = 0
     until: int = 0
     end: State | None = None
+    promise: float = 0.0
 
 
 class Suspicions(Remembered):
@@ -88,27 +90,37 @@ class Suspicions(Remembered):
     def __init__(self, known: SensorErrors, gravity: Array, biases: tuple[float, float]) -> None:
         self._known, self._gravity = known, gravity
         self._loose = np.repeat([*_LOOSE, *biases], 3)
-        self._looked, self._found, self._suspected, self._fits = 0, None, [], []
+        self._looked, self._found, self._suspected, self._fits, self._sure = 0, None, [], [], True
 
     @property
     def found(self) -> tuple[str, str, float, float] | None:
         """Returns sensor, kind, size and standard deviation (s, or a share) of the error that explains most, if any."""
         return self._found
 
-    def look(self, time: int, window: Window) -> Fit | None:
-        """Looks, once a second; returns the motion that was fitted if no error was found, None if none was."""
+    def look(self, time: int, window: Window, sure: bool = True) -> Fit | None:
+        """Looks, once a second; returns the motion of late, None if it was not fitted or if speeds are wrong.
+
+        `sure`: nothing contradicts what was told of the first heading.
+        """
         if time - self._looked < _EVERY:
             return None
-        self._looked = time
+        self._looked, self._sure = time, sure
         suspected = self._suspects(window)
-        enough = len(window.steps) - window.first >= _FEWEST and bool(suspected)
-        if suspected != self._suspected or not enough:
+        fits = len(window.steps) - window.first >= _FEWEST and bool(suspected)
+        if suspected != self._suspected or not fits:
             self._suspected, self._fits, self._found = suspected, [], None
-        if not enough:
+        if not fits:
             return None
-        self._fits = [self._fitted(window, erring) for erring in (False, True)]
-        self._found = self._judged(*self._fits)
-        return self._fits[0] if self._found is None else None
+        enough = float(quantile(1 - _CHANCE, len(suspected)))
+        without = self._fitted(window, False)
+        if self._found is None and without.promise < _CEASES * enough:  # a second fit is not worth its time
+            self._fits = [without]
+            return without
+        self._fits = [without, self._fitted(window, True)]
+        self._found = self._judged(without, self._fits[1], enough * (_CEASES if self._found else 1.0))
+        if self._found is not None and self._found[1] == SCALE:
+            return None
+        return self._fits[self._found is not None]
 
     def _suspects(self, window: Window) -> list[tuple[str, str]]:
         """Returns sensors and the kinds of error that are looked for: those that are not estimated."""
@@ -121,9 +133,8 @@ class Suspicions(Remembered):
         }
         return sorted(every - estimated)
 
-    def _judged(self, without: Fit, erring: Fit) -> tuple[str, str, float, float] | None:
+    def _judged(self, without: Fit, erring: Fit, enough: float) -> tuple[str, str, float, float] | None:
         noise = max(erring.cost / erring.freedom, 1.0)  # what was told of it may be too small
-        enough = float(quantile(1 - _CHANCE, len(self._suspected))) * (_CEASES if self._found else 1.0)
         if without.cost - erring.cost < enough * noise:
             return None
         k = int(np.argmax(np.abs(erring.errors) / erring.sigmas))
@@ -149,18 +160,19 @@ class Suspicions(Remembered):
                 errors = errors + change[SIZE:].clip(-_MOST, _MOST)
             if np.abs(change[ROTATION.start :]).max() < _SETTLED:
                 break
-        sigmas = np.sqrt(np.diag(np.linalg.inv(information))[SIZE:])
+        spreads = np.linalg.inv(information)
+        sigmas, promise = np.sqrt(np.diag(spreads)[SIZE:]), float(score @ spreads @ score - score[:size] @ change)
         known = effects[:SIZE, :size]
         covariance = end.covariance + known @ np.linalg.solve(information[:size, :size], known.T)
         end = moved(end, known @ change, covariance)
-        return Fit(steps[0].time, state, errors, cost, sigmas, freedom, steps[-1].time, end)
+        return Fit(steps[0].time, state, errors, cost, sigmas, freedom, steps[-1].time, end, promise)
 
     def _begun(self, window: Window, erring: bool) -> tuple[State, Array]:
         """Returns the state at the window's first step and the errors (S,) from which a fit begins."""
         times = [step.time for step in window.steps[: window.first + 1]]
         if not self._fits or self._fits[0].time not in times:
             return window.steps[window.first].start, np.zeros(len(self._suspected))
-        fit = self._fits[erring]
+        fit = self._fits[-1 if erring else 0]
         state = fit.state
         for step in window.steps[times.index(fit.time) + 1 : window.first + 1]:
             state = step.motion.moved(state, self._gravity)[0]
@@ -168,7 +180,7 @@ class Suspicions(Remembered):
 
     def _prior(self, first: Step) -> Array:
         """Returns what is known (15, 15) of the first state of a window before anything is measured."""
-        if first.told:
+        if first.told and self._sure:
             scale = np.sqrt(np.diag(first.start.covariance))  # metres by the thousand beside biases: inverted without
             return np.asarray(np.linalg.inv(first.start.covariance / np.outer(scale, scale)) / np.outer(scale, scale))
         up = first.start.rotation[2]
@@ -221,7 +233,7 @@ class Suspicions(Remembered):
         """Returns residual (M,), Jacobian (M, 15 + K), and what each error adds to the residual (M, S)."""
         suspect = entry.sensor, suspected(entry.model)
         own = self._suspected.index(suspect) if suspect in self._suspected else -1
-        delay = float(errors[own]) if own >= 0 and suspect[1] == LATE else 0.0
+        delay = float(errors[own]) - entry.assumed if own >= 0 and suspect[1] == LATE else 0.0
         residual, there = entry.model.innovation(_back(x, step, delay, self._gravity), step.gyro)
         H = np.zeros((len(residual), SIZE + len(x.errors)))
         H[:, :SIZE] = there

@@ -245,6 +245,18 @@ def test_late_stamps_of_positions_beside_wheels_are_named_with_their_offset(late
     assert abs(float(found[-1][1].split()[3]) - late) < 0.15
     assert "s late" in found[-1][1]
     assert "robot/wheels" not in run.alarms
+    assert run.within(found[0][0] + 1.0, 15.0) >= 0.95
+    assert run.errors[-200:].mean() < 0.1  # it is taken off
+
+
+@pytest.mark.long
+def test_late_stamps_of_positions_that_are_all_there_is_are_found_and_taken_off() -> None:
+    drive = Drive(18.0)
+    run = Run(drive, drive.fixes(stamped=0.5))
+    found = [(at, text) for at, text in run.alarms["robot/fix"] if text.startswith("its stamps are")]
+    assert found[0][0] < 14.0
+    assert run.within(found[0][0] + 1.0, 18.0) >= 0.95
+    assert run.errors[-200:].mean() < 0.15
 
 
 @pytest.mark.long

@@ -103,7 +103,7 @@ def test_the_operator_says_what_it_found_and_its_poses_are_right() -> None:
         sensors = {"robot/pose": {"use": "pose", "offset": 0.05, "offset_sigma": sigma}}
         operator, played = fused({"robot/imu": robot.imu, "robot/pose": late}, heading=None, sensors=sensors)
         found[f"{sigma}"] = errors(robot, played)[0][-100:].mean()
-    assert found["0.2"] < 0.05 < found["0.0"]
+    assert max(found.values()) < 0.05  # without being told it is found as well
     assert operator.summary()["robot/pose, offset (s)"] == pytest.approx(0.12, abs=0.01)
     status = played["status"][-1]
     assert isinstance(status, Diagnostics)
