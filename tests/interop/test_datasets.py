@@ -91,6 +91,33 @@ def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: 
     assert done.left_out == {"said": "it holds no numbers of which each message has as many"}
 
 
+def test_what_no_frame_of_a_lerobot_dataset_takes_is_counted_as_lost_and_not_as_written(tmp_path: Path) -> None:
+    material_of = arm()
+    for k in (4, 5):  # a pause of an hour in front of them
+        moved = material_of["camera/image"][k]
+        material_of["camera/image"][k] = moved.replace(stamp=moved.stamp + 3600 * SECOND)
+    done = Exported()
+    with Material(write(tmp_path / "a.mcap", material_of)) as material:
+        export_lerobot(material, tmp_path / "set", done)
+
+    lost = {name: sum(losses.values()) for name, losses in done.lost.items()}
+    frames = done.written["camera/image"]
+    assert frames == 5  # the first image came before the first command
+    assert done.written["arm/joints"] == 4
+    assert done.written["arm/joints"] + lost["arm/joints"] == len(material_of["arm/joints"])
+    assert done.written["cmd/twist"] + lost["cmd/twist"] == len(material_of["cmd/twist"])
+    assert [number for what, number in done.lost["camera/image"].items() if "pauses" in what] == [1]
+
+
+def test_two_cameras_of_one_name_in_lerobot_are_refused_by_their_names(tmp_path: Path) -> None:
+    streams = arm()
+    path = write(
+        tmp_path / "a.mcap", {"camera/image": streams["camera/image"], "camera.image": streams["camera/image"]}
+    )
+    with Material(path) as material, pytest.raises(RecordingError, match=r"camera\.image and camera/image are both"):
+        export_lerobot(material, tmp_path / "set", Exported())
+
+
 def test_the_statistics_of_a_lerobot_dataset_are_those_of_its_columns(tmp_path: Path) -> None:
     with Material(write(tmp_path / "a.mcap", arm())) as material:
         export_lerobot(material, tmp_path / "set", Exported())
