@@ -300,3 +300,36 @@ def test_a_definition_that_is_broken_costs_its_own_topic(dataflow, tmp_path: Pat
     assert told["written"] == {"/good": 2}
     assert "definition of std_msgs/msg/Odd is broken" in told["left_out"]["/bad"]
     assert list(told["lost"]["/good"].values()) == [1]
+
+
+def test_a_replay_of_a_damaged_file_counts_what_is_lost_in_words_and_in_json(dataflow, tmp_path: Path) -> None:
+    path, graph = damaged_chunk(tmp_path / "a.mcap"), tmp_path / "g.yaml"
+    graph.write_text(GRAPH)
+    words = ("replay", path, "--graph", graph, "--one-process")
+
+    told = dataflow(*words, "-q", code=1).stderr
+    notes = json.loads(dataflow(*words, "--json", code=1).stdout)["notes"]
+
+    assert "topic /pose: 12 messages lost to damage" in " ".join(told.split())
+    assert any("topic /pose: 12 messages lost to damage" in note for note in notes)
+
+
+def test_files_of_a_folder_that_are_no_parts_of_one_are_not_read_as_one(dataflow, tmp_path: Path) -> None:
+    for name in ("kitchen", "street"):
+        poses(tmp_path / f"{name}.mcap")
+    assert "no parts of one (kitchen.mcap, street.mcap): name one" in " ".join(
+        dataflow("info", tmp_path, code=2).stderr.split()
+    )
+    (tmp_path / "street.mcap").rename(tmp_path / "kitchen_1.mcap")
+    (tmp_path / "kitchen.mcap").rename(tmp_path / "kitchen_0.mcap")
+    dataflow("info", tmp_path)
+
+
+def test_python_warns_of_what_a_file_lacks(tmp_path: Path) -> None:
+    graph = tmp_path / "g.yaml"
+    graph.write_text(GRAPH)
+    with pytest.warns(UserWarning, match="no proper end"), api.open(torn(tmp_path / "a.mcap")):
+        pass
+    path = damaged_chunk(tmp_path / "b.mcap")
+    with pytest.warns(UserWarning, match="does not decompress"):
+        api.replay(path, graph=graph)
