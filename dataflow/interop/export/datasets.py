@@ -146,8 +146,11 @@ def export_kitti(material: Material, folder: Path, done: Exported) -> None:
         raise RecordingError(f"{material.path}: no image of the one camera has the stamp of one of the other")
     write_text(folder / "times.txt", "".join(f"{(s - stamps[0]) * 1e-9:e}\n" for s in stamps), done)
     lines = []
+    names, frames = material.of_type(CameraInfo), [frame_of(material, camera) for camera in cameras]
+    in_order = len(set(frames)) < len(cameras) == len(names)  # a rectified pair has one frame
     for k, camera in enumerate(cameras):
-        info = calibration(material, frame_of(material, camera), done, alone=len(cameras) == 1)
+        among = [names[k]] if in_order else names
+        info = calibration(material, frames[k], done, among=among, alone=in_order or len(cameras) == 1)
         if info is None:
             done.left_out[f"P{k} of calib.txt"] = f"no calibration has the frame of {material.names[camera]}"
             continue

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -45,12 +45,13 @@ def frame_of(material: Material, stream: str) -> str:
     return "" if first is None else str(getattr(first.message, "frame", ""))
 
 
-def calibration(material: Material, frame: str, done: Exported, *, alone: bool = False) -> CameraInfo | None:
+def calibration(
+    material: Material, frame: str, done: Exported, *, among: Sequence[str] | None = None, alone: bool = False
+) -> CameraInfo | None:
     """The first calibration of a camera's frame, counted as written; what of its lens has no place is counted as lost.
-    `alone`: the only one there is will do, whatever its frame."""
-    infos = [
-        (name, recorded.message) for name in material.of_type(CameraInfo) for recorded in material.messages([name])
-    ]
+    `among`: streams of calibrations; `alone`: the only one there is will do, whatever its frame."""
+    streams = material.of_type(CameraInfo) if among is None else among
+    infos = [(name, recorded.message) for name in streams for recorded in material.messages([name])]
     chosen = [(name, info) for name, info in infos if getattr(info, "frame", "") == frame]
     chosen = chosen or (infos if alone and len(infos) == 1 else [])
     for name, info in chosen[:1]:
