@@ -16,6 +16,7 @@ from dataflow.arguments import checked
 from dataflow.graph.model import Graph
 from dataflow.recording import Event, Recorded, Recording
 from dataflow.recording.layout import RECORDING
+from dataflow.recording.notices import warning
 from dataflow.recording.streams.part_folder import parts_in
 from dataflow.reexecution.recorded_run import resolved_graph
 
@@ -30,7 +31,8 @@ def open(path: str | Path) -> RecordedStreams:
     file = Path(path).expanduser()
     if not file.is_file() and not (file.is_dir() and parts_in(file)):
         raise FileNotFoundError(f"no recording {file}" + (": that is a folder" if file.is_dir() else ""))
-    recording = Recording(file)
+    with warning():
+        recording = Recording(file)
     infos = [info for info in recording.streams.values() if not info.static and "/@/" not in f"/{info.name}"]
     origin = min((info.first for info in infos if info.first is not None), default=0)
     return RecordedStreams(recording, tuple(recording.streams), origin)

@@ -22,6 +22,7 @@ from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign
 from dataflow.recording import Recording
 from dataflow.recording.layout import BAG, RUN
+from dataflow.recording.notices import warning
 from dataflow.recording.streams.facts import machine_facts
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
 from dataflow.supervision import plan
@@ -145,7 +146,23 @@ def replay(
     (`{"/camera/image_raw": "camera/image"}`), where types leave a choice; `clock` whether headers or log times stamp
     it. Raises `ReplayError`, `GraphError`, `RunFailed`, and `MappingError` that lists the topics.
     """
-    path = Path(recording)
+    with warning():
+        return _replayed(Path(recording), graph, start, end, record, overwrite, settings, paranoid, maps, clock, watch)
+
+
+def _replayed(
+    path: Path,
+    graph: GraphLike | None,
+    start: float | None,
+    end: float | None,
+    record: str | Path | None,
+    overwrite: bool,
+    settings: Mapping[str, Any] | None,
+    paranoid: bool,
+    maps: Mapping[str, str] | None,
+    clock: Choice,
+    watch: Watch | None,
+) -> RunResult:
     facts: dict[str, dict[str, str]] = {}
     played: set[str] | None = None
     shift = 0

@@ -21,6 +21,8 @@ LIBRARY_BYTES = 128
 """Of an MCAP, at its beginning, among which its header names the library."""
 _PART = re.compile(r"(.*?)_?(?:\d{4}(?:-\d\d){5})?_\d+\.bag")
 """The name that `rosbag record --split` gives to a part: prefix, date and number."""
+_DIGITS = re.compile(r"\d+|\.zstd?$")
+"""Parts of the names of files by which those of one recording differ."""
 DATASETS = "folders of datasets (TUM, EuRoC, KITTI) are read by sources of a graph: `dataflow operators` lists them"
 _SUFFIXES = ((MAGIC, ".mcap"), (SQLITE_MAGIC, ".db3"), (ROS1_MAGIC, ".bag"))
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -123,6 +125,9 @@ def _open_folder(path: Path, strict: bool) -> Bag:
         first, second = (", ".join(file.name for file in files[kind]) for kind in kinds)
         raise BagError(f"{path} holds bags of two kinds, {first} and {second}; name one of them")
     if kinds:
+        if not folder.named and len({_DIGITS.sub("", file.name) for file in files[kinds[0]]}) > 1:
+            named = ", ".join(file.name for file in files[kinds[0]][:4])
+            raise BagError(f"{path} holds {len(files[kinds[0]])} files that are no parts of one ({named}): name one")
         bag = _of_files(path, kinds[0], files[kinds[0]], strict, compressed=folder.message_compression)
         bag.promised = {**bag.promised, **folder.promised}
         bag.notes = (*folder.notes, *bag.notes, *surpluses(bag))

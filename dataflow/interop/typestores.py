@@ -54,10 +54,12 @@ class RosType:
         return tuple(name for name, _ in self._store.fielddefs[self.name][1])
 
     def as_ros2(self) -> SchemaText:
-        """Returns its definition, and those that it needs, as ROS 2 writes them."""
-        return SchemaText(
-            self.name, "ros2msg", _as_ros2(self._store).generate_msgdef(self.name, ros_version=2)[0].encode()
-        )
+        """Returns its definition, and those that it needs, as ROS 2 writes them. Raises `RecordingError`."""
+        try:
+            text, _ = _as_ros2(self._store).generate_msgdef(self.name, ros_version=2)
+        except TypesysError as error:
+            raise RecordingError(f"the definition of {self.name} is broken: {error}") from error
+        return SchemaText(self.name, "ros2msg", text.encode())
 
     def to_cdr(self, data: bytes | memoryview) -> bytes:
         """Returns a ROS 1 message as ROS 2 serialises it; raises `RecordingError`."""

@@ -53,7 +53,8 @@ Doubt = tuple[str, dict[str, float]]
 
 
 def _doubts(kind: str, looked: list[Message]) -> Iterator[Doubt]:
-    odd = [m for m in looked if not all(np.isfinite(getattr(m, name)).all() for name in _NUMBERS.get(kind, ()))]
+    given = ([v for name in _NUMBERS.get(kind, ()) if (v := getattr(m, name)) is not None] for m in looked)
+    odd = [m for m, values in zip(looked, given, strict=True) if not all(np.isfinite(v).all() for v in values)]
     if odd:
         text = f"{len(odd):,} of {len(looked):,} messages hold numbers that are not finite, the first at {odd[0].stamp}"
         yield text, {"messages": len(odd)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Self
 
 from dataflow.text import visible
 
@@ -24,7 +25,7 @@ class DamagedError(RecordingError):
     """The contradiction, without the file's name."""
 
     @classmethod
-    def of(cls, path: Path, what: str) -> DamagedError:
+    def of(cls, path: Path, what: str) -> Self:
         error = cls(f"{path} is damaged: {what}; `dataflow recover` may save what is left")
         error.what = visible(what)
         return error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,22 @@ def listening(listener: Listener) -> Iterator[None]:
         yield
     finally:
         _listeners.remove(listener)
+
+
+@contextmanager
+def warning() -> Iterator[None]:
+    """Turns the notes of files that this process opens meanwhile into Python's warnings, each once."""
+    found: dict[str, None] = {}
+
+    def take(file: Path, note: str) -> None:
+        found[note if file.name in note else f"{file}: {note}"] = None
+
+    try:
+        with listening(take):
+            yield
+    finally:
+        for note in found:
+            warnings.warn(note, stacklevel=4)
 
 
 def notice(file: Path, notes: Sequence[str]) -> None:

@@ -15,6 +15,7 @@ from ruamel.yaml.error import YAMLError
 from dataflow.messages import Imu, Message, Pose
 from dataflow.messages.geometry import normalize
 from dataflow.operator import Out, Param, Source, SourceError
+from operators.sources.passed_over import PassedOver
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,8 @@ class EurocImu(Source):
 
     The folder holds `imu.csv` (ns, gyroscope in rad/s, accelerometer in m/s²), and where they are known
     `groundtruth.txt` (s, x y z, qx qy qz qw: the pose of the inertial sensor) and `imu_sensor.yaml` (noise densities,
-    which give every sample its covariance). Burri et al., "The EuRoC micro aerial vehicle datasets", 2016.
+    which give every sample its covariance). A line that cannot be read is passed over with a warning, and so is a pose
+    that is none. Burri et al., "The EuRoC micro aerial vehicle datasets", 2016.
     """
 
     imu: Out[Imu] = Out(doc="angular velocity and specific force, with the covariances of the file's densities")
@@ -50,16 +52,23 @@ class EurocImu(Source):
     path: str = Param(doc="the folder")
     imu_frame: str = Param("imu", min_length=1, doc="frame of the inertial sensor")
     world_frame: str = Param("world", min_length=1, doc="frame of the ground truth, z up")
+    strict: bool = Param(False, doc="what cannot be read is an error, instead of being passed over and counted")
 
     def setup(self) -> None:
         """Raises SourceError."""
         folder = Path(self.path).expanduser()
         if not folder.is_dir():
             raise SourceError(f"no folder {folder}")
-        self._imu = read_imu(self.use_file(folder / "imu.csv"))
+        self._passed = PassedOver(self.log, strict=self.strict)
+        self._imu = read_imu(self.use_file(folder / "imu.csv"), self._passed)
         truth, sensor = folder / "groundtruth.txt", folder / "imu_sensor.yaml"
-        self._truth = read_truth(self.use_file(truth)) if truth.is_file() else Samples([], np.zeros((0, 7)))
+        self._truth = (
+            read_truth(self.use_file(truth), self._passed) if truth.is_file() else Samples([], np.zeros((0, 7)))
+        )
         self._noise = read_noise(self.use_file(sensor)) if sensor.is_file() else None
+
+    def summary(self) -> Mapping[str, int]:
+        return {"passed_over": self._passed.number}
 
     def length(self) -> int:
         return len(set(self._imu.stamps) | set(self._truth.stamps))
@@ -92,19 +101,20 @@ class EurocImu(Source):
             yield messages
 
 
-def read_imu(file: Path) -> Samples:
+def read_imu(file: Path, passed: PassedOver) -> Samples:
     """Reads `imu.csv`: gyroscope and accelerometer (N, 6). Raises SourceError, OSError."""
-    return _rows(file, ",", 6, Decimal(1), "a stamp in ns and 6 numbers: gyroscope in rad/s, accelerometer in m/s²")
+    wanted = "a stamp in ns and 6 numbers: gyroscope in rad/s, accelerometer in m/s²"
+    return _rows(file, ",", 6, Decimal(1), wanted, passed)
 
 
-def read_truth(file: Path) -> Samples:
+def read_truth(file: Path, passed: PassedOver) -> Samples:
     """Reads `groundtruth.txt`: position and quaternion (x, y, z, w) (N, 7). Raises SourceError, OSError."""
     wanted = "seconds and 7 numbers: x y z qx qy qz qw"
-    truth = _rows(file, None, 7, Decimal(10) ** 9, wanted)
-    wrong = np.flatnonzero(~(np.abs(np.linalg.norm(truth.values[:, 3:], axis=1) - 1) < 1e-2))
-    if wrong.size:
-        raise SourceError(f"{file}, pose {wrong[0] + 1}: {truth.values[wrong[0], 3:].tolist()} is no unit quaternion")
-    return truth
+    truth = _rows(file, None, 7, Decimal(10) ** 9, wanted, passed)
+    right = np.abs(np.linalg.norm(truth.values[:, 3:], axis=1) - 1) < 1e-2
+    for pose in np.flatnonzero(~right):
+        passed.take(SourceError(f"{file}, pose {pose + 1}: {truth.values[pose, 3:].tolist()} is no unit quaternion"))
+    return Samples([stamp for stamp, good in zip(truth.stamps, right, strict=True) if good], truth.values[right])
 
 
 def read_noise(file: Path) -> InertialNoise:
@@ -124,10 +134,15 @@ def read_noise(file: Path) -> InertialNoise:
     return InertialNoise(*found)
 
 
-def _rows(file: Path, separator: str | None, columns: int, scale: Decimal, wanted: str) -> Samples:
+def _rows(file: Path, separator: str | None, columns: int, scale: Decimal, wanted: str, passed: PassedOver) -> Samples:
     stamps: list[int] = []
     values: list[list[float]] = []
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1):
+    refused: list[SourceError] = []
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{file} is no text in UTF-8: {error}") from None
+    for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue
         words = line.strip().split(separator)
@@ -141,9 +156,12 @@ def _rows(file: Path, separator: str | None, columns: int, scale: Decimal, wante
                 raise ValueError(f"stamp {stamp} after {stamps[-1]}")
         except (ValueError, InvalidOperation, OverflowError) as error:
             reason = "the stamp is no number" if isinstance(error, InvalidOperation) else error
-            raise SourceError(f"{file}, line {number}: {reason}; expected {wanted}, stamps increasing") from None
+            refused.append(SourceError(f"{file}, line {number}: {reason}; expected {wanted}, stamps increasing"))
+            continue
         stamps.append(stamp)
         values.append(row)
     if not stamps:
-        raise SourceError(f"{file} holds no line of {wanted}")
+        raise refused[0] if refused else SourceError(f"{file} holds no line of {wanted}")
+    for refusal in refused:
+        passed.take(refusal)
     return Samples(stamps, np.array(values))

@@ -97,3 +97,17 @@ def test_a_bag_that_is_no_mcap_is_answered_with_what_makes_one(dataflow, tmp_pat
     bag.write_bytes(b"#ROSBAG V2.0\n")
 
     assert "dataflow convert" in dataflow("cut", bag, "--to", "1", "-o", tmp_path / "a.mcap", code=2).stderr
+
+
+def test_a_folder_of_parts_is_read_as_one_recording_and_edited_after_a_merge(
+    dataflow, recorded: Recorded, tmp_path: Path
+) -> None:
+    folder = tmp_path / "parts"
+    dataflow("split", recorded[0], "--every", "100ms", "-o", folder)
+
+    assert "the same: 5 streams" in dataflow("diff", folder, recorded[0]).stdout
+    for words in (["latency"], ["logs"], ["spans", "--to", tmp_path / "s.jsonl"], ["lint", "--quick"]):
+        dataflow(words[0], folder, *words[1:])
+    told = dataflow("cut", folder, "--duration", "1s", "-o", tmp_path / "c.mcap", code=2).stderr
+    assert "dataflow merge" in told
+    assert "parts/*.mcap" in "".join(told.split())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -264,3 +265,71 @@ def test_a_compressed_file_is_opened_whatever_its_name(dataflow, tmp_path: Path)
     assert told["messages"] == 2 * COUNT
     packed.write_bytes(zstandard.compress(b"<html>moved</html>"))
     assert "a page of the web" in dataflow("info", packed, code=2).stderr
+
+
+def test_fewer_messages_than_statistics_count_fail_the_command(dataflow, tmp_path: Path) -> None:
+    path = poses(tmp_path / "a.mcap")
+
+    def promise(data: bytearray) -> None:
+        at = data.rfind(struct.pack("<HQ", 1, COUNT))
+        data[at : at + 10] = struct.pack("<HQ", 1, COUNT + 10)
+        data[-12:-8] = bytes(4)  # no checksum of the summary
+
+    changed(path, promise)
+    told = dataflow("convert", path, tmp_path / "o.mcap", "--to", "mcap", code=1).stderr
+    assert "statistics count 130 messages of /pose, 120 are there" in " ".join(told.split())
+    dataflow("cut", path, "--duration", "10ms", "-o", tmp_path / "c.mcap", code=1)
+    assert "120 are there" in " ".join(dataflow("info", path).stdout.split())
+
+
+def test_a_definition_that_is_broken_costs_its_own_topic(dataflow, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros1", library="other")
+        for name, text in (("/bad", b"garbage def {{{"), ("/good", b"string data")):
+            schema = writer.register_schema(f"std_msgs/{'Odd' if name == '/bad' else 'String'}", "ros1msg", text)
+            channel = writer.register_channel(name, "ros1", schema)
+            for k in range(3):
+                data = b"\xff\xff\xff\x7f" if k == 1 else struct.pack("<I", 2) + b"hi"
+                writer.add_message(channel, START + k * SECOND, data, START + k * SECOND, k)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+    told = json.loads(dataflow("convert", path, tmp_path / "bag", "--to", "ros2", "--json").stdout)
+
+    assert told["written"] == {"/good": 2}
+    assert "definition of std_msgs/msg/Odd is broken" in told["left_out"]["/bad"]
+    assert list(told["lost"]["/good"].values()) == [1]
+
+
+def test_a_replay_of_a_damaged_file_counts_what_is_lost_in_words_and_in_json(dataflow, tmp_path: Path) -> None:
+    path, graph = damaged_chunk(tmp_path / "a.mcap"), tmp_path / "g.yaml"
+    graph.write_text(GRAPH)
+    words = ("replay", path, "--graph", graph, "--one-process")
+
+    told = dataflow(*words, "-q", code=1).stderr
+    notes = json.loads(dataflow(*words, "--json", code=1).stdout)["notes"]
+
+    assert "topic /pose: 12 messages lost to damage" in " ".join(told.split())
+    assert any("topic /pose: 12 messages lost to damage" in note for note in notes)
+
+
+def test_files_of_a_folder_that_are_no_parts_of_one_are_not_read_as_one(dataflow, tmp_path: Path) -> None:
+    for name in ("kitchen", "street"):
+        poses(tmp_path / f"{name}.mcap")
+    assert "no parts of one (kitchen.mcap, street.mcap): name one" in " ".join(
+        dataflow("info", tmp_path, code=2).stderr.split()
+    )
+    (tmp_path / "street.mcap").rename(tmp_path / "kitchen_1.mcap")
+    (tmp_path / "kitchen.mcap").rename(tmp_path / "kitchen_0.mcap")
+    dataflow("info", tmp_path)
+
+
+def test_python_warns_of_what_a_file_lacks(tmp_path: Path) -> None:
+    graph = tmp_path / "g.yaml"
+    graph.write_text(GRAPH)
+    with pytest.warns(UserWarning, match="no proper end"), api.open(torn(tmp_path / "a.mcap")):
+        pass
+    path = damaged_chunk(tmp_path / "b.mcap")
+    with pytest.warns(UserWarning, match="does not decompress"):
+        api.replay(path, graph=graph)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from dataflow.cli.main import app
 from dataflow.interop.export import frames
-from dataflow.interop.export.datasets import export_7scenes, export_kitti, export_tum
+from dataflow.interop.export.datasets import DATASETS, export_7scenes, export_kitti, export_tum, tell_untaken
 from dataflow.interop.export.kitti_raw import export_kitti_raw
 from dataflow.interop.export.lerobot import export_lerobot
 from dataflow.interop.export.lerobot_layouts import Layout30
@@ -89,6 +89,33 @@ def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: 
     assert set(info["features"]) == set(table.column_names)
     assert info["features"]["observation.images.camera.image"]["shape"] == [12, 16, 3]
     assert done.left_out == {"said": "it holds no numbers of which each message has as many"}
+
+
+def test_what_no_frame_of_a_lerobot_dataset_takes_is_counted_as_lost_and_not_as_written(tmp_path: Path) -> None:
+    material_of = arm()
+    for k in (4, 5):  # a pause of an hour in front of them
+        moved = material_of["camera/image"][k]
+        material_of["camera/image"][k] = moved.replace(stamp=moved.stamp + 3600 * SECOND)
+    done = Exported()
+    with Material(write(tmp_path / "a.mcap", material_of)) as material:
+        export_lerobot(material, tmp_path / "set", done)
+
+    lost = {name: sum(losses.values()) for name, losses in done.lost.items()}
+    frames = done.written["camera/image"]
+    assert frames == 5  # the first image came before the first command
+    assert done.written["arm/joints"] == 4
+    assert done.written["arm/joints"] + lost["arm/joints"] == len(material_of["arm/joints"])
+    assert done.written["cmd/twist"] + lost["cmd/twist"] == len(material_of["cmd/twist"])
+    assert [number for what, number in done.lost["camera/image"].items() if "pauses" in what] == [1]
+
+
+def test_two_cameras_of_one_name_in_lerobot_are_refused_by_their_names(tmp_path: Path) -> None:
+    streams = arm()
+    path = write(
+        tmp_path / "a.mcap", {"camera/image": streams["camera/image"], "camera.image": streams["camera/image"]}
+    )
+    with Material(path) as material, pytest.raises(RecordingError, match=r"camera\.image and camera/image are both"):
+        export_lerobot(material, tmp_path / "set", Exported())
 
 
 def test_the_statistics_of_a_lerobot_dataset_are_those_of_its_columns(tmp_path: Path) -> None:
@@ -316,3 +343,34 @@ def test_frames_are_paired_without_holding_a_recording(tmp_path: Path, monkeypat
 
     assert max(held) <= 3
     assert [cv2.imread(str(tmp_path / "scenes" / f"frame-{k:06d}.color.png"))[0, 0, 0] for k in (0, 59)] == [0, 59]
+
+
+def lens(frame: str, focal: float, distortion: list[float] | None = None) -> CameraInfo:
+    K = np.array([[focal, 0, 8], [0, focal, 6], [0, 0, 1.0]])
+    model = "none" if distortion is None else "plumb_bob"
+    found = None if distortion is None else np.array(distortion)
+    return CameraInfo(stamp=START, frame=frame, width=16, height=12, K=K, distortion_model=model, distortion=found)
+
+
+def test_a_kitti_camera_gets_its_own_calibration_and_what_has_no_place_is_said(tmp_path: Path) -> None:
+    mounted = Transforms(
+        stamp=START,
+        frames=("c",),
+        child_frames=("d",),
+        translations=np.zeros((1, 3)),
+        rotations=np.array([[0, 0, 0, 1.0]]),
+    )
+    streams: dict[str, list[Message]] = {
+        "a/info": [lens("d", 100)],
+        "b/info": [lens("c", 50, [0.1, 0, 0, 0, 0])],
+        "camera/image": arm()["camera/image"],
+        "mounting": [mounted],
+    }
+    done = Exported()
+    with Material(write(tmp_path / "a.mcap", streams, static=("a/info", "b/info", "mounting"))) as material:
+        DATASETS["kitti"](material, tmp_path / "set", done)
+        tell_untaken(material, "kitti", done)
+
+    assert (tmp_path / "set/calib.txt").read_text().startswith("P0: 5.0")
+    assert done.left_out.keys() == {"a/info", "mounting"}
+    assert done.lost["b/info"] == {"the distortion of its lens (plumb_bob)": 1}

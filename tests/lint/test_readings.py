@@ -71,3 +71,12 @@ def test_readings_that_cannot_be_are_named(make: Make, told: str) -> None:
     found = [finding.text for finding in check_readings(material)]
 
     assert [told in text for text in found] == ([True] if told else [])
+
+
+def test_a_velocity_that_is_not_given_is_no_reading() -> None:
+    still = [
+        Odometry(stamp=t, frame="odom", child_frame="base", position=[0, 0, 0], orientation=[0, 0, 0, 1])
+        for t in STAMPS
+    ]
+    assert still[0].linear is None
+    assert list(check_readings(MadeMaterial({"/odom": still}))) == []

@@ -10,7 +10,7 @@ from dataflow.cli.support.arguments import (
     Json,
     ModuleFolders,
     RecordingFile,
-    existing,
+    existing_recording,
     find_modules_in,
 )
 from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
@@ -41,7 +41,7 @@ def latency(
     from dataflow.reexecution.recorded_run import recorded_graph, resolved_graph
 
     find_modules_in(folders)
-    with friendly_errors(), Recording(existing(recording, "a recording")) as opened:
+    with friendly_errors(), Recording(existing_recording(recording)) as opened:
         if not opened.firing_batches():
             raise fail(
                 f"{recording} holds no firing records, from which latencies are computed: `dataflow run --record` and "

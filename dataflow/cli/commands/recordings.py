@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.cli.support.arguments import FLAG, AnyRecording, Json, Streams, existing, existing_recording
+from dataflow.cli.support.arguments import FLAG, AnyRecording, Json, Streams, existing_recording
 from dataflow.cli.support.output import (
     DIFFERENT,
     count,
@@ -221,8 +221,8 @@ def diff(
 
     with (
         friendly_errors(),
-        Recording(existing(a, "a recording")) as first,
-        Recording(existing(b, "a recording")) as second,
+        Recording(existing_recording(a)) as first,
+        Recording(existing_recording(b)) as second,
     ):
         if tolerance is not None and not 0 <= tolerance < float("inf"):
             raise fail(f"--tolerance {tolerance:g}: expected a number, 0 or more")

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from dataflow.interop.playing import Matching
     from dataflow.interop.streams import BagStreams
     from dataflow.recording.mcap.index import McapFile
+    from dataflow.supervision.core.report import RunReport, Watch
 
 
 def replay_bag(
@@ -59,6 +60,7 @@ def replay_bag(
     from dataflow.interop.playing import match
     from dataflow.interop.streams import BagStreams
     from dataflow.recording.layout import BAG
+    from dataflow.recording.notices import notice
     from dataflow.supervision.replay import plan_replay
     from dataflow.supervision.run import replay
 
@@ -70,8 +72,15 @@ def replay_bag(
         begin, finish = window(whole, start, end, path)
         shown = None if whole is None else (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
         metadata = {BAG: opened.facts()}
-        report = execute(
-            lambda watch: replay(opened, graph=graph, start=start, end=end, watch=watch, metadata=metadata, **options),
+
+        def playing(watch: Watch | None) -> RunReport:
+            report = replay(opened, graph=graph, start=start, end=end, watch=watch, metadata=metadata, **options)
+            _say_what_was_not_read(opened, {name: held for name, (held, _) in report.streams.items()}, begin, finish)
+            notice(path, opened.account.short)
+            return report
+
+        execute(
+            playing,
             graph,
             outputs,
             shown,
@@ -86,7 +95,6 @@ def replay_bag(
             if kept and not quiet:
                 names = ", ".join(sorted(kept))
                 say(f"[dim]kept as they are: {plural(sum(kept.values()), 'message')} of {escape(names)}[/]")
-        _say_what_was_not_read(opened, {name: held for name, (held, _) in report.streams.items()}, begin, finish)
         if opened.account.short:
             raise typer.Exit(DIFFERENT)
 
@@ -101,6 +109,7 @@ def _say_what_was_not_read(
         if not played.static and delivered.get(stream, 0) < sum(1 for _ in opened.stamps(stream, begin, end))
     }
     opened.look_for_unread(missing, begin, end)
+    opened.recount()
     for topic, unread in opened.account.unread.items():
         say(f"[yellow]{escape(f'{topic}: {unread}')}[/]")
 

@@ -52,9 +52,11 @@ def opened_material(path: Path) -> Iterator[Origin]:
     from dataflow.interop.opening import is_foreign
     from dataflow.recording.mcap.ending import MAGIC
     from dataflow.recording.streams.copying import Origin
+    from dataflow.recording.streams.part_folder import parts_in
 
     if path.is_dir():
-        raise fail(f"{path} is a folder: name its .mcap file, or make one file of it: {converting(path)}")
+        made = f"dataflow merge {path}/*.mcap -o {path.name}.mcap" if parts_in(path) else converting(path)
+        raise fail(f"{path} is a folder: name its .mcap file, or make one file of it: {made}")
     existing(path, "a recording")
     with path.open("rb") as file:
         head = file.read(len(MAGIC))

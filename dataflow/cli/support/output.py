@@ -78,8 +78,9 @@ def forget_notes() -> None:
 
 def print_json(value: Any) -> None:
     """Prints one JSON document on standard output; an object also holds the notes of the files that were opened."""
-    if isinstance(value, dict) and _notes and "notes" not in value:
-        value = value | {"notes": list(_notes)}
+    if isinstance(value, dict) and _notes:
+        own = list(value.get("notes", ()))
+        value = value | {"notes": [*own, *(note for note in _notes if not any(note in text for text in own))]}
     print(json_text(value, indent=2))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from dataflow.interop.export.frames import (
     IMAGES,
     POSES,
     as_kind,
+    calibration,
+    frame_of,
     messages_as,
     optional,
     together,
@@ -31,7 +33,6 @@ from dataflow.messages import (
     Imu,
     Message,
     Pose,
-    Transforms,
 )
 from dataflow.messages.geometry import transform_matrix
 from dataflow.recording.errors import RecordingError
@@ -97,6 +98,7 @@ def export_7scenes(material: Material, folder: Path, done: Exported) -> None:
         if left := done.written.get(material.names[stream], 0) - len(stamps):
             what = "image" if stream == images else "pose"
             done.lose(material.names[stream], f"{what} of which no frame was made, left out", left)
+    done.lose(material.names[depths], "the times of frames, which their numbers stand for", count)
     done.files.append(str(folder))
     _intrinsics(material, folder, done)
 
@@ -143,11 +145,15 @@ def export_kitti(material: Material, folder: Path, done: Exported) -> None:
     if not stamps:
         raise RecordingError(f"{material.path}: no image of the one camera has the stamp of one of the other")
     write_text(folder / "times.txt", "".join(f"{(s - stamps[0]) * 1e-9:e}\n" for s in stamps), done)
-    infos = [m for name in material.of_type(CameraInfo) for m in material.messages([name])][: len(cameras)]
     lines = []
-    for k, found in enumerate(infos):
-        info = found.message
-        assert isinstance(info, CameraInfo)
+    names, frames = material.of_type(CameraInfo), [frame_of(material, camera) for camera in cameras]
+    in_order = len(set(frames)) < len(cameras) == len(names)  # a rectified pair has one frame
+    for k, camera in enumerate(cameras):
+        among = [names[k]] if in_order else names
+        info = calibration(material, frames[k], done, among=among, alone=in_order or len(cameras) == 1)
+        if info is None:
+            done.left_out[f"P{k} of calib.txt"] = f"no calibration has the frame of {material.names[camera]}"
+            continue
         P = np.hstack([info.K, np.zeros((3, 1))]) if info.P is None else info.P
         lines.append(f"P{k}: " + " ".join(f"{v:.12e}" for v in P.ravel()))
     if lines:
@@ -195,9 +201,8 @@ def _write_poses(
 
 def tell_untaken(material: Material, what: str, done: Exported) -> None:
     """Says which streams and topics a dataset has no place for."""
-    used = {name for name in material.of_type(CameraInfo, Transforms) if what not in ("euroc",)}
     for name, outside in material.names.items():
-        if name not in used and outside not in done.written and outside not in done.left_out:
+        if outside not in done.written and outside not in done.left_out:
             kind = material.streams[name].message_type
             done.left_out[outside] = f"{what} has no place for {kind.SCHEMA if kind else 'it'}"
     for topic in material.untouched:
@@ -225,16 +230,9 @@ def _matrix_text(rows: Any) -> str:
 
 def _intrinsics(material: Material, folder: Path, done: Exported) -> None:
     """The calibration of the depth camera (the one whose frame depth images have), or of the only one."""
-    infos = [m.message for name in material.of_type(CameraInfo) for m in material.messages([name])]
-    frames = {r.message.frame for name in material.of_type(*DEPTHS) for r in _some(material, name)}
-    found = [i for i in infos if isinstance(i, CameraInfo) and (i.frame in frames or len(infos) == 1)]
-    if found:
-        write_text(folder / "camera-intrinsics.txt", _matrix_text(found[0].K), done)
-    elif infos:
+    depths = material.of_type(*DEPTHS)
+    info = calibration(material, frame_of(material, depths[0]) if depths else "", done, alone=True)
+    if info is not None:
+        write_text(folder / "camera-intrinsics.txt", _matrix_text(info.K), done)
+    elif material.of_type(CameraInfo):
         done.left_out["camera-intrinsics.txt"] = "no calibration has the frame of the depth images"
-
-
-def _some(material: Material, name: str) -> Iterator[Any]:
-    """The first message of a stream."""
-    first = next(material.messages([name]), None)
-    return iter(() if first is None else (first,))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from dataflow.interop.conversions import NARROWING, convert
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import (
+    CameraInfo,
     CompressedDepth,
     CompressedImage,
     DepthImage,
@@ -36,6 +37,30 @@ POSES = (Pose, Odometry)
 def optional(material: Material, *types: type[Message]) -> str | None:
     """The one stream of some types, None where there is none; raises `RecordingError` for several."""
     return material.only("the format", *types) if material.of_type(*types) else None
+
+
+def frame_of(material: Material, stream: str) -> str:
+    """The frame of a stream's first message."""
+    first = next(material.messages([stream]), None)
+    return "" if first is None else str(getattr(first.message, "frame", ""))
+
+
+def calibration(
+    material: Material, frame: str, done: Exported, *, among: Sequence[str] | None = None, alone: bool = False
+) -> CameraInfo | None:
+    """The first calibration of a camera's frame, counted as written; what of its lens has no place is counted as lost.
+    `among`: streams of calibrations; `alone`: the only one there is will do, whatever its frame."""
+    streams = material.of_type(CameraInfo) if among is None else among
+    infos = [(name, recorded.message) for name in streams for recorded in material.messages([name])]
+    chosen = [(name, info) for name, info in infos if getattr(info, "frame", "") == frame]
+    chosen = chosen or (infos if alone and len(infos) == 1 else [])
+    for name, info in chosen[:1]:
+        assert isinstance(info, CameraInfo)
+        done.count(material.names[name])
+        if info.distortion is not None and info.distortion.any():
+            done.lose(material.names[name], f"the distortion of its lens ({info.distortion_model})")
+        return info
+    return None
 
 
 def messages_as(material: Material, stream: str | None, kind: type[Message], done: Exported) -> Iterator[Any]:

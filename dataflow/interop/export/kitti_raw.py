@@ -10,11 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
-from dataflow.interop.export.frames import IMAGES, PAIR_WITHIN, messages_as, optional, write_png, write_text
+from dataflow.interop.export.frames import (
+    IMAGES,
+    PAIR_WITHIN,
+    calibration,
+    messages_as,
+    optional,
+    write_png,
+    write_text,
+)
 from dataflow.interop.export.kitti_oxts import write_oxts
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
-from dataflow.messages import CameraInfo, Image, PointCloud, Transforms
+from dataflow.messages import Image, PointCloud, Transforms
 from dataflow.messages.geometry import invert, transform_matrix
 from dataflow.recording.errors import RecordingError
 
@@ -84,8 +92,7 @@ def _images(material: Material, camera: str, wanted: list[int], folder: Path, do
 
 def _calibration(material: Material, folder: Path, camera: str, lidar: str, done: Exported) -> None:
     """Writes calib_cam_to_cam.txt and calib_velo_to_cam.txt, as far as the recording holds calibration."""
-    infos = [m.message for name in material.of_type(CameraInfo) for m in material.messages([name])]
-    info = next((i for i in infos if isinstance(i, CameraInfo) and i.frame == camera), None)
+    info = calibration(material, camera, done)
     if info is None:
         done.left_out["calib_cam_to_cam.txt"] = f"no calibration has the frame of the images, {camera!r}"
     else:
@@ -93,7 +100,7 @@ def _calibration(material: Material, folder: Path, camera: str, lidar: str, done
         R = np.eye(3) if info.R is None else info.R
         lines = {"S_rect_02": [info.width, info.height], "R_rect_00": R.ravel(), "P_rect_02": P.ravel()}
         write_text(folder / "calib_cam_to_cam.txt", _lines(lines), done)
-    T = _between(material, lidar, camera)
+    T = _between(material, lidar, camera, done)
     if T is None:
         done.left_out["calib_velo_to_cam.txt"] = f"no transform between {lidar!r} and {camera!r}"
     else:
@@ -104,14 +111,14 @@ def _calibration(material: Material, folder: Path, camera: str, lidar: str, done
 
 def _mounting(material: Material, folder: Path, lidar: str, unit: str, done: Exported) -> None:
     """Writes calib_imu_to_velo.txt, if a transform gives it."""
-    T = _between(material, lidar, unit)
+    T = _between(material, lidar, unit, done)
     if T is None:
         done.left_out["calib_imu_to_velo.txt"] = f"no transform between {lidar!r} and {unit!r}"
     else:
         write_text(folder / "calib_imu_to_velo.txt", _lines({"R": T[:3, :3].ravel(), "T": T[:3, 3]}), done)
 
 
-def _between(material: Material, parent: str, child: str) -> np.ndarray | None:
+def _between(material: Material, parent: str, child: str, done: Exported) -> np.ndarray | None:
     """Returns T_parent_child (4, 4) from the first transform between the two frames, either way round; None without."""
     for name in material.of_type(Transforms):
         for recorded in material.messages([name]):
@@ -119,10 +126,9 @@ def _between(material: Material, parent: str, child: str) -> np.ndarray | None:
             assert isinstance(message, Transforms)
             for k, pair in enumerate(zip(message.frames, message.child_frames, strict=True)):
                 T = transform_matrix(message.translations[k], message.rotations[k])
-                if pair == (parent, child):
-                    return T
-                if pair == (child, parent):
-                    return invert(T)
+                if pair in ((parent, child), (child, parent)):
+                    done.count(material.names[name])
+                    return T if pair == (parent, child) else invert(T)
     return None
 
 

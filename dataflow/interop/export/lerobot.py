@@ -26,6 +26,7 @@ from dataflow.messages import CameraInfo, Image, Image16, Message, Transforms
 from dataflow.messages.base import ArrayField
 from dataflow.recording.errors import RecordingError
 
+UNTAKEN = "messages that no frame took, left out: a frame has the newest of each stream"
 ROWS = 64
 """Frames of a row group: their images are in memory together."""
 SAMPLED_PIXELS = 4096
@@ -107,6 +108,11 @@ def export_lerobot(
     if writer is None:
         raise RecordingError(f"{material.path}: no image of {material.names[plan.anchor]} has all others before it")
     writer.close()
+    if uneven := int((np.abs(np.diff(stamps) * (fps * 1e-9) - 1) > 0.5).sum()):
+        what = (
+            f"pauses and gaps between frames, which LeRobot has every {1 / fps:.3g} s (the column stamp has the times)"
+        )
+        done.lose(material.names[plan.anchor], what, uneven)
     done.files.append(str(path))
     dataset = _described(plan, len(stamps), fps, task or material.path.stem)
     done.files += [str(file) for file in layout.describe(folder, dataset)]
@@ -120,7 +126,12 @@ def _planned(material: Material, action: str | None, done: Exported) -> _Plan:
     acting = None if action is None else names.get(action, action)
     if acting is not None and acting not in material.streams:
         raise RecordingError(f"{material.path}: no stream {action!r} for the action; there are {', '.join(names)}")
-    images = {f"observation.images.{material.names[name].strip('/').replace('/', '.')}": name for name in cameras}
+    images: dict[str, str] = {}
+    for name in cameras:
+        key = f"observation.images.{material.names[name].strip('/').replace('/', '.')}"
+        if (other := images.setdefault(key, name)) != name:
+            both = f"{material.names[other]} and {material.names[name]}"
+            raise RecordingError(f"{material.path}: {both} are both {key} in LeRobot: leave one out with --without")
     states = []
     for name, info in material.streams.items():
         if name in cameras or name == acting:
@@ -160,19 +171,31 @@ def _frames(material: Material, plan: _Plan, done: Exported) -> Iterator[tuple[i
     newest: dict[str, Message] = {}
     now: int | None = None
 
+    untaken: set[str] = set()
+
     def is_frame() -> bool:
         return len(newest) == len(wanted) and newest[plan.anchor].stamp == now
 
+    def frame() -> dict[str, Message]:
+        for name in untaken:
+            done.count(material.names[name])
+        untaken.clear()
+        return dict(newest)
+
     for recorded in material.messages(wanted):
         if now is not None and recorded.stamp != now and is_frame():
-            yield now, dict(newest)
+            yield now, frame()
         now = recorded.stamp
+        if recorded.stream in untaken:
+            done.lose(material.names[recorded.stream], UNTAKEN)
         newest[recorded.stream] = recorded.message
+        untaken.add(recorded.stream)
         if isinstance(recorded.message, Image16):
             done.narrow(material.names[recorded.stream], "16 bits, and LeRobot's images have 8")
-        done.count(material.names[recorded.stream])
     if now is not None and is_frame():
-        yield now, dict(newest)
+        yield now, frame()
+    for name in untaken:
+        done.lose(material.names[name], UNTAKEN)
 
 
 def _batches(frames: Iterator[tuple[int, dict[str, Message]]]) -> Iterator[list[tuple[int, dict[str, Message]]]]:

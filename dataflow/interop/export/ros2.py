@@ -192,8 +192,12 @@ def _copy(
     shift = material.shift
     for stored in material.stored(list(schemas)):
         kind_of = kinds.get(stored.topic)
-        data = bytes(stored.data) if kind_of is None else kind_of.to_cdr(stored.data)
         name = called[stored.topic]
+        try:
+            data = bytes(stored.data) if kind_of is None else kind_of.to_cdr(stored.data)
+        except RecordingError as error:
+            done.lose(name, f"messages that cannot be read, left out: {error}")
+            continue
         log_time = max(stored.log_time - shift, 0)  # as it was: it all is of the recorder's clock
         writer.write(name, schemas[stored.topic], data, log_time, latched=latched[stored.topic])
         done.count(name)

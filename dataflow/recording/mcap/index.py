@@ -7,7 +7,7 @@ bytes a chunk, and where their messages lie is read as it is needed.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +29,7 @@ from dataflow.recording.mcap.message_index import LoadedIndex, MessageIndex
 from dataflow.recording.mcap.rawfile import RECORD, RawFile, Watch
 from dataflow.recording.mcap.scan import scan
 from dataflow.recording.mcap.seals import Seal, seal_of
-from dataflow.recording.mcap.summary import TAIL_BYTES, Footer, Summary, read_footer, read_summary
+from dataflow.recording.mcap.summary import TAIL_BYTES, Footer, MiscountedError, Summary, read_footer, read_summary
 from dataflow.recording.notices import notice
 
 NO_END = (
@@ -70,6 +70,7 @@ class McapFile:
         self.damage: list[str] = []
         self.unread_from: int | None = None
         self._sealed = False
+        self._promised: Mapping[int, int] = {}
         self.path = path
         self._file = RawFile(path, watch)
         try:
@@ -105,8 +106,13 @@ class McapFile:
         name = self.path.name
         behind = f"{name}: messages behind byte {self.unread_from or 0:,} of {self.nbytes:,}, if there were any"
         uncounted = f"{name}: chunks that cannot be read, and whose messages nothing counts: {self.left_out}"
+        fewer = [
+            f"{name}: its statistics count {count:,} messages of {self.channels[c].topic}, {there:,} are there"
+            for c, count in self._promised.items()
+            if c in self.channels and (there := self.index.count(c)) < count
+        ]
         found = ((self.torn, f"{name} {NO_END}"), (self.left_out, uncounted), (self.unread_from is not None, behind))
-        return [text for there, text in found if there]
+        return [*(text for there, text in found if there), *fewer]
 
     @property
     def nbytes(self) -> int:
@@ -253,6 +259,7 @@ class McapFile:
         try:
             return read_summary(self._file, footer, sealed=self._sealed)
         except DamagedError as error:
+            self._promised = error.counts if isinstance(error, MiscountedError) else {}
             self.damage.append(f"{error.what}; all of its records were read instead")
         except struct.error as error:
             self.damage.append(f"a record of its summary is too short ({error}); all of its records were read instead")

@@ -5,13 +5,14 @@ from __future__ import annotations
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, MetadataIndex, Statistics
 
+from dataflow.recording.errors import DamagedError
 from dataflow.recording.mcap.attachments import Place
 from dataflow.recording.mcap.chunk_indexes import ChunkIndexes, ChunkIndexReader
 from dataflow.recording.mcap.chunks import Column
@@ -30,6 +31,12 @@ LONG = 2**14
 LONG_BYTES = 2**24
 """Bytes of its message indexes, 16 a message, beyond which they are so too: in memory all would take half as much
 again."""
+
+
+class MiscountedError(DamagedError):
+    """A file whose statistics count other messages than its index: `counts`, by channel."""
+
+    counts: Mapping[int, int] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +195,9 @@ def _compare(contents: Contents, statistics: Statistics | None, index: MessageIn
         )
     for channel, count in statistics.channel_message_counts.items():
         if index.count(channel) != count:
-            raise contents.file.damaged(
-                f"its statistics count {count} messages of channel {channel}, its index {index.count(channel)}"
+            error = MiscountedError.of(
+                contents.file.path,
+                f"its statistics count {count} messages of channel {channel}, its index {index.count(channel)}",
             )
+            error.counts = statistics.channel_message_counts
+            raise error

@@ -62,7 +62,19 @@ def test_a_euroc_folder_without_truth_or_densities_gives_the_samples_alone(folde
 def test_a_wrong_euroc_file_is_named(folder: Path, name: str, text: str, words: str) -> None:
     (folder / name).write_text(text)
     with pytest.raises(SourceError, match=words):
-        EurocImu(path=str(folder)).setup()
+        EurocImu(path=str(folder), strict=True).setup()
+
+
+@pytest.mark.parametrize("line", ["5000100,0,0,0,0,0,0", "6000100,0,0,0", "6000100,0,0,nan,0,0,0", "soon,0,0,0,0,0,0"])
+def test_a_line_or_a_pose_that_is_none_is_passed_over_and_counted(folder: Path, line: str) -> None:
+    (folder / "imu.csv").write_text("\ufeff" + IMU + line + "\n")
+    (folder / "groundtruth.txt").write_text(TRUTH + "1.0 0 0 0 1 1 0 0\n")
+    source = EurocImu(path=str(folder))
+    played = play(source)
+
+    assert [m.stamp for m in played["imu"]] == [100, 5000100]
+    assert [m.stamp for m in played["ground_truth"]] == [100, 2500000]
+    assert source.summary() == {"passed_over": 2}
 
 
 def test_a_missing_euroc_folder_and_file_are_named(folder: Path) -> None:

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from dataflow.cli.commands.completion import running_operators
 from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph, running_graph
-from dataflow.cli.support.arguments import FLAG, existing
+from dataflow.cli.support.arguments import FLAG, existing_recording
 from dataflow.cli.support.output import INTERRUPTED, fail, friendly_errors, out, print_json_line, say
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def logs(
         if recording is not None:
             if follow or graph is not None or wait:
                 raise fail("--follow, --graph and --wait are about a running graph; leave them out for a recording")
-            lines = _recorded(existing(recording, "a recording"))
+            lines = _recorded(existing_recording(recording))
         else:
             lines = _running(name, wait, follow=follow)
         wanted = (line for line in lines if _is_wanted(line, operators, LEVELS.index(level)))

@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph
-from dataflow.cli.support.arguments import ModuleFolders, Overwrite, existing, find_modules_in, output_file
+from dataflow.cli.support.arguments import ModuleFolders, Overwrite, existing_recording, find_modules_in, output_file
 from dataflow.cli.support.output import INTERRUPTED, count, fail, friendly_errors, say
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def _export(recording: Path, write: Callable[[str], int], to: str) -> None:
     from dataflow.reexecution.recorded_run import recorded_graph, resolved_graph
 
     sent = lost = 0
-    with Recording(existing(recording, "a recording")) as opened:
+    with Recording(existing_recording(recording)) as opened:
         if not opened.firing_batches():
             raise fail(
                 f"{recording} holds no firing records, which become spans: `dataflow run --record` and replays keep "
