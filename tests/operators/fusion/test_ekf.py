@@ -109,8 +109,9 @@ def test_a_clock_that_is_off_is_made_up_for_by_the_offset() -> None:
     for offset in (0.0, 0.2):
         sensors = {"robot/fix": {"offset": offset}}
         _, played = fused({"robot/imu": robot.imu, "robot/fix": shifted}, sensors=sensors, **HEADING)
-        found.append(errors(robot, played)[0][-100:].mean())
-    assert found[1] < 0.06 < found[0]
+        found.append(errors(robot, played)[0])
+    assert max(one[-100:].mean() for one in found) < 0.06  # in the end, without being told as well
+    assert found[1].max() < 0.5 * found[0].max()
 
 
 def test_wheels_hold_a_robot_that_stands() -> None:
