@@ -151,10 +151,16 @@ def own_name(keys: Path) -> str | None:
     return (keys / _NAME).read_text() if (keys / _NAME).is_file() else None
 
 
+def holder(keys: Path) -> str | None:
+    """Returns the machine that keys were made for, or `TOOLS`; None of keys of before this was noted."""
+    path = keys / _MACHINE
+    return path.read_text() if path.is_file() else None
+
+
 def require_machine(keys: Path, name: str) -> None:
     """Raises `KeysError` where keys are those of another machine than `name`, or of tools."""
-    path = keys / _MACHINE  # which keys of before do not have
-    if path.is_file() and (found := path.read_text()) != name:
+    found = holder(keys)
+    if found is not None and found != name:
         whose = "tools, which join no run" if found == TOOLS else f"machine {found!r}"
         raise KeysError(
             f"{keys} holds the keys of {whose}, not those of {name!r}: `dataflow keys add {name}` makes them"

@@ -189,3 +189,12 @@ def test_an_operator_that_hangs_and_a_source_that_is_silent_are_named(
 
     graph = load_text(CHAIN)
     assert list(silent(graph, [status], running=100.0, over=2.0)) == named
+
+
+@pytest.mark.parametrize(("seconds", "named"), [(5.0, []), (14.0, ["detector: has been at its first call for 14.0 s"])])
+def test_an_operator_that_hangs_in_its_first_call_is_named(seconds: float, named: list[str]) -> None:
+    counts = {"camera": [1000, 0, 0, 0, NEVER, 0]}
+    silences = {"camera": 0.1, "detector": seconds}
+    status = ProcessStatus("eyes", counts, dict.fromkeys(counts, 0), frozenset(), silences=silences)
+
+    assert list(silent(load_text(CHAIN), [status], running=100.0, over=2.0)) == named

@@ -315,7 +315,7 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
     assert found["pub"].returncode == 0, found["pub"]
     assert json.loads(found["health"].stdout)["reasons"] == [], found["health"]
     assert json.loads(found["reload"].stdout)["operator"] == "there", found["reload"]
-    assert "there is not reloaded" in found["refused"].stderr
+    assert "there is not reloaded: these are keys of tools" in found["refused"].stderr
     assert found["set"].returncode == 0, found["set"]
     assert found["record"].returncode == 0, found["record"]
     assert found["stranger"].returncode != 0
