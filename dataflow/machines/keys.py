@@ -8,9 +8,11 @@ it.
 from __future__ import annotations
 
 import contextlib
+import errno
 import ipaddress
 import os
 import re
+import socket
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -174,6 +176,24 @@ def require_serving(keys: Path) -> None:
             f"{keys} holds keys that cannot serve: those of the machine that runs the graph are made with "
             "`dataflow keys add NAME --serves ADDRESS`"
         )
+
+
+def require_address(endpoint: str) -> None:
+    """Raises `KeysError` for a tls/ endpoint at which this machine cannot listen, with the reason."""
+    address, colon, port = endpoint.removeprefix("tls/").rpartition(":")
+    if not (colon and address and port.isdecimal() and int(port) < 1 << 16):
+        raise KeysError(f"{endpoint}: expected tls/<address>:<port>")
+    try:
+        found = socket.getaddrinfo(address.strip("[]"), int(port), type=socket.SOCK_STREAM)
+        with socket.create_server(found[0][4][:2], family=found[0][0]):
+            pass
+    except OSError as error:
+        reasons = {
+            errno.EADDRINUSE: f"port {port} is taken: does another run listen there?",
+            errno.EADDRNOTAVAIL: f"{address} is no address of this machine",
+        }
+        why = reasons.get(error.errno or 0, error.strerror or str(error))
+        raise KeysError(f"cannot listen at {endpoint}: {why}") from error
 
 
 def access(machines: Iterable[str], namespace: str, own: str | None = None) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from dataflow.machines.keys import (
     KeysError,
     issue,
     new_authority,
+    require_address,
     require_machine,
     require_serving,
     settings,
@@ -222,6 +223,19 @@ def test_keys_are_taken_by_whom_they_were_made_for_alone(keys: Path, tmp_path: P
 def test_an_address_with_a_port_is_refused(keys: Path, tmp_path: Path, address: str) -> None:
     with pytest.raises(KeysError, match=r"expected an address or host name, without a port"):
         issue(keys / "authority", tmp_path / "arm", "arm", serves=["192.168.1.3", address])
+
+
+def test_an_endpoint_at_which_this_machine_cannot_listen_is_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = f"tls/127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(KeysError, match=r"port \d+ is taken: does another run listen there\?"):
+            require_address(taken)
+    require_address(taken)
+    with pytest.raises(KeysError, match=r"192\.0\.2\.7 is no address of this machine"):
+        require_address("tls/192.0.2.7:7447")
+    for wrong in ("tls/127.0.0.1", "tls/:7447", "tls/127.0.0.1:port", "tls/127.0.0.1:70000"):
+        with pytest.raises(KeysError, match=f"{wrong}: expected tls/<address>:<port>"):
+            require_address(wrong)
 
 
 def test_keys_that_could_not_be_made_leave_nothing_in_the_way(keys: Path, tmp_path: Path) -> None:

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from dataflow.machines.files import FilesError
 from dataflow.machines.pipe import Clocks
 from dataflow.supervision import agent
 from dataflow.supervision.agent import Stay
+
+
+def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace())
+    (tmp_path / "models").write_text("a file where a folder would be")
+    stay = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "none")  # type: ignore[arg-type]
+    piece = {"path": "models/net.bin", "at": 0, "data": b"x", "last": True, "digest": ""}
+    with pytest.raises(FilesError, match=r"'models/net\.bin' cannot be written into /.*: File exists"):
+        stay._take_piece(piece)
 
 
 class Children:
