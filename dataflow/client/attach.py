@@ -14,7 +14,7 @@ import msgpack
 import zenoh
 
 from dataflow.graph.model import Graph
-from dataflow.machines.keys import GRAPH_KEY, OVER_KEY, tool_settings
+from dataflow.machines.keys import GRAPH_KEY, OVER_KEY, TOOLS, holder, tool_settings
 from dataflow.messages.base import message_type
 from dataflow.messages.declaration import known_type
 from dataflow.transport import Bus, BusError, NetworkConfig, TapClient, TapWindow
@@ -42,14 +42,14 @@ class Elsewhere:
     """An endpoint of another machine, which is asked over one connection as long as a tool runs."""
 
     def __init__(self, endpoint: str, keys: Path | None) -> None:
-        self.endpoint, self._keys = endpoint, keys
+        self.endpoint, self.keys = endpoint, keys
         self._over: set[float] = set()
         """When the runs were started that have ended since."""
         self._heard_at = 0.0
 
     @cached_property
     def _settings(self) -> dict[str, Any]:
-        return tool_settings(self._keys, self.endpoint)
+        return tool_settings(self.keys, self.endpoint)
 
     @cached_property
     def _bus(self) -> Bus:
@@ -92,6 +92,12 @@ class Elsewhere:
 
 
 _elsewhere: ContextVar[Elsewhere | None] = ContextVar("elsewhere", default=None)
+
+
+def with_keys_of_tools() -> bool:
+    """Returns whether graphs are looked for on another machine, with keys that load no code there."""
+    place = _elsewhere.get()
+    return place is not None and place.keys is not None and holder(place.keys) == TOOLS
 
 
 @contextlib.contextmanager

@@ -30,7 +30,7 @@ FAMILIES: Mapping[str, tuple[str, str]] = {
     "dataflow_call_seconds_total": ("counter", "Wall time of the operator's calls."),
     "dataflow_restarts_total": ("counter", "Restarts of the operator."),
     "dataflow_event_time_seconds": ("gauge", "The stamp up to which the operator is done."),
-    "dataflow_silence_seconds": ("gauge", "How long the operator has not fired."),
+    "dataflow_silence_seconds": ("gauge", "How long the operator has not fired, or is at its first call."),
     "dataflow_behind_clock_seconds": ("gauge", "How far a source that could wait is behind the clock."),
     "dataflow_disk_free_bytes": ("gauge", "Free space where the folder lies."),
 }

@@ -40,7 +40,8 @@ class ProcessStatus:
     `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
     (input, "timeout" or "late"). `behind`: per source the seconds by which its last message was behind the clock when
     it was read, and when it was sent. `firings`: batches of firing records, where they were asked for. `found`: what
-    operators found wrong with what they were given. `silences`: the seconds since operators last fired. `after`:
+    operators found wrong with what they were given. `silences`: the seconds since operators last fired, or began
+    their first call. `after`:
     firings behind a cursor (`RecentFirings.after`).
     """
 

@@ -276,7 +276,8 @@ class LiveRunner(OperatorRunner):
         stamp = max(self.done, NEVER + 1)
         try:
             state = None if failed else self.calls.snapshot((self.records.incarnation, stamp))
-            code = Replaced(self.node, self._code)
+            with interrupted_after(SET_UP_WITHIN):
+                code = Replaced(self.node, self._code)
         except (OperatorFailure, OperatorImportError) as error:
             raise ReloadError(str(error)) from error
         try:
@@ -297,11 +298,12 @@ class LiveRunner(OperatorRunner):
             self.records.add("restore", stamp, started, detail={"state": shown, "before": stamp})
         self.wake()
         seconds, warning = time.monotonic() - began, ""
+        changed = code.now.digests != code.before.digests
         try:
             code.store_before()
         except OSError as error:
             warning = f"the code before could not be stored, so verify will not have it: {error}"
-        return {"seconds": seconds, "state": kept, "warning": warning}
+        return {"seconds": seconds, "state": kept, "changed": changed, "warning": warning}
 
     def _set_up(self, made: type[Operator], state: bytes | None, stamp: int) -> tuple[int, Calls, str]:
         """An operator in the place of this one, as re-execution makes it, with its state if that fits. Returns when its

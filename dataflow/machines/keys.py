@@ -8,9 +8,11 @@ it.
 from __future__ import annotations
 
 import contextlib
+import errno
 import ipaddress
 import os
 import re
+import socket
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -151,10 +153,16 @@ def own_name(keys: Path) -> str | None:
     return (keys / _NAME).read_text() if (keys / _NAME).is_file() else None
 
 
+def holder(keys: Path) -> str | None:
+    """Returns the machine that keys were made for, or `TOOLS`; None of keys of before this was noted."""
+    path = keys / _MACHINE
+    return path.read_text() if path.is_file() else None
+
+
 def require_machine(keys: Path, name: str) -> None:
     """Raises `KeysError` where keys are those of another machine than `name`, or of tools."""
-    path = keys / _MACHINE  # which keys of before do not have
-    if path.is_file() and (found := path.read_text()) != name:
+    found = holder(keys)
+    if found is not None and found != name:
         whose = "tools, which join no run" if found == TOOLS else f"machine {found!r}"
         raise KeysError(
             f"{keys} holds the keys of {whose}, not those of {name!r}: `dataflow keys add {name}` makes them"
@@ -168,6 +176,24 @@ def require_serving(keys: Path) -> None:
             f"{keys} holds keys that cannot serve: those of the machine that runs the graph are made with "
             "`dataflow keys add NAME --serves ADDRESS`"
         )
+
+
+def require_address(endpoint: str) -> None:
+    """Raises `KeysError` for a tls/ endpoint at which this machine cannot listen, with the reason."""
+    address, colon, port = endpoint.removeprefix("tls/").rpartition(":")
+    if not (colon and address and port.isdecimal() and int(port) < 1 << 16):
+        raise KeysError(f"{endpoint}: expected tls/<address>:<port>")
+    try:
+        found = socket.getaddrinfo(address.strip("[]"), int(port), type=socket.SOCK_STREAM)
+        with socket.create_server(found[0][4][:2], family=found[0][0]):
+            pass
+    except OSError as error:
+        reasons = {
+            errno.EADDRINUSE: f"port {port} is taken: does another run listen there?",
+            errno.EADDRNOTAVAIL: f"{address} is no address of this machine",
+        }
+        why = reasons.get(error.errno or 0, error.strerror or str(error))
+        raise KeysError(f"cannot listen at {endpoint}: {why}") from error
 
 
 def access(machines: Iterable[str], namespace: str, own: str | None = None) -> dict[str, Any]:

@@ -105,9 +105,11 @@ class Progress:
         self.found[operator] = text
 
     def silences(self) -> dict[str, float]:
-        """Returns the seconds since operators last fired, as far as was reported; on any thread."""
+        """Returns the seconds since operators last fired, as far as was reported, or began their first call; on any
+        thread."""
         now = self._clock()
-        return {name: now - fired for name, fired in self._fired_at.copy().items()}
+        at_first = {r.node.name: since for r in self._driver.operators if (since := r.working_since) is not None}
+        return {name: max(0.0, now - since) for name, since in (at_first | self._fired_at.copy()).items()}
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""

@@ -11,6 +11,10 @@ from dataflow.ros.wire import absolute
 
 TOPIC = r"^~?/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$"
 """Names that ROS takes."""
+NAMESPACE = r"^/?([A-Za-z_]\w*(/[A-Za-z_]\w*)*)?$"
+NODE = r"^([A-Za-z_]\w*)?$"
+ENDPOINT = r"^[a-z][a-z0-9_-]*/.+$"
+"""Such as tcp/localhost:7447."""
 TYPE = r"^(|[A-Za-z]\w*/msg/[A-Za-z]\w*)$"
 
 
@@ -20,9 +24,9 @@ class Place:
     topic: str = Param(pattern=TOPIC, doc="name of the topic; without a leading slash, it lies in the namespace")
     distro: Distro = Param("jazzy", doc="distribution whose definition of the type counts, where that is given")
     domain: int = Param(0, ge=0, doc="ROS_DOMAIN_ID")
-    namespace: str = Param("/", doc="namespace of the node")
-    node: str = Param("", doc="name of the node; none takes dataflow and the topic")
-    router: str = Param(ROUTER, min_length=1, doc="Zenoh endpoint of the router to connect to")
+    namespace: str = Param("/", pattern=NAMESPACE, doc="namespace of the node")
+    node: str = Param("", pattern=NODE, doc="name of the node; none takes dataflow and the topic")
+    router: str = Param(ROUTER, pattern=ENDPOINT, doc="Zenoh endpoint of the router to connect to")
     zenoh: dict[str, Any] = Param({}, doc="further Zenoh settings by path, such as of TLS")
     reliability: Literal["reliable", "best_effort"] = Param("reliable", doc="quality of service")
     durability: Literal["volatile", "transient_local"] = Param(

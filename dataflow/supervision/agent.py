@@ -301,12 +301,17 @@ class Stay:
     def _take_piece(self, fields: Mapping[str, Any]) -> None:
         """Writes a piece of a file beside its place, and puts it there when it is whole and right."""
         path = files.inside(self._agent.folder, fields["path"])
-        path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(path.name + ".part")
         if fields["at"] + len(fields["data"]) > files.MOST_SENT:
             raise files.FilesError(f"file {fields['path']!r} has more than {files.MOST_SENT / 1e9:.1f} GB")
-        with part.open("ab" if fields["at"] else "wb") as file:
-            file.write(fields["data"])
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with part.open("ab" if fields["at"] else "wb") as file:
+                file.write(fields["data"])
+        except OSError as error:
+            raise files.FilesError(
+                f"file {fields['path']!r} cannot be written into {self._agent.folder}: {error.strerror}"
+            ) from error
         self._say("", "took")
         if not fields["last"]:
             return

@@ -68,7 +68,9 @@ def on_ray(
 
     Recordings must be where every machine of the cluster finds them: a shared folder, or a URL. Raises `SweepError`.
     """
-    import ray  # of the extra `sweep`
+    if not tasks:  # a cluster takes seconds to begin
+        return
+    import ray  # of the extra `ray`
 
     here = address == "local"
     where: dict[str, Any] = {"num_cpus": jobs, "include_dashboard": False} if here else {}

@@ -28,6 +28,7 @@ from operators.calibration.camera import BLURRED, MODELS, Fitted, Model, differe
 from operators.calibration.recorded import (
     Along,
     Seen,
+    images_looked_at,
     images_of,
     intrinsics_of,
     look,
@@ -67,12 +68,14 @@ Marker = Annotated[float | None, typer.Option("--marker", metavar="METRES", help
 Dictionary = Annotated[str, typer.Option("--dictionary", metavar="NAME", help="OpenCV's name of its set of markers.")]
 Lens = Annotated[str, typer.Option("--model", metavar="MODEL", help=f"{', '.join(MODELS)} (fisheye).")]
 Every = Annotated[
-    float, typer.Option("--every", metavar="SECONDS", min=0, help="Look at one image in so long; 0 at all.")
+    float, typer.Option("--every", metavar="SECONDS", min=0, help="Look at one image in so long; 0 looks at all.")
 ]
 Out = Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Folder of the files that are written.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the outcome as JSON.")]
 FOLDER = Path("out/calibration")
+LARGEST = 1.0
+"""Metres of a square; longer ones are millimetres, or centimetres."""
 
 
 @calibrate.command()
@@ -233,6 +236,8 @@ def _board(
     *, upright: bool = False,
 ) -> Board:  # fmt: skip
     """The board of the options; `upright`: it must not look the same upside down. Raises ValueError."""
+    if square > LARGEST:
+        raise ValueError(f"squares of {square:g} m: --square is in metres; 25 mm are 0.025")
     if (chessboard is None) == (charuco is None):
         raise ValueError("one of --chessboard NxM (inner corners) and --charuco NxM (squares) names the board")
     if charuco is not None:
@@ -315,7 +320,8 @@ def _camera_words(seen: Seen, fitted: Fitted) -> list[str]:
     away, odd = fitted.distances, f", {fitted.left_out} odd ones left out" if fitted.left_out else ""
     bent = info.distortion.tolist() if info.distortion is not None else []
     return [
-        f"{seen.name}: {len(fitted.views)} views, of {len(seen.views)} with the board in {seen.looked} images{odd}; "
+        f"{seen.name}: {len(fitted.views)} views, of {len(seen.views)} with the board in "
+        f"{images_looked_at(seen.looked, seen.there)}{odd}; "
         f"residual {fitted.rms:.3f} px, worst view {fitted.errors.max():.3f} px",
         f"  focal lengths {info.fx:.2f}{about[0]}, {info.fy:.2f}{about[1]} px",
         f"  principal point {info.cx:.2f}{about[2]}, {info.cy:.2f}{about[3]} px",
@@ -337,6 +343,7 @@ def _camera_json(seen: Seen, fitted: Fitted) -> dict[str, Any]:
         "distortion": [] if info.distortion is None else info.distortion.tolist(),
         "deviations": None if fitted.deviations is None else fitted.deviations.tolist(),
         "images": seen.looked,
+        "images_there": seen.there,
         "with_board": len(seen.views),
         "blurred": seen.blurred,
         "views": [

@@ -25,7 +25,7 @@ Along = Callable[[list[int], str], Iterable[int]]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Seen:
-    """The images of a stream, `looked` of them, of `size` (width, height), and their `views` of a board."""
+    """The images of a stream, of `size` (width, height), `looked` of all `there`, and their `views` of a board."""
 
     name: str
     frame: str
@@ -33,6 +33,7 @@ class Seen:
     size: tuple[int, int]
     looked: int
     views: tuple[View, ...]
+    there: int = 0
 
     @property
     def blurred(self) -> int:
@@ -45,8 +46,8 @@ class Seen:
             return fit_camera(self.board, different(self.views, self.size[0]), self.frame, self.size, model)
         except ValueError as error:
             raise ValueError(
-                f"{self.name}: {error} (a board in {len(self.views)} of {self.looked} images, {self.blurred} blurred, "
-                "the others alike)"
+                f"{self.name}: {error} (a board in {len(self.views)} of {images_looked_at(self.looked, self.there)}, "
+                f"{self.blurred} blurred, the others alike)"
             ) from error
 
     def covered(self, fitted: Fitted) -> NDArray[np.int32]:
@@ -63,6 +64,12 @@ class Seen:
         if lacking := coverage.unseen_parts(self.covered(fitted)):
             found.append(f"hardly any board was in these parts of the image: {', '.join(lacking)}")
         return found
+
+
+def images_looked_at(looked: int, there: int) -> str:
+    """Returns their number in words, with that of all where some were passed by."""
+    passed = f" of {there} (--every 0 looks at all)" if looked < there else ""
+    return f"{looked} image{'s' * (looked != 1)}{passed}"
 
 
 def spaced(stamps: NDArray[np.int64], every: float) -> list[int]:
@@ -108,8 +115,10 @@ def look(board: Board, stream: RecordedStream, places: list[int], along: Along) 
     if not looked:
         raise ValueError(f"{name} has no image that can be read")
     if not views:
-        raise ValueError(f"{name}: no board in {looked} images: are its counts right ({board})?")
-    return Seen(name, frame, board, size, looked, tuple(views))
+        raise ValueError(
+            f"{name}: no board in {images_looked_at(looked, len(stream))}: are its counts right ({board})?"
+        )
+    return Seen(name, frame, board, size, looked, tuple(views), len(stream))
 
 
 def own_frames(left: Seen, right: Seen) -> tuple[Seen, Seen]:

@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from dataflow.cli.commands.following.health import silent
-from dataflow.cli.support.board import Board, Sample, heading, line, shown
-from dataflow.client.processes import ProcessStatus
+from dataflow.cli.support.board import Board, Sample, heading, line, machine_line, shown
+from dataflow.client.processes import MachineStatus, ProcessStatus
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph
 from dataflow.sync import NEVER
@@ -189,3 +189,19 @@ def test_an_operator_that_hangs_and_a_source_that_is_silent_are_named(
 
     graph = load_text(CHAIN)
     assert list(silent(graph, [status], running=100.0, over=2.0)) == named
+
+
+@pytest.mark.parametrize(("seconds", "named"), [(5.0, []), (14.0, ["detector: has been at its first call for 14.0 s"])])
+def test_an_operator_that_hangs_in_its_first_call_is_named(seconds: float, named: list[str]) -> None:
+    counts = {"camera": [1000, 0, 0, 0, NEVER, 0]}
+    silences = {"camera": 0.1, "detector": seconds}
+    status = ProcessStatus("eyes", counts, dict.fromkeys(counts, 0), frozenset(), silences=silences)
+
+    assert list(silent(load_text(CHAIN), [status], running=100.0, over=2.0)) == named
+
+
+def test_a_clock_of_another_machine_that_was_not_measured_has_no_figure() -> None:
+    assert machine_line("robot", MachineStatus(False, 0, 0, 0)) == "machine robot: link down, clock not measured yet"
+    assert machine_line("robot", MachineStatus(True, 1_250_000, 600_000, 2)) == (
+        "machine robot: link up, clock +1.250 ms ± 0.300 ms, 2 messages dropped"
+    )

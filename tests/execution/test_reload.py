@@ -146,6 +146,7 @@ def _fire(runner: LiveRunner, stamp: int) -> None:
             "its inputs are declared otherwise now",
         ),
         ("sum_to_reload", CODE + "\n    def setup(self):\n        1 / 0\n", "ZeroDivisionError"),
+        ("sum_to_reload", CODE + "\nwhile True: pass\n", r"not over within 0\.05 s"),
         ("sum_to_reload", CODE + "\n    def setup(self):\n        while True: pass\n", r"not over within 0\.05 s"),
     ],
 )
@@ -170,6 +171,13 @@ def test_code_that_does_not_fit_is_refused_and_the_old_one_goes_on(
     assert collector.kinds() == ["setup", "fire", "fire"]
     assert {name: sys.modules[name] for name in MODULES} == modules
     assert not store().exists()
+
+
+def test_a_reload_says_whether_the_code_has_changed(folder: Path, running: tuple[LiveRunner, Collector]) -> None:
+    runner, _ = running
+    assert not runner.reload()["changed"]
+    (folder / "step_of_reload.py").write_text("STEP = 20\n")
+    assert runner.reload()["changed"]
 
 
 def test_a_module_that_declares_messages_is_not_imported_again(

@@ -27,6 +27,7 @@ from dataflow.machines.keys import (
     KeysError,
     issue,
     new_authority,
+    require_address,
     require_machine,
     require_serving,
     settings,
@@ -224,6 +225,19 @@ def test_an_address_with_a_port_is_refused(keys: Path, tmp_path: Path, address: 
         issue(keys / "authority", tmp_path / "arm", "arm", serves=["192.168.1.3", address])
 
 
+def test_an_endpoint_at_which_this_machine_cannot_listen_is_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = f"tls/127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(KeysError, match=r"port \d+ is taken: does another run listen there\?"):
+            require_address(taken)
+    require_address(taken)
+    with pytest.raises(KeysError, match=r"192\.0\.2\.7 is no address of this machine"):
+        require_address("tls/192.0.2.7:7447")
+    for wrong in ("tls/127.0.0.1", "tls/:7447", "tls/127.0.0.1:port", "tls/127.0.0.1:70000"):
+        with pytest.raises(KeysError, match=f"{wrong}: expected tls/<address>:<port>"):
+            require_address(wrong)
+
+
 def test_keys_that_could_not_be_made_leave_nothing_in_the_way(keys: Path, tmp_path: Path) -> None:
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "authority.key").write_text("no key")
@@ -315,7 +329,7 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
     assert found["pub"].returncode == 0, found["pub"]
     assert json.loads(found["health"].stdout)["reasons"] == [], found["health"]
     assert json.loads(found["reload"].stdout)["operator"] == "there", found["reload"]
-    assert "there is not reloaded" in found["refused"].stderr
+    assert "there is not reloaded: these are keys of tools" in found["refused"].stderr
     assert found["set"].returncode == 0, found["set"]
     assert found["record"].returncode == 0, found["record"]
     assert found["stranger"].returncode != 0

@@ -21,6 +21,7 @@ class Reporting:
         node = SimpleNamespace(name="last")
         self.operator = SimpleNamespace(
             node=node, done=0, firings=0, drops={}, timeouts={}, late={}, ports=ports, work=Work(),
+            working_since=None,
             operator=SimpleNamespace(finding=lambda: f"{self.operator.done} things lie askew"),
         )  # fmt: skip
         self.channel, self.now = RecordedChannel(), 0.0
@@ -126,3 +127,10 @@ def test_the_time_since_the_last_firing_is_known_while_a_call_does_not_end() -> 
     one.now += 7.5
 
     assert one.progress.silences() == {"last": 7.5}
+
+
+def test_an_operator_at_its_first_call_is_silent_since_that_began() -> None:
+    one = Reporting()
+    one.now, one.operator.working_since = 9.0, 2.0
+
+    assert one.progress.silences() == {"last": 7.0}

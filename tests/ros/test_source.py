@@ -26,6 +26,28 @@ def test_a_type_is_named_as_ros_2_does(type_: str) -> None:
         load_text(GRAPH % ("/imu", type_))
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("namespace", "my ns/*"),
+        ("namespace", "/robot/"),
+        ("node", "no de"),
+        ("node", "a/b"),
+        ("router", "127.0.0.1:7447"),
+        ("router", ""),
+    ],
+)
+@pytest.mark.parametrize("use", ["Imu", "Ros2Sink"])
+def test_names_and_endpoints_that_cannot_be_are_faults_of_the_graph(name: str, value: str, use: str) -> None:
+    source = "from: {use: 'dataflow.ros:Imu', params: {topic: /a}}"
+    inputs = ", inputs: {message: from/message}" if use == "Ros2Sink" else ""
+    operators = f"  {source}\n  at: {{use: 'dataflow.ros:{use}'{inputs}, params: {{topic: /b, {name}: '%s'}}}}\n"
+    text = f"graph: ros\nnamespace: test\noperators:\n{operators}"
+    with pytest.raises(GraphError, match=name):
+        load_text(text % value)
+    load_text(text % {"namespace": "/robot_1/arm", "node": "eyes", "router": "tls/[::1]:7447"}[name])
+
+
 def test_what_ros_takes_is_taken() -> None:
     for topic in ("imu", "/imu", "/robot/imu_1/data", "~/imu"):
         load_text(GRAPH % (topic, "sensor_msgs/msg/Imu"))

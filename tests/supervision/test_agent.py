@@ -13,11 +13,21 @@ from typing import Any
 import pytest
 
 from dataflow.machines import files
+from dataflow.machines.files import FilesError
 from dataflow.machines.pipe import Clocks
 from dataflow.records.black_box import Reached, Remains
 from dataflow.supervision import agent
 from dataflow.supervision.agent import Stay
 from dataflow.supervision.core import events
+
+
+def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace())
+    (tmp_path / "models").write_text("a file where a folder would be")
+    stay = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "none")  # type: ignore[arg-type]
+    piece = {"path": "models/net.bin", "at": 0, "data": b"x", "last": True, "digest": ""}
+    with pytest.raises(FilesError, match=r"'models/net\.bin' cannot be written into /.*: File exists"):
+        stay._take_piece(piece)
 
 
 class Children:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import RecordingWriter
 from dataflow.sweep import run
+from dataflow.sweep.run import on_ray
 from dataflow.sweep.table import Store
 from dataflow.sweep.work import Result
 
@@ -76,3 +78,8 @@ def test_none_begins_where_results_are_known_and_nothing_may_be_left(recordings:
     assert len(Begun.all) == 2
     assert sweep(recordings, tmp_path / "out", again=True).left
     assert len(Begun.all) == 4
+
+
+def test_no_cluster_is_begun_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert list(on_ray([], "local", 1, 60.0, {})) == []

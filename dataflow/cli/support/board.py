@@ -174,9 +174,10 @@ def shown(sample: Sample, found: RunningGraph) -> RenderableType:
 
 
 def machine_line(name: str, state: MachineStatus) -> str:
-    """Returns such as "machine robot: link up, clock +1.250 ms ± 0.300 ms"."""
+    """Returns such as "machine robot: link up, clock +1.250 ms ± 0.300 ms"; no measurement takes no time."""
     dropped = f", {state.dropped} messages dropped" if state.dropped else ""
-    clock = f"clock {state.offset / 1e6:+.3f} ms ± {state.delay / 2e6:.3f} ms"
+    measured = f"{state.offset / 1e6:+.3f} ms ± {state.delay / 2e6:.3f} ms"
+    clock = f"clock {measured if state.delay else 'not measured yet'}"
     return f"machine {name}: link {'up' if state.up else 'down'}, {clock}{dropped}"
 
 

@@ -89,7 +89,7 @@ def test_a_camera_is_found_and_its_file_is_taken_by_a_source(pair: Path, tmp_pat
 def test_words_name_residuals_coverage_and_poor_data(pair: Path, tmp_path: Path) -> None:
     out = run(f"camera {pair} {CHARUCO} --image left --every 0.7 --out {tmp_path}")
 
-    assert "cameras/left: 4 views, of 4 with the board in 4 images; residual 0." in out
+    assert "cameras/left: 4 views, of 4 with the board in 4 images of 10 (--every 0 looks at all); residual 0." in out
     assert "px boards" not in out
     assert "boards were in" in out
     assert "warning: 4 views are few" in out
@@ -223,7 +223,11 @@ def test_a_camera_beside_an_imu_is_found(tmp_path: Path) -> None:
             "camera PAIR --square 0.03 --chessboard 9x6 --image left --model fish",
             "no lens model 'fish'; there are plumb",
         ),
-        ("camera PAIR --square 0.03 --charuco 8x6 --marker 0.02 --image left --every 2", "no board in 2 images"),
+        (
+            "camera PAIR --square 0.03 --charuco 8x6 --marker 0.02 --image left --every 2",
+            "no board in 2 images of 10 (--every 0 looks at all)",
+        ),
+        ("camera PAIR --square 25 --chessboard 9x6", "squares of 25 m: --square is in metres; 25 mm are 0.025"),
         ("stereo PAIR --square 0.03 --chessboard 8x6", "looks the same upside down"),
         ("camera-imu PAIR --square 0.03 --chessboard 9x6 --image left", "0 streams of samples of an IMU (none)"),
         ("camera nowhere.mcap --square 0.03 --chessboard 9x6", "no recording nowhere.mcap"),

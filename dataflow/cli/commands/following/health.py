@@ -34,6 +34,8 @@ ANSWER_WITHIN = 1.0
 CONNECT_WITHIN = 3.0
 PERIODS = 5
 """Usual periods of an operator after which it counts as silent."""
+FIRST_CALL = 10.0
+"""Seconds of an operator's first call, which may load a network, after which it counts as silent."""
 PORT = 9464
 HERE = Path()
 
@@ -62,8 +64,9 @@ def health(
     """Check whether a running graph does its work: for a watchdog, a container's health check, a cron job.
 
     It does not where the process of an operator gives no answer, an operator was restarted meanwhile, no operator
-    fires, one has not fired for five of its usual periods (and `--over`), drops more than `--losses` of its messages
-    or is slower than its `--rate`, or the disk has less than `--free` left. Each reason is a line.
+    fires, one has not fired for five of its usual periods (and `--over`), is at its first call for 10 s, drops more
+    than `--losses` of its messages or is slower than its `--rate`, or the disk has less than `--free` left. Each reason
+    is a line.
 
     Exit codes: 0 healthy; 1 not; 2 no such graph runs.
 
@@ -122,19 +125,25 @@ def faults(before: Sequence[Row], now: Sequence[Row], *, least: Mapping[str, flo
 
 
 def silent(graph: Graph, statuses: Sequence[ProcessStatus], running: float, over: float) -> Iterator[str]:
-    """Yields the operators that have not fired for `over` seconds and five of their usual periods, but those of which
-    an operator in front is silent, too. `running`: seconds since the run began."""
+    """Yields the operators that have not fired for `over` seconds and five of their usual periods, or are at their
+    first call for `FIRST_CALL`, but those of which an operator in front is silent, too.
+
+    `running`: seconds since the run began.
+    """
     from dataflow.graph.reach import upstream
 
     quiet: dict[str, tuple[float, float]] = {}
     for status in statuses:
         for name, silence in status.silences.items():
-            period = running / max(status.counts[name][0], 1)
-            if name in graph.nodes and name not in status.ended and silence > max(over, PERIODS * period):
+            firings = status.counts[name][0] if name in status.counts else 0
+            period = running / firings if firings else 0.0
+            limit = max(over, PERIODS * period if firings else FIRST_CALL)
+            if name in graph.nodes and name not in status.ended and silence > limit:
                 quiet[name] = silence, period
     for name, (silence, period) in quiet.items():
         if upstream(graph, [name]).isdisjoint(quiet):
-            yield f"{name}: has not fired for {seconds(silence)}; before, every {seconds(period)}"
+            since = f"has not fired for {seconds(silence)}; before, every {seconds(period)}"
+            yield f"{name}: {since if period else f'has been at its first call for {seconds(silence)}'}"
 
 
 def metrics(

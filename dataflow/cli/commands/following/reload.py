@@ -26,7 +26,8 @@ def reload(
 
     Its module is imported again, with the modules of the same code that have changed, between two firings. It keeps its
     state where it gives one (`snapshot`) and the new code takes it, and its messages that wait. Where the new code
-    fails, or declares other ports, the old code goes on. The recording holds this as a restart, with the digests of
+    fails, takes longer than 30 s to be imported or set up, or declares other ports, the old code goes on. On another
+    machine it is the code that lies there. The recording holds this as a restart, with the digests of
     both codes. Sources, and modules that declare message types, are not reloaded. With --connect it takes the keys of
     the machine that runs the graph; those of tools load no code.
 
@@ -37,7 +38,7 @@ def reload(
       dataflow reload tracker
       dataflow reload front/cloud --graph two_cameras
     """
-    from dataflow.client.attach import graph_of
+    from dataflow.client.attach import graph_of, with_keys_of_tools
     from dataflow.client.processes import NoAnswer, Refused, processes_of
     from dataflow.graph.problems import did_you_mean
 
@@ -46,6 +47,9 @@ def reload(
         nodes = graph_of(found).nodes
         if operator not in nodes:
             raise fail(f"no operator {operator!r} runs: {did_you_mean(operator, nodes, 'there are')}")
+        if with_keys_of_tools():
+            why = "these are keys of tools, which load no code: take those of the machine that runs the graph"
+            raise fail(f"{operator} is not reloaded: {why}", code=DIFFERENT)
         with processes_of(found) as processes:
             try:
                 outcome = processes.reload(operator, timeout)
@@ -56,5 +60,7 @@ def reload(
     if json:
         print_json({"operator": operator, **outcome})
     else:
-        text = f"{operator} goes on with new code after {outcome['seconds']:.2g} s; its state: {outcome['state']}"
+        where = f" on machine {machine}, to which no code is sent" if (machine := nodes[operator].machine) else ""
+        which = "new code" if outcome["changed"] else f"the code that it had: no file of it has changed{where},"
+        text = f"{operator} goes on with {which} after {outcome['seconds']:.2g} s; its state: {outcome['state']}"
         out.print(Text(text), soft_wrap=True)

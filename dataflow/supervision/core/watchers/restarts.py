@@ -196,7 +196,8 @@ class LiveRestarts(RestartPolicy):
                 )
             case "reloaded":
                 name = fields["operator"]
-                text = f"operator {name!r} goes on with new code after {fields['seconds']:.2g} s"
+                which = "new code" if fields["changed"] else "the code that it had, whose files are as they were,"
+                text = f"operator {name!r} goes on with {which} after {fields['seconds']:.2g} s"
                 said = (text, f"its state: {fields['state']}", fields["warning"])
                 run.event("reload", "; ".join(filter(None, said)), operators=[name])
             case "stream_ended":
