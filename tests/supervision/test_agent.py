@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from dataflow.machines import files
-from dataflow.machines.files import FilesError
 from dataflow.machines.pipe import Clocks
 from dataflow.records.black_box import Reached, Remains
 from dataflow.supervision import agent
@@ -26,7 +25,7 @@ def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path, monkeypatch:
     (tmp_path / "models").write_text("a file where a folder would be")
     stay = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "none")  # type: ignore[arg-type]
     piece = {"path": "models/net.bin", "at": 0, "data": b"x", "last": True, "digest": ""}
-    with pytest.raises(FilesError, match=r"'models/net\.bin' cannot be written into /.*: File exists"):
+    with pytest.raises(files.FilesError, match=r"'models/net\.bin' cannot be written into /.*: File exists"):
         stay._take_piece(piece)
 
 
@@ -119,7 +118,8 @@ def test_a_machine_says_what_it_lacks_and_in_what_it_differs(stay: tuple[Stay, l
     there, said = stay
     (tmp_path / "same.yaml").write_bytes(b"same")
     digests = {"same.yaml": hashed(b"same"), "new": hashed(b"new")}
-    wanted = {"python": files.python(), "code": {}, "uses": [], "files": digests}
+    none: dict[str, Any] = {"code": {}, "uses": [], "processes": [], "graph": {"nodes": []}}
+    wanted = {"python": files.python(), "files": digests, **none}
     there._obey("", "prepare", wanted)
     there._obey("", "prepare", wanted | {"python": "CPython 2.7"})
     assert said[0] == ("", "lacks", {"files": ["new"]})
