@@ -8,7 +8,18 @@ import pytest
 from plays import Play, asked_where, killed, sent, spawned
 
 from dataflow.supervision.core.commands import Announce, Over, Withdraw
-from dataflow.supervision.core.events import Aborted, Begin, Died, HungUp, LeftBehind, Paused, Printed, Said, Tick
+from dataflow.supervision.core.events import (
+    Aborted,
+    Begin,
+    Died,
+    HungUp,
+    LeftBehind,
+    LinkChanged,
+    Paused,
+    Printed,
+    Said,
+    Tick,
+)
 from dataflow.sync import FOREVER
 
 
@@ -54,6 +65,21 @@ def test_an_edge_that_is_not_proven_is_named_when_the_time_is_up() -> None:
     play.wait(25.0)
 
     assert play.failure() == "no connection within 10 s on: test/left/fast → sum"
+
+
+def test_a_machine_that_goes_during_the_start_is_waited_for_shortly_and_named() -> None:
+    play = Play(start_timeout=1000.0)
+    play.deaf.add("sum")
+    play.tell(Begin(), Said("sum", "joined", {}), LinkChanged("arm", ("sum",), up=False))
+    play.wait(5.0)
+    play.tell(LinkChanged("arm", ("sum",), up=True))
+    play.wait(60.0)
+    assert play.core.status.phase == "starting"
+
+    play.tell(LinkChanged("arm", ("sum",), up=False))
+    play.wait(35.0)
+
+    assert "machine 'arm' was not heard for 30 s while its operators were to start" in play.failure()
 
 
 def test_a_process_that_is_not_ready_is_named_when_the_time_is_up() -> None:
