@@ -372,7 +372,7 @@ def test_a_fault_of_what_is_recorded_is_found(name: str, seed: int, memory: Path
 def test_a_pipe_that_does_not_notice_what_its_link_lost_is_found() -> None:
     travel(journey_of(3))
 
-    with MUTANTS["link"].planted(), pytest.raises(Violation, match="out of order|was changed|did not come"):
+    with MUTANTS["link"].planted(), pytest.raises(Violation, match=r"out of order|was changed|did not come"):
         travel(journey_of(3))
 
 
