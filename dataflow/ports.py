@@ -42,6 +42,8 @@ class SourceError(ValueError):
 class OutputError(ValueError):
     """`process()` returned something that its ports cannot emit: names the operator and the port."""
 
+    tells_all = True
+
 
 class In(Generic[T]):
     """An input that triggers firings. Several are joined by stamp, or merged with `merge=True`.

@@ -32,7 +32,8 @@ def _answer(call: Call) -> Any:
             write_letter(letter, {"value": function(read_letter(letter), board)})
         return read_letter(letter)["value"]
     except Exception as error:
-        text = getattr(error, "traceback", None) or "".join(traceback.format_exception(error))
+        own: str | None = getattr(error, "traceback", None)
+        text = "".join(traceback.format_exception(error)) if own is None else own
         raise RunFailed(str(error) or type(error).__name__, text, getattr(error, "operator", None)) from error
     finally:
         os.close(shared)

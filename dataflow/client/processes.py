@@ -147,6 +147,14 @@ class Processes:
         key = local_key(self._namespace, "reload", operator)
         return dict(self._answered(key, operator, {"reload": True}, timeout, "it is reloaded"))
 
+    def files(self, operator: str, timeout: float) -> dict[str, str]:
+        """The digests of the modules that an operator's code is made of, as their files are now on its machine.
+
+        Raises `Refused`, `NoAnswer`.
+        """
+        key = local_key(self._namespace, "reload", operator)
+        return dict(self._answered(key, operator, {"reload": True, "files": True}, timeout, "nothing is reloaded"))
+
     def takers(self, timeout: float) -> dict[str, Taker]:
         """The sources that take messages from outside, by name."""
         answers = self._bus.ask(runtime_key(self._namespace, "pub", "**"), timeout=timeout)

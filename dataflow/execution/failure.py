@@ -18,24 +18,37 @@ _ENGINE = Path(__file__).parent.parent
 class OperatorFailure(RuntimeError):
     """An operator raised or broke its contract.
 
-    Carries its name, the firing, the operator's own traceback, and the file and line of its code that raised ("" and 0
-    where none did).
+    Carries its name, the firing, the operator's own traceback ("" where the error's text is all there is to know), and
+    the file and line of its code that raised ("" and 0 where none did).
     """
 
     def __init__(self, operator: str, when: str, error: BaseException) -> None:
         self.operator, self.when = operator, when
         self.summary = readable(error)
         self.file, self.line = place_of(error.__traceback__)
-        try:
-            self.traceback = cut(_printable("".join(traceback.format_exception(error))), MOST_OF_A_TRACEBACK)
-        except Exception:  # its own text cannot be made
-            self.traceback = "".join(traceback.format_tb(error.__traceback__)) + self.summary
+        if tells_all(error) and not self.file:
+            self.traceback = ""
+        else:
+            self.traceback = _traceback(error, self.summary)
         super().__init__(f"operator {operator!r} failed in {when}: {self.summary}")
 
     @property
     def where(self) -> str:
         """Returns such as "crashy.py:12"; "" where no code of an operator raised."""
         return f"{Path(self.file).name}:{self.line}" if self.file else ""
+
+
+def tells_all(error: BaseException) -> bool:
+    """Returns whether an error's text is all there is to know, where no code of an operator raised it: the engine's
+    own lines say nothing about a program that ended, or about messages that do not fit."""
+    return bool(getattr(error, "tells_all", False))
+
+
+def _traceback(error: BaseException, summary: str) -> str:
+    try:
+        return cut(_printable("".join(traceback.format_exception(error))), MOST_OF_A_TRACEBACK)
+    except Exception:  # its own text cannot be made
+        return "".join(traceback.format_tb(error.__traceback__)) + summary
 
 
 def place_of(trace: TracebackType | None) -> tuple[str, int]:

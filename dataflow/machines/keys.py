@@ -37,6 +37,7 @@ _AUTHORITY_KEY = "authority.key"
 _MACHINE, _NAME = "machine", "name"
 """The file with the name of the machine, and that of one that serves."""
 _HOST = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(\.[A-Za-z0-9-]{1,63})*\.?")
+_ENDPOINT = re.compile(r"tls/[^/]+:\d{1,5}([?#].*)?")
 _CURVE = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
 
 
@@ -131,7 +132,7 @@ def settings(keys: Path | None, endpoint: str) -> dict[str, Any]:
         if endpoint.startswith("unixsock-stream/"):
             return {}
         raise NetworkError(f"{endpoint!r} needs keys: make them with `dataflow keys new FOLDER`, give them by --keys")
-    if not endpoint.startswith("tls/"):
+    if not _ENDPOINT.fullmatch(endpoint):
         raise NetworkError(f"endpoint {endpoint!r} with keys: expected tls/<address>:<port>")
     if missing := [name for name in (_AUTHORITY, _CERTIFICATE, _KEY) if not (keys / name).is_file()]:
         raise NetworkError(f"keys {str(keys)!r}: no {', '.join(missing)}; `dataflow keys add` makes such a folder")

@@ -44,7 +44,9 @@ def log_failure(error: BaseException) -> None:
     logger = logging.getLogger("dataflow.failure")
     place, about = (failure.file, failure.line), {"operator": failure.operator}
     logger.handle(
-        logger.makeRecord(logger.name, logging.ERROR, *place, failure.traceback.rstrip(), (), None, "", about)
+        logger.makeRecord(
+            logger.name, logging.ERROR, *place, failure.traceback.rstrip() or failure.summary, (), None, "", about
+        )
     )
 
 

@@ -11,6 +11,7 @@ import msgpack
 from dataflow.execution.driver import Driver, Maker
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.source import SourceRunner
+from dataflow.graph.code import code_now, file_digests
 from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_tunable
 from dataflow.process.channel import Channel
@@ -73,7 +74,7 @@ class Requests:
 
         A request `{"get": true}` is answered with the values of all, and whether they can change now; with
         `{"reload": true}`, from `here` alone, the operator goes on with its code as it is in its files now
-        (`Runner.reload`).
+        (`Runner.reload`); with `"files": true` besides, these are only looked at (`file_digests`).
         """
         with query:
             try:
@@ -149,6 +150,8 @@ class Requests:
         return message.stamp
 
     def _value_asked(self, maker: Maker, asked: Any) -> Any:
+        if asked.get("reload") and asked.get("files"):
+            return file_digests(code_now(type(maker.operator)).texts)
         if asked.get("reload"):
             outcome = maker.reload()
             self._channel.send("reloaded", operator=maker.node.name, **outcome)

@@ -54,6 +54,8 @@ class Outcome(IntEnum):
 class ProgramError(RuntimeError):
     """A program failed, ended, answered nothing in its time or something that is no reply; names program and call."""
 
+    tells_all = True
+
 
 class Child:
     """A running program. Its standard error is the operator's log. A failed call ends it."""

@@ -78,7 +78,7 @@ class Ros2Node:
         except BusError as error:
             raise SourceError(
                 f"no Zenoh router answers at {router}: start one (`ros2 run rmw_zenoh_cpp rmw_zenohd`), or name "
-                f"another with `router` ({error.__cause__})"
+                f"another with `router` ({error})"
             ) from error
         except NetworkError as error:
             raise SourceError(str(error)) from error

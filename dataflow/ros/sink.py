@@ -11,7 +11,7 @@ from dataflow.operator import In, Operator, Param, Sampled, SourceError
 from dataflow.ros.definitions import store_of, type_hash, written
 from dataflow.ros.message import RosMessage
 from dataflow.ros.node import Publisher
-from dataflow.ros.place import Place
+from dataflow.ros.place import TYPE, Place
 from dataflow.ros.wire import Qos
 
 if TYPE_CHECKING:
@@ -33,7 +33,9 @@ class Ros2Sink(Place, Operator):
     fixed: Sampled[Transforms | CameraInfo] = Sampled(required=False, doc="what is static, for `fixed_topic`")
 
     type: str = Param(
-        "", doc="its ROS type; none takes the usual one of the message. Given, the topic is there before a message is"
+        "",
+        pattern=TYPE,
+        doc="its ROS type; none takes the usual one of the message. Given, the topic is there before a message is",
     )
     fixed_topic: str = Param("/tf_static", min_length=1, doc="topic of `fixed`")
     history: Literal["keep_last", "keep_all"] = Param(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -332,12 +332,21 @@ class Ros2Source(Subscriber):
     )
 
 
+_TYPE = Param("", doc="its ROS type; none takes that of its first publisher")
+
+
+def _types_of(message: type[Message]) -> Any:
+    """Returns the ROS types whose messages become those of a type, as a parameter takes them."""
+    return Literal[("", *(name for name, (becomes, _) in MAPPED.items() if message in offers(becomes)))]
+
+
 def source_of(message: type[Message]) -> type[Subscriber]:
     """Returns the source of a ROS topic whose messages become those of a type."""
     made = {
         "__module__": "dataflow.ros",
         "__doc__": f"{message.__name__} messages of a ROS 2 topic.",
-        "__annotations__": {"message": Out[message], "lost": Out[Number]},  # type: ignore[valid-type]
+        "__annotations__": {"message": Out[message], "lost": Out[Number], "type": _types_of(message)},  # type: ignore[valid-type]
+        "type": _TYPE,
         "message": Out(doc="the messages"),
         "lost": Out(doc="messages lost so far on the side of ROS; with the first message after each gap, and again"),
     }
@@ -349,7 +358,8 @@ def latched_source_of(message: type[Message]) -> type[Subscriber]:
     made = {
         "__module__": "dataflow.ros",
         "__doc__": f"The {message.__name__} of a latched ROS 2 topic, valid always.",
-        "__annotations__": {"message": Out[message]},  # type: ignore[valid-type]
+        "__annotations__": {"message": Out[message], "type": _types_of(message)},  # type: ignore[valid-type]
+        "type": _TYPE,
         "message": Out(static=True, doc="what was latched at the start"),
     }
     return type(f"Static{message.__name__}", (Latched,), made)

@@ -115,7 +115,8 @@ def _hand_over(process: Any) -> None:
 def _report(channel: Channel, error: BaseException, phase: str) -> None:
     """Reports to the supervisor what failed, and in which phase of this process, if it is still there."""
     operator = getattr(error, "operator", None)
-    text = cut(getattr(error, "traceback", None) or "".join(traceback.format_exception(error)), MOST_OF_A_TRACEBACK)
+    own: str | None = getattr(error, "traceback", None)
+    text = cut("".join(traceback.format_exception(error)) if own is None else own, MOST_OF_A_TRACEBACK)
     summary = cut(getattr(error, "summary", None) or f"{type(error).__name__}: {error}")
     when, where = getattr(error, "when", ""), getattr(error, "where", "")
     try:

@@ -18,7 +18,7 @@ from dataflow.transport.bounded import within
 from dataflow.transport.counters import Counters
 from dataflow.transport.keys import static_key, stream_of_static
 from dataflow.transport.network import NetworkConfig
-from dataflow.transport.publisher import BusError, StreamPublisher, undeclare
+from dataflow.transport.publisher import BusError, StreamPublisher, reason, undeclare
 
 CLOSE_WITHIN = 20.0
 
@@ -71,7 +71,8 @@ class Bus:
             self.session = zenoh.open(self.config.zenoh_config())
         except zenoh.ZError as error:
             listen, connect = (", ".join(places) for places in (self.config.listen, self.config.connect))
-            raise BusError(f"cannot {f'listen on {listen}' if listen else f'connect to {connect}'}: {error}") from error
+            what = f"listen on {listen}" if listen else f"connect to {connect}"
+            raise BusError(f"cannot {what}: {reason(error)}") from error
         self.id = str(self.session.zid())
         self.counted = Counters()
         self._lock = threading.Lock()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from typing import Any
@@ -16,6 +17,12 @@ class BusError(RuntimeError):
     """The network refused an operation; the message names it, the key and the reason."""
 
 
+def reason(error: zenoh.ZError) -> str:
+    """Returns Zenoh's reason without the places in its code, of which users know nothing."""
+    return _IN_ITS_CODE.sub("", str(error)).strip()
+
+
+_IN_ITS_CODE = re.compile(r"\s*\bat \S+\.rs:\d+\.?")
 UNDECLARE_WITHIN = 10.0
 """Seconds: Zenoh waits for callbacks that are under way, and for links that take nothing."""
 

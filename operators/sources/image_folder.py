@@ -89,6 +89,14 @@ class ImageFolder(CalibratedImages):
     def summary(self) -> Mapping[str, int | str]:
         return {"clock": self.stamps, "passed_over": self._passed.number}
 
+    def finding(self) -> str:
+        """Returns how many images are missing in the stream."""
+        number = self._missing()
+        return f"{number} image{'s' * (number != 1)} of {self.path} left out, each named in a warning" if number else ""
+
+    def _missing(self) -> int:
+        return self._passed.number if hasattr(self, "_passed") else 0
+
     def _existing(self) -> Path:
         folder = Path(self.path).expanduser()
         if not folder.is_dir():
@@ -182,7 +190,10 @@ class GrowingImageFolder(ImageFolder):
         return None
 
     def summary(self) -> Mapping[str, int | str]:
-        return {"clock": self.stamps, "left_out": self._left_out + self._passed.number}
+        return {"clock": self.stamps, "left_out": self._missing()}
+
+    def _missing(self) -> int:
+        return self._left_out + super()._missing()
 
     def _first_stamp(self) -> int:
         return self._first[0]

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import struct
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,18 +13,13 @@ import numpy as np
 
 from dataflow.messages import Message, PointCloud
 from dataflow.operator import Out, Param, Source, SourceError
+from operators.sources.capture import CaptureError, records
 from operators.sources.ports import lost_datagrams, read_port, udp_port
 
 PACKET = 1206
 """Bytes of a packet with points."""
-_PCAP_HEADER, _RECORD_HEADER = 24, 16
-_OTHER_KINDS = (
-    (b"\x0a\x0d\x0d\x0a", "a pcapng file", "editcap -F pcap IN.pcapng OUT.pcap"),
-    (b"\x1f\x8b", "compressed (gzip)", "gunzip it"),
-)
-_BLOCK = 100
-_MARKS = (b"\xff\xee", b"\xff\xdd")
-"""Of upper and of lower blocks; only an HDL-64E has lower ones."""
+BANKS = (0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF)
+"""By which the blocks of a packet begin: the lasers whose returns follow."""
 SILENCE = 500_000_000
 """Nanoseconds without packets after which a turn that has begun is dropped."""
 
@@ -45,8 +39,7 @@ class _Velodyne(Source, abstract=True):
         "arrival", doc="clock of the stamps; `sensor` is its time within the hour, of satellites or free, at this hour"
     )
 
-    _packets, _others, _unknown, _early, _last, _arrived = 0, 0, 0, 0, -1, 0
-    _refused = ""
+    _packets, _others, _early, _last, _arrived = 0, 0, 0, -1, 0
 
     @abstractmethod
     def _received(self) -> Iterator[tuple[int, bytes]]:
@@ -61,45 +54,57 @@ class _Velodyne(Source, abstract=True):
                 f"Velodyne LiDARs need the package {error.name}: pip install 'robot-dataflow[lidar]'"
             ) from error
         self._library: Any = velodyne_decoder
+        self._models: dict[int, bool] = {}
         self._begin()
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         for arrival, data in self._received():
-            if not _has_points(data):  # position packets, other programs
+            if not self._takes(data):  # position packets, other programs
                 self._others += bool(data)
                 continue
             if arrival - self._arrived > SILENCE:
                 self._begin()
             self._packets, self._arrived = self._packets + 1, arrival
-            yield from self._clouds(self._turn(self._decoder.decode, arrival * 1e-9, data))
-        yield from self._clouds(self._turn(self._decoder.finish))
+            yield from self._clouds(self._decoder.decode(arrival * 1e-9, data))
+        yield from self._clouds(self._decoder.finish())
 
     def summary(self) -> Mapping[str, int | str]:
         found = {"clock": self.clock, "packets": self._packets, "other_datagrams": self._others}
-        return {**found, "undecoded": self._unknown, "past": self._early}
+        return {**found, "past": self._early}
 
     def finding(self) -> str:
-        if self._refused and self._last < 0:
-            return f"{self._packets} packets, none that can be decoded: {self._refused}"
         if self._others and not self._packets:
-            return f"{self._others} datagrams, none of {PACKET} bytes: is it a Velodyne LiDAR, is that its data port?"
+            return (
+                f"{self._others} datagrams, none of them a packet with points ({PACKET} bytes): is it a Velodyne "
+                "LiDAR, is that its data port?"
+            )
         return ""
+
+    def _takes(self, data: bytes) -> bool:
+        """Returns whether a datagram is a packet with points of a known model; any program may send others."""
+        if not _has_points(data):
+            return False
+        known = self._models.get(data[-1])
+        if known is None:
+            try:
+                trial = self._new_decoder()  # the run's own one would be left with its turn in pieces
+                trial.decode(0.0, data)
+                trial.finish()
+                known = True
+            except RuntimeError as error:
+                self.log.warning("packets are left out: %s", error)
+                known = False
+            self._models[data[-1]] = known
+        return known
 
     def _begin(self) -> None:
         """Begins a turn anew; the first one after it is whole only where it begins at its first packet."""
+        self._decoder = self._new_decoder()
+
+    def _new_decoder(self) -> Any:
         library = self._library
         model = getattr(library.Model, self.model) if self.model else None
-        settings = library.Config(model=model, min_range=self.min_range, max_range=self.max_range)
-        self._decoder = library.StreamDecoder(settings)
-
-    def _turn(self, decode: Callable[..., Any], *given: Any) -> Any:
-        """Returns what the decoder gives; nothing for packets of a model that it does not know, or of another one."""
-        try:
-            return decode(*given)
-        except RuntimeError as error:
-            self._refused, self._unknown = str(error), self._unknown + 1
-            self._begin()  # the decoder would come upon the same packet again; this turn is lost
-        return None
+        return library.StreamDecoder(library.Config(model=model, min_range=self.min_range, max_range=self.max_range))
 
     def _clouds(self, turn: Any) -> Iterator[Mapping[str, Message]]:
         if turn is None or not len(turn[1]):
@@ -131,7 +136,7 @@ class VelodyneFile(_Velodyne):
 
     input: str = Param(min_length=1, doc="the file")
 
-    _broken_off = ""
+    _broken = ""
 
     def setup(self) -> None:
         """Raises SourceError, FileNotFoundError."""
@@ -139,53 +144,27 @@ class VelodyneFile(_Velodyne):
         super().setup()
 
     def finding(self) -> str:
-        """Returns what is wrong with the file, where nothing came out of it, or not all."""
+        """Returns what is wrong with the file, where nothing came out of it or it breaks off."""
         if not (self._packets or self._others):
             return f"{self._path.name} holds no packet"
-        return super().finding() or self._broken_off
+        return self._broken or super().finding()
 
     def _received(self) -> Iterator[tuple[int, bytes]]:
-        util = self._library.util
-        self._check_kind()
+        layers = self._library.util.dpkt
         try:
-            for stamp, data in util.iter_pcap(self._path):
-                yield round(float(stamp) * 1e9), bytes(data)
-        except (ValueError, util.dpkt.Error) as error:
+            for stamp, frame in records(self._path):
+                try:
+                    data = layers.ethernet.Ethernet(frame)
+                except layers.UnpackError:
+                    continue
+                while hasattr(data, "data"):
+                    data = data.data
+                yield stamp, bytes(data)
+        except CaptureError as error:
             if not self._packets:
-                raise SourceError(f"{self._path} is no capture of packets (pcap): {error}") from error
-            self._broken_off = str(error)
-        if self._broken_off or _is_cut(self._path):
-            self._broken_off = f"{self._path.name} breaks off in a packet: {self._packets} before it were read"
-            self.log.warning("%s", self._broken_off)
-
-    def _check_kind(self) -> None:
-        """Raises SourceError for a file that would only have to be converted."""
-        with self._path.open("rb") as file:
-            magic = file.read(4)
-        for begins, kind, how in _OTHER_KINDS:
-            if magic.startswith(begins):
-                raise SourceError(f"{self._path} is {kind}, not a pcap: {how}")
-
-
-def _has_points(data: bytes) -> bool:
-    """Returns whether it is a packet with points: twelve blocks, each of which begins with its mark."""
-    return len(data) == PACKET and all(data[at : at + 2] in _MARKS for at in range(0, 12 * _BLOCK, _BLOCK))
-
-
-def _is_cut(path: Path) -> bool:
-    """Returns whether a pcap ends within a packet."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        order = "<" if file.read(_PCAP_HEADER)[:1] in b"\xd4\x4d" else ">"
-        at = _PCAP_HEADER
-        while head := file.read(_RECORD_HEADER):
-            if len(head) < _RECORD_HEADER:
-                return True
-            at += _RECORD_HEADER + int(struct.unpack(f"{order}8xI4x", head)[0])
-            if at > size:
-                return True
-            file.seek(at)
-    return False
+                raise SourceError(str(error)) from error
+            self._broken = f"{error}, after {self._packets} packets"
+            self.log.warning("%s", self._broken)
 
 
 class VelodyneLidar(_Velodyne):
@@ -234,3 +213,12 @@ class VelodyneLidar(_Velodyne):
                 self.log.warning("no packets from the LiDAR at %s: it is waited for", self.input)
             silent = silent and data is None
             yield arrival, data or b""
+
+
+def _has_points(data: bytes) -> bool:
+    """Returns whether a datagram has the twelve blocks of a packet with points; of anything else a decoder would make
+    turns."""
+    if len(data) != PACKET:
+        return False
+    begins = np.frombuffer(data, "<u2", 600).reshape(12, 50)
+    return bool(np.isin(begins[:, 0], BANKS).all() and (begins[:, 1] <= 36000).all())

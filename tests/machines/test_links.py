@@ -200,6 +200,12 @@ def test_an_endpoint_without_keys_is_refused_beyond_a_socket_of_this_user(keys: 
     assert settings(None, "unixsock-stream//run/meet") == {}
 
 
+@pytest.mark.parametrize("endpoint", ["tls/10.0.0.2", "tls/:7447", "tls/10.0.0.2:port", "tcp/10.0.0.2:7447"])
+def test_an_endpoint_without_a_port_is_refused_where_it_is_connected_to(keys: Path, endpoint: str) -> None:
+    with pytest.raises(NetworkError, match=r"expected tls/<address>:<port>"):
+        settings(keys / "tools", endpoint)
+
+
 def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:
     assert {path.stat().st_mode & 0o077 for path in keys.rglob("*key*") if path.is_file()} == {0}
     with pytest.raises(KeysError, match="has keys already"):

@@ -14,6 +14,7 @@ from example_messages import example
 from program_operators import Faulty, Relay, faulty
 
 import dataflow
+from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Image, Number
 from dataflow.messages.base import Message, message_types
 from dataflow.operator import Batch, Context, In, OperatorDefinitionError, Out, OutputError
@@ -172,6 +173,13 @@ def test_a_reply_that_is_no_message_is_refused(fault: str, text: str) -> None:
     with pytest.raises(OutputError, match=text):
         call(operator, 7, number=number(7))
     operator.close()
+
+
+@pytest.mark.parametrize("fault", ["text", "half", "garbage"])
+def test_what_a_program_does_wrong_is_told_without_lines_of_the_engine(fault: str) -> None:
+    with pytest.raises(OperatorFailure, match="python") as raised:
+        play(faulty(fault)(), {"number": [number(1)]})
+    assert raised.value.traceback == ""
 
 
 def test_a_port_that_is_not_declared_is_named() -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import pytest
 
 import dataflow.ros as topics
 from dataflow.graph import GraphError, load_text
-from dataflow.operator import SourceError
+from dataflow.interop.ros import CONVERSIONS
 
 GRAPH = "graph: ros\nnamespace: test\noperators:\n  imu: {use: 'dataflow.ros:Imu', params: {topic: '%s', type: '%s'}}\n"
 
@@ -53,11 +50,13 @@ def test_what_ros_takes_is_taken() -> None:
         load_text(GRAPH % (topic, "sensor_msgs/msg/Imu"))
 
 
-def test_a_type_that_becomes_another_message_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    source: Any = topics.Imu(topic="/imu", type="sensor_msgs/msg/Image")
-    monkeypatch.setattr(source, "join", lambda: SimpleNamespace())
+@pytest.mark.parametrize("use", ["Imu", "StaticTransforms"])
+def test_a_type_that_becomes_another_message_is_a_fault_of_the_graph(use: str) -> None:
+    text = (GRAPH % ("/imu", "sensor_msgs/msg/Image")).replace(":Imu'", f":{use}'")
+    with pytest.raises(GraphError, match=r"type.*sensor_msgs/msg/Imu|type.*tf2_msgs/msg/TFMessage"):
+        load_text(text)
 
-    with pytest.raises(
-        SourceError, match=r"a sensor_msgs/msg/Image becomes .* Image, not Imu: use dataflow\.ros:Image"
-    ):
-        source.setup()
+
+def test_the_types_of_a_source_are_those_that_become_its_messages() -> None:
+    for name, (becomes, _) in CONVERSIONS.items():
+        getattr(topics, becomes.__name__)(topic="/a", type=name)

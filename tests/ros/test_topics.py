@@ -272,7 +272,7 @@ def test_errors_name_what_is_missing(endpoint: str, peer: Peer) -> None:
     with pytest.raises(SourceError, match=r"no publisher of /scan in domain 0 within 0.2 s; topics there: .*/chatter"):
         topics.LaserScan(topic="/scan", router=endpoint, within="200ms").setup()
     with pytest.raises(SourceError, match="no type 'my_robot/msg/Gripper' that is known here"):
-        topics.Imu(topic="/gripper", type="my_robot/msg/Gripper", router=endpoint).setup()
+        topics.Ros2Source(topic="/gripper", type="my_robot/msg/Gripper", router=endpoint).setup()
     source = topics.StaticText(topic="/chatter", router=endpoint, within="200ms")
     source.setup()
     with pytest.raises(SourceError, match=r"std_msgs/msg/String.* came within 0\.2 s; its publishers: /talker"):

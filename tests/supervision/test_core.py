@@ -14,15 +14,23 @@ from dataflow.supervision.core.events import (
     Died,
     HungUp,
     LeftBehind,
+<<<<<<< HEAD
     Paused,
     PlaybackAsked,
+=======
+    LinkChanged,
+    Paused,
+>>>>>>> m11d
     Printed,
     Said,
     Tick,
 )
+<<<<<<< HEAD
 from dataflow.supervision.core.report import OperatorCounts
 from dataflow.supervision.core.watchers.quiescence import MAX_WINDOW_DOUBLINGS, Proof, Verdict
 from dataflow.supervision.core.wording import how_it_ended, how_long
+=======
+>>>>>>> m11d
 from dataflow.sync import FOREVER
 
 
@@ -68,6 +76,21 @@ def test_an_edge_that_is_not_proven_is_named_when_the_time_is_up() -> None:
     play.wait(25.0)
 
     assert play.failure() == "no connection within 10 s on: test/left/fast → sum"
+
+
+def test_a_machine_that_goes_during_the_start_is_waited_for_shortly_and_named() -> None:
+    play = Play(start_timeout=1000.0)
+    play.deaf.add("sum")
+    play.tell(Begin(), Said("sum", "joined", {}), LinkChanged("arm", ("sum",), up=False))
+    play.wait(5.0)
+    play.tell(LinkChanged("arm", ("sum",), up=True))
+    play.wait(60.0)
+    assert play.core.status.phase == "starting"
+
+    play.tell(LinkChanged("arm", ("sum",), up=False))
+    play.wait(35.0)
+
+    assert "machine 'arm' was not heard for 30 s while its operators were to start" in play.failure()
 
 
 def test_a_process_that_is_not_ready_is_named_when_the_time_is_up() -> None:

@@ -11,6 +11,9 @@ from dataflow.supervision.core.run_state import RunState
 from dataflow.supervision.core.stack_requests import Asking, notice
 from dataflow.supervision.core.supervised import Supervised
 
+HEARD_WITHIN = 30.0
+"""Seconds for which a machine that is not heard is waited for during the start; so long its agent waits, too."""
+
 
 class Barrier:
     """Starts all processes, then has them send probes until nothing is unseen."""
@@ -55,9 +58,21 @@ class Barrier:
         run.status.waiting = tuple(p.label for p in processes if p.life is not Life.READY and self._missing(p))
         if run.steady > self._deadline - notice(run.plan.start_timeout):
             self._asking.ask(_late(processes), self._deadline)
+        self._look_at_machines()
         if run.steady > self._deadline:
             self._fail(processes)
         return False
+
+    def _look_at_machines(self) -> None:
+        """Raises `RunFailed` where a machine has gone before its processes were ready: nothing runs yet that could go
+        on without it."""
+        for machine, since in self.run.unheard.items():
+            if (silence := self.run.steady - since) > HEARD_WITHIN:
+                raise RunFailed(
+                    f"machine {machine!r} was not heard for {silence:.0f} s while its operators were to start: is it "
+                    "up, and does `dataflow join` still run there?",
+                    self.run.last_words(),
+                )
 
     def _missing(self, process: Supervised) -> bool:
         """Returns whether a process is not ready, or does not see all of its edges."""

@@ -54,6 +54,8 @@ class RunState:
         self._clocks: dict[str, float] = {}
         self.unreachable: dict[str, str] = {}
         """By process on a machine of which nothing is heard, that machine."""
+        self.unheard: dict[str, float] = {}
+        """By machine of which nothing is heard, since when (s)."""
         self._phase = Phase.STARTING
         self._commands: list[Command] = []
         for label, process in self.processes.items():
@@ -160,7 +162,9 @@ class RunState:
         """Notes that processes on another machine are out of reach, or no longer: none of them need have ended."""
         for label in labels:
             self.unreachable.pop(label, None)
+        self.unheard.pop(machine, None)
         if not up:
+            self.unheard[machine] = self.steady
             self.unreachable |= dict.fromkeys(labels, machine)
         what = "is back" if up else "is down: nothing of that machine is heard, and its operators go on"
         self.event("link", f"the link to machine {machine!r} {what}", machine=machine, up=up)

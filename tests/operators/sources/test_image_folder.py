@@ -178,6 +178,14 @@ def test_images_that_are_late_or_damaged_are_left_out(tmp_path: Path, caplog: py
     ]
 
 
+def test_images_that_were_left_out_are_a_finding(tmp_path: Path) -> None:
+    fill(tmp_path, "1.png")
+    source = growing(tmp_path, nothing, write("2.png", b"damaged"), nothing, write("3.png", encoded(3)), nothing)
+
+    assert shown(source) == [(1, 0), (3, 3)]
+    assert "1 image of" in source.finding()
+
+
 def test_a_file_that_never_settles_does_not_hold_the_others(tmp_path: Path) -> None:
     fill(tmp_path, "1.png")
     grows = [write("2.png", b"x" * size) for size in range(1, HELD + 3)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
@@ -9,7 +10,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
-from dataflow.cli.support.arguments import Json
+from dataflow.cli.support.arguments import Json, find_modules_in
 from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, print_json, say
 
 
@@ -27,9 +28,9 @@ def reload(
     Its module is imported again, with the modules of the same code that have changed, between two firings. It keeps its
     state where it gives one (`snapshot`) and the new code takes it, and its messages that wait. Where the new code
     fails, takes longer than 30 s to be imported or set up, or declares other ports, the old code goes on. On another
-    machine it is the code that lies there. The recording holds this as a restart, with the digests of
-    both codes. Sources, and modules that declare message types, are not reloaded. With --connect it takes the keys of
-    the machine that runs the graph; those of tools load no code.
+    machine it is the code that lies there: where it differs from that here, nothing is reloaded. The recording holds
+    this as a restart, with the digests of both codes. Sources, and modules that declare message types, are not
+    reloaded. With --connect it takes the keys of the machine that runs the graph; those of tools load no code.
 
     Exit codes: 0 reloaded; 1 refused: the old code goes on, or no answer; 2 no such graph or operator.
 
@@ -52,6 +53,8 @@ def reload(
             raise fail(f"{operator} is not reloaded: {why}", code=DIFFERENT)
         with processes_of(found) as processes:
             try:
+                if (machine := nodes[operator].machine) is not None:
+                    _require_same_files(processes.files(operator, timeout), machine)
                 outcome = processes.reload(operator, timeout)
             except (Refused, NoAnswer) as error:
                 raise fail(f"{operator} is not reloaded: {error}", code=DIFFERENT) from None
@@ -60,7 +63,20 @@ def reload(
     if json:
         print_json({"operator": operator, **outcome})
     else:
-        where = f" on machine {machine}, to which no code is sent" if (machine := nodes[operator].machine) else ""
+        where = f" on machine {machine}, to which no code is sent" if machine else ""
         which = "new code" if outcome["changed"] else f"the code that it had: no file of it has changed{where},"
         text = f"{operator} goes on with {which} after {outcome['seconds']:.2g} s; its state: {outcome['state']}"
         out.print(Text(text), soft_wrap=True)
+
+
+def _require_same_files(there: Mapping[str, str], machine: str) -> None:
+    """Raises `Refused` where files of an operator's modules differ here, where they were edited, and on its machine;
+    files that are not found here are not compared."""
+    from dataflow.client.processes import Refused
+    from dataflow.graph.code import file_digests
+
+    find_modules_in(None)
+    here = file_digests(there)
+    if differing := [name for name, digest in sorted(there.items()) if here.get(name, digest) != digest]:
+        which = ", ".join(differing)
+        raise Refused(f"{which} on machine {machine!r} differs from here: install it there first, the old code goes on")

@@ -1,0 +1,23 @@
+"""`dataflow reload`: what it compares before it orders a reload on another machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dataflow.cli.commands.following.reload import _require_same_files
+from dataflow.client.processes import Refused
+from dataflow.graph.code import digest_of
+
+
+def test_files_that_differ_from_those_of_the_other_machine_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "edited_here.py").write_text("GAIN = 2\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    _require_same_files({"edited_here": digest_of(b"GAIN = 2\n"), "only_there": "0" * 64}, "arm")
+    with pytest.raises(Refused, match=r"edited_here on machine 'arm' differs from here: install it there first"):
+        _require_same_files({"edited_here": digest_of(b"GAIN = 1\n")}, "arm")
