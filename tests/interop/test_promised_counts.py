@@ -146,7 +146,8 @@ def test_split_databases_are_one_bag_in_the_order_of_log_times(tmp_path: Path) -
     rows = imus(STAMPS)
     first, second = write_ros2(tmp_path / "a", rows[10:], "sqlite3"), write_ros2(tmp_path / "b", rows[:10], "sqlite3")
     (first / "metadata.yaml").unlink()
-    shutil.copy(second / "b.db3", first / "b.db3")
+    (first / "a.db3").rename(first / "run_1.db3")
+    shutil.copy(second / "b.db3", first / "run_0.db3")
 
     bag = open_bag(first)
 

@@ -14,23 +14,16 @@ from dataflow.supervision.core.events import (
     Died,
     HungUp,
     LeftBehind,
-<<<<<<< HEAD
-    Paused,
-    PlaybackAsked,
-=======
     LinkChanged,
     Paused,
->>>>>>> m11d
+    PlaybackAsked,
     Printed,
     Said,
     Tick,
 )
-<<<<<<< HEAD
 from dataflow.supervision.core.report import OperatorCounts
 from dataflow.supervision.core.watchers.quiescence import MAX_WINDOW_DOUBLINGS, Proof, Verdict
 from dataflow.supervision.core.wording import how_it_ended, how_long
-=======
->>>>>>> m11d
 from dataflow.sync import FOREVER
 
 

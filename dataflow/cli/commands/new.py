@@ -143,7 +143,7 @@ def service(
     find_modules_in(None)
     with friendly_errors():
         loaded = load_graph(file, live=True)
-        machines_of(loaded, listen, keys, here=False)
+        machines_of(loaded, listen, keys, here=False, begins=False)
     away = sorted({node.machine for node in loaded.nodes.values() if node.machine is not None})
     if away and listen is None:
         raise fail(f"operators run on {', '.join(away)}: give --listen, where they join, and --keys")

@@ -152,8 +152,10 @@ Verbose = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]
 
 
-def machines_of(graph: Graph, listen: str | None, keys: Path | None, *, here: bool) -> dict[str, Any]:
-    """Returns the field of a `RunPlan` for other machines, if an option is about them."""
+def machines_of(
+    graph: Graph, listen: str | None, keys: Path | None, *, here: bool, begins: bool = True
+) -> dict[str, Any]:
+    """Returns the field of a `RunPlan` for other machines, if an option is about them; a run listens."""
     from dataflow.machines.keys import require_address, require_serving, settings
     from dataflow.supervision.plan import Meeting
 
@@ -167,6 +169,6 @@ def machines_of(graph: Graph, listen: str | None, keys: Path | None, *, here: bo
         settings(keys, listen)
     if keys is not None:
         require_serving(keys)
-        if not here and listen is not None:
+        if begins and not here and listen is not None:
             require_address(listen)
     return {"machines": Meeting(listen, keys)} if listen is not None else {"machines": None} if here else {}
