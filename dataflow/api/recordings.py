@@ -17,6 +17,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Event, Recorded, Recording
 from dataflow.recording.layout import RECORDING
 from dataflow.recording.notices import warning
+from dataflow.recording.streams.cutting import cut_of
 from dataflow.recording.streams.part_folder import parts_in
 from dataflow.reexecution.recorded_run import resolved_graph
 
@@ -34,7 +35,10 @@ def open(path: str | Path) -> RecordedStreams:
     with warning():
         recording = Recording(file)
     infos = [info for info in recording.streams.values() if not info.static and "/@/" not in f"/{info.name}"]
+    part = cut_of(recording.metadata)
     origin = min((info.first for info in infos if info.first is not None), default=0)
+    if part is not None and part.start is not None:
+        origin = part.start
     return RecordedStreams(recording, tuple(recording.streams), origin)
 
 
@@ -79,7 +83,10 @@ class RecordedStreams(Mapping[str, RecordedStream]):
 
     @property
     def start(self) -> int:
-        """The timestamp of the first message (ns since the epoch), static streams and the runtime's own aside."""
+        """The timestamp of the first message (ns since the epoch), static streams and the runtime's own aside.
+
+        A part begins where it was cut.
+        """
         return self._origin if self._first is None else max(self._origin, self._first)
 
     @property
@@ -129,7 +136,7 @@ class RecordedStreams(Mapping[str, RecordedStream]):
 
     @checked
     def between(self, start: float | None = None, end: float | None = None) -> RecordedStreams:
-        """The recording from `start` to `end`, both included, in seconds from its first message."""
+        """The recording from `start` to `end`, both included, in seconds from its own start."""
         first = None if start is None else self._origin + round(start * 1e9)
         last = None if end is None else self._origin + round(end * 1e9)
         return self.within(first, last)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from analysed import MS, START, imu
+from made_parts import cut
 from mcap.writer import Writer
 
 import dataflow
@@ -147,3 +148,9 @@ def test_html_names_streams_with_rates_and_the_empty_ones(recording: dataflow.Re
     assert "rad/s" in recording["imu"]._repr_html_()
     assert np.array_equal(recording["imu"].between(0.05).stamps, recording["imu"].stamps[5:])
     assert isinstance(recording["imu"][0], Imu)
+
+
+def test_seconds_of_a_part_begin_where_it_was_cut(path: Path, tmp_path: Path) -> None:
+    with dataflow.open(cut(path, tmp_path / "part.mcap", 0.025, None)) as part:
+        assert part.start == START + 25 * MS
+        assert [m.stamp for m in part.between(0.0, 0.016)["imu"]] == [START + 30 * MS, START + 40 * MS]
