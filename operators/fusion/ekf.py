@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -300,6 +301,9 @@ class EkfFusion(Operator):
         before = self.state.last.before(name, message)
         if self.state.filter is None:
             self.state.ignored[f"{name}: before the beginning"] += 1
+            with suppress(Unusable):
+                for found in measurements(name, message, before, settings, around):
+                    self.state.inertial.saw(*found)
             return
         if settings.use == "control":
             self._command(name, message, settings, around)

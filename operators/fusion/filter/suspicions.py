@@ -46,6 +46,8 @@ _ROUNDS = 4
 """Linearisations of a fit at most; the next look goes on where they end."""
 _SETTLED = 1e-2
 """Change of rotations (rad), biases and errors (s, shares) that ends them."""
+_EXPLAINS = 1.5
+"""Mean of a fit's squared residuals by their covariance, above which the noise is other than told: it shows nothing."""
 LATE, SCALE = "late", "scale"
 _SPREAD = {LATE: 1.0, SCALE: 0.2}
 """Standard deviations of errors before anything is measured, s and shares."""
@@ -77,6 +79,11 @@ class Fit:
     until: int = 0
     end: State | None = None
     promise: float = 0.0
+
+    @property
+    def explains(self) -> bool:
+        """Returns whether what was measured agrees with the fit as well as its noise lets expect."""
+        return self.cost <= _EXPLAINS * max(self.freedom, 1)
 
 
 class Suspicions(Remembered):
@@ -115,12 +122,13 @@ class Suspicions(Remembered):
         without = self._fitted(window, False)
         if self._found is None and without.promise < _CEASES * enough:  # a second fit is not worth its time
             self._fits = [without]
-            return without
+            return without if without.explains else None
         self._fits = [without, self._fitted(window, True)]
         self._found = self._judged(without, self._fits[1], enough * (_CEASES if self._found else 1.0))
         if self._found is not None and self._found[1] == SCALE:
             return None
-        return self._fits[self._found is not None]
+        fit = self._fits[self._found is not None]
+        return fit if fit.explains else None
 
     def _suspects(self, window: Window) -> list[tuple[str, str]]:
         """Returns sensors and the kinds of error that are looked for: those that are not estimated."""
@@ -135,7 +143,7 @@ class Suspicions(Remembered):
 
     def _judged(self, without: Fit, erring: Fit, enough: float) -> tuple[str, str, float, float] | None:
         noise = max(erring.cost / erring.freedom, 1.0)  # what was told of it may be too small
-        if without.cost - erring.cost < enough * noise:
+        if without.cost - erring.cost < enough * noise or not erring.explains:
             return None
         k = int(np.argmax(np.abs(erring.errors) / erring.sigmas))
         return *self._suspected[k], float(erring.errors[k]), float(erring.sigmas[k])

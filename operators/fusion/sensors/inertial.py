@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 from dataflow.messages import Imu
 from dataflow.operator import Remembered
 from operators.fusion.filter.error_state import Noise
+from operators.fusion.filter.gate import threshold
 from operators.fusion.filter.history import Node, Sample
 from operators.fusion.filter.initialisation import Prior, first_node, rests
+from operators.fusion.filter.measurements import FullPose, Model, Position, Velocity
 from operators.fusion.sensors.covariances import Unusable
 
 Array = NDArray[np.float64]
 _LONGEST = 0.1
 """Seconds to the last sample above which that time does not count as the sensor's period."""
+
+_MOVES = 0.9999
+"""Share of what chance does to a measurement of a body at rest, above which it shows that the body moves."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +47,13 @@ class InertialSensor(Remembered):
     _first: int
     _last: int
     _noise: Noise | None
+    _places: dict[str, tuple[int, Array, Array]]
+    _moved: int
 
     def __init__(self, config: InertialConfig) -> None:
         self._config = config
         self._kept, self._first, self._last, self._noise = [], -1, -1, None
+        self._places, self._moved = {}, -1
 
     def sample(self, name: str, imu: Imu, time: int) -> Sample:
         """Returns the sample of a message that was measured at a time (ns).
@@ -66,6 +74,29 @@ class InertialSensor(Remembered):
         self._last, self._noise = time, noise
         return Sample(time, imu.angular_velocity, imu.linear_acceleration, noise)
 
+    def saw(self, time: int, sensor: str, model: Model, noise: Array) -> None:
+        """Takes a measurement from before the first estimate: a body that drives straight on feels like one at rest."""
+        if isinstance(model, Velocity) and len(model.value) == 3:  # one beam of a radar may see what moves
+            off = model.value
+        elif isinstance(model, Position | FullPose):
+            value = model.value if isinstance(model, Position) else model.place
+            known = np.isfinite(value)
+            noise = noise[: known.sum(), : known.sum()]
+            first = self._places.get(sensor)
+            if (
+                first is None
+                or not 0 <= time - first[0] <= self._config.rest * 1e9
+                or (np.isfinite(first[1]) != known).any()
+            ):
+                self._places[sensor] = time, value, noise
+                return
+            _, place, spread = first
+            off, noise = (value - place)[known], noise + spread
+        else:
+            return
+        if off @ np.linalg.solve(noise, off) > threshold(_MOVES, len(off)):
+            self._moved = max(self._moved, time)
+
     def begun(self, sample: Sample, prior: Prior, gravity: float, T_body_base: Array) -> tuple[Node, bool] | None:
         """Returns the first estimate, and whether it was made at rest, once the samples suffice."""
         config = self._config
@@ -73,7 +104,7 @@ class InertialSensor(Remembered):
         waited = (sample.time - self._first) * 1e-9
         if waited < config.rest or len(self._kept) < 3:
             return None
-        resting = rests(self._kept, prior)
+        resting = rests(self._kept, prior) and self._moved < self._kept[0].time
         if not resting and waited < config.patience:
             return None
         node = first_node(self._kept, prior, gravity, at_rest=resting, T_body_base=T_body_base)
