@@ -98,9 +98,10 @@ class EkfFusion(Operator):
 
     `standstill` and `slip` say what is known of the motion without a sensor of it (wheels say both by themselves).
     It begins when the inertial sensor has rested for `rest` and no position or speed shows otherwise, or after
-    `patience` in motion: gravity gives the level, rest the gyroscope's bias. With `start: unknown` position and heading come from the measurements; headings all
-    around are tried side by side until one is left, and the covariance holds them all. With `start: origin` the first
-    pose is the world frame. Odometry begins when the position is known (`sure`).
+    `patience` in motion: gravity gives the level, rest the gyroscope's bias. With `start: unknown` position and
+    heading come from the measurements; headings all around are tried side by side until one is left, and the
+    covariance holds them all. With `start: origin` the first pose is the world frame. Odometry begins when the
+    position is known (`sure`).
 
     Methods: Solà, "Quaternion kinematics for the error-state Kalman filter", 2017; Li and Mourikis, "Online temporal
     calibration for camera-IMU systems", 2014.
