@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -11,7 +12,7 @@ import msgpack
 from dataflow.execution.driver import Driver, Maker
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.source import SourceRunner
-from dataflow.graph.code import code_now, file_digests
+from dataflow.graph.code import ReloadError, code_now, file_digests
 from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_tunable
 from dataflow.process.channel import Channel
@@ -153,7 +154,12 @@ class Requests:
         if asked.get("reload") and asked.get("files"):
             return file_digests(code_now(type(maker.operator)).texts)
         if asked.get("reload"):
-            outcome = maker.reload()
+            try:
+                outcome = maker.reload()
+            except ReloadError as error:  # who asked may no longer wait
+                text = "is not reloaded, the old code goes on: %s"
+                logging.getLogger(__name__).warning(text, error, extra={"operator": maker.node.name})
+                raise
             self._channel.send("reloaded", operator=maker.node.name, **outcome)
             return outcome
         if asked.get("get"):

@@ -112,11 +112,13 @@ class ImageFolder(CalibratedImages):
             for entry in entries:
                 name = entry.name
                 fits = os.path.splitext(name)[1].lower() in SUFFIXES and fnmatch.fnmatchcase(name, self.pattern)
-                if name in known or not fits or not entry.is_file():  # reading a pipe would wait
+                if name in known or not fits:
                     continue
                 try:
+                    if not entry.is_file():  # reading a pipe would wait
+                        continue
                     found = entry.stat()
-                except FileNotFoundError:  # gone since
+                except OSError:  # gone since, or a link to itself
                     continue
                 yield _File(self._stamp(name, found.st_mtime_ns), name, found.st_size, found.st_mtime_ns)
 

@@ -64,6 +64,9 @@ class _Velodyne(Source, abstract=True):
                 continue
             if arrival - self._arrived > SILENCE:
                 self._begin()
+            if not self._is_of_the_turn(data[-1]):
+                self._others += 1
+                continue
             self._packets, self._arrived = self._packets + 1, arrival
             yield from self._clouds(self._decoder.decode(arrival * 1e-9, data))
         yield from self._clouds(self._decoder.finish())
@@ -99,7 +102,16 @@ class _Velodyne(Source, abstract=True):
 
     def _begin(self) -> None:
         """Begins a turn anew; the first one after it is whole only where it begins at its first packet."""
-        self._decoder = self._new_decoder()
+        self._decoder, self._one, self._strangers = self._new_decoder(), -1, set[int]()
+
+    def _is_of_the_turn(self, model: int) -> bool:
+        """Returns whether a packet's model is that of the packets before: a decoder takes one model."""
+        if self._one < 0:
+            self._one = model
+        if model != self._one and model not in self._strangers:
+            self._strangers.add(model)
+            self.log.warning("packets of model %d are left out: those before are of model %d", model, self._one)
+        return model == self._one
 
     def _new_decoder(self) -> Any:
         library = self._library

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 
 import pytest
 
-from dataflow.cli.commands.following.reload import _require_same_files
+from dataflow.cli.commands.following.reload import _require_same_files, reload
 from dataflow.client.processes import Refused
+from dataflow.execution.live import SET_UP_WITHIN
 from dataflow.graph.code import digest_of
 
 
@@ -21,3 +23,8 @@ def test_files_that_differ_from_those_of_the_other_machine_are_named(
     _require_same_files({"edited_here": digest_of(b"GAIN = 2\n"), "only_there": "0" * 64}, "arm")
     with pytest.raises(Refused, match=r"edited_here on machine 'arm' differs from here: install it there first"):
         _require_same_files({"edited_here": digest_of(b"GAIN = 1\n")}, "arm")
+
+
+def test_a_reload_is_waited_for_until_its_import_and_setup_are_given_up() -> None:
+    """Restoring a state that does not fit is followed by another `setup()`."""
+    assert inspect.signature(reload).parameters["timeout"].default >= 3 * SET_UP_WITHIN

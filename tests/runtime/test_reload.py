@@ -141,6 +141,9 @@ def test_new_code_goes_on_with_the_state_and_the_run_verifies_identical(folder: 
             _await_firings(processes, "after", 5)
         assert "is a source, which holds its device" in _command("ticks", code=1)
         assert "did you mean 'sum'?" in _command("sun", code=2)
+        (folder / "weights_reloaded.py").write_text("WEIGHT =\n")
+        assert "cannot import 'offering_reloaded:Sum'" in _command("sum", code=1)
+        (folder / "weights_reloaded.py").write_text(HELPER.replace("WEIGHT = 1", "WEIGHT = 10_000"))
 
     recording = _run(folder, reload)
 
@@ -154,6 +157,8 @@ def test_new_code_goes_on_with_the_state_and_the_run_verifies_identical(folder: 
     assert {file.name for file in store().iterdir()} == {digest for code in codes[:2] for digest in code.values()}
     with Recording(recording) as opened:
         totals = [number(item.message) for item in opened.messages(["test/sum/total"])]
+        said = [str(item.message.text) for item in opened.messages(["test/@/logs"])]  # type: ignore[attr-defined]
+    assert [text for text in said if text.startswith("is not reloaded, the old code goes on: cannot import 'offering")]
     assert all(b - a in (0, 1, 100, 10_000) for a, b in itertools.pairwise(totals))
 
     report = _verified(recording)

@@ -150,6 +150,7 @@ def test_what_is_no_file_is_no_image(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a_2.png")
     (tmp_path / "a_4.png").mkdir()
     (tmp_path / "a_5.png").symlink_to("nowhere.png")
+    (tmp_path / "a_6.png").symlink_to("a_6.png")
     source = ImageFolder(path=str(tmp_path))
     assert len(play(source)["image"]) == 2
     assert source.summary()["passed_over"] == 0

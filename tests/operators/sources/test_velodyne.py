@@ -152,6 +152,22 @@ def test_datagrams_of_anybody_are_counted_and_end_nothing(tmp_path: Path) -> Non
 
 
 @need
+def test_packets_of_another_sensors_model_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The decoder takes one model; which one, is decided anew after a silence."""
+    turns, other = [packet(k) for k in range(160)], packet(7)[:-1] + bytes([0x28])
+    alone = play(VelodyneFile(input=str(capture(tmp_path / "a.pcap", turns))))["cloud"]
+    mixed = VelodyneFile(input=str(capture(tmp_path / "b.pcap", [*turns[:50], other, *turns[50:], other])))
+    before = VelodyneFile(input=str(capture(tmp_path / "c.pcap", [other, *[b""] * 400, *turns])))
+
+    clouds = play(mixed)["cloud"]
+
+    assert [len(c.points) for c in clouds] == [len(c.points) for c in alone]  # type: ignore[attr-defined]
+    assert (mixed.summary()["packets"], mixed.summary()["other_datagrams"]) == (160, 2)
+    assert caplog.text.count("packets of model 40 are left out: those before are of model 34") == 1
+    assert len(play(before)["cloud"]) == len(alone)
+
+
+@need
 @pytest.mark.parametrize("content", [b"", b"no capture at all, but a longer text than a header"])
 def test_a_file_that_is_no_capture_is_named(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.pcap").write_bytes(content)

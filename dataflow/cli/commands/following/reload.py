@@ -20,7 +20,7 @@ def reload(
     wait: Wait = 0.0,
     timeout: Annotated[
         float, typer.Option("--timeout", metavar="SECONDS", help="Wait so long for an answer.", min=0.1)
-    ] = 30.0,
+    ] = 90.0,
     json: Json = False,
 ) -> None:
     """Let an operator of a live run go on with its code as it is in its files now.
