@@ -84,7 +84,7 @@ class Session:
         self._going = Going(first, self._first_line)
         self._breakpoints: dict[str, dict[int, Breakpoint]] = {}
         self._passes: Counter[tuple[str, int]] = Counter()
-        """Passes of the call under way at the lines of breakpoints with `hits`: editors set all anew when one is set."""
+        """Passes of the call under way by lines of breakpoints with `hits`; editors set all anew when one is set."""
         self._variables, self._frames = Variables(), list[FrameType]()
         self._homes = homes_of(debugger.node.operator.__module__)
         self._lines = Lines(self._at_line, self._homes)
