@@ -87,6 +87,7 @@ class There:
                 pass_fds=[theirs.fileno()],
                 env=place.variables(environment(threads)),
                 stdin=subprocess.DEVNULL,
+                stdout=2,  # results go to standard output
             )
         try:
             self._ask("make", node, seed, version, threads)

@@ -583,12 +583,16 @@ def _named_in(expression: str) -> set[str]:
 
 
 def _is_true_then(code: Any, fired: Fired) -> bool:
-    """Returns whether an expression is true of a call as it was recorded, as far as that is known: not the state behind
-    it, nor what is in no recorded stream."""
-    try:
-        return bool(eval(code, fired.names_then() | {"before": fired.states()[0]}))
-    except Exception:  # it needs what is not known, or what the recorded call did not make
-        return False
+    """Returns whether an expression is true of a call as it was recorded, or only because it differs from that, as far
+    as that is known: not what is in the state behind it, nor what is in no recorded stream."""
+    names = fired.names_then() | {"before": fired.states()[0], "after": object()}
+    for same in (True, False):
+        try:
+            if eval(code, names | {"same": same}):
+                return True
+        except Exception:  # it needs what is not known, or what the recorded call did not make
+            continue
+    return False
 
 
 def _evaluated(code: Any, text: str, names: dict[str, Any]) -> Any:

@@ -12,6 +12,17 @@ import pytest
 SUPPORT = str(Path(held_runs.__file__).parent)
 
 
+LOUD = """
+import held_runs
+
+
+class Loud(held_runs.Odometry):
+    def setup(self):
+        super().setup()
+        print("what operators print")
+"""
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> str:
     faults = held_runs.Faults(still=[("odometry", 45, 55)])
@@ -34,11 +45,16 @@ def test_the_loss_is_named_with_what_it_cost_and_what_is_not_known(dataflow, run
 @pytest.mark.long
 def test_it_is_json_with_another_graph_and_settings(dataflow, run: str, tmp_path: Path) -> None:
     graph = tmp_path / "held.yaml"
-    graph.write_text(held_runs.TEXT.format(steps=80, score="Score"))
-    words = ("--graph", str(graph), "--set", "drive.steps=80", "--path", SUPPORT, "--json")
+    text = held_runs.TEXT.format(steps=80, score="Score")
+    graph.write_text(text.replace("held_runs:Odometry", "loud_odometry:Loud"))
+    (tmp_path / "loud_odometry.py").write_text(LOUD)
+    folders = ("--path", SUPPORT, "--path", str(tmp_path))
+    words = ("--graph", str(graph), "--set", "drive.steps=80", *folders, "--json")
 
-    told = json.loads(dataflow("drops", run, "--worse", "end_error > 5", *words).stdout)
+    found = dataflow("drops", run, "--worse", "end_error > 5", *words)
+    told = json.loads(found.stdout)
 
+    assert "what operators print" in found.stderr
     assert [loss["stamp"] for loss in told["named"]] == [held_runs.STAMP + 10**9]
     assert told["minimal"] is True
 

@@ -19,6 +19,7 @@ from dataflow.cli.support.arguments import chosen_streams, existing, graph_file,
 from dataflow.cli.support.output import about_a_file, friendly_errors, plural, seconds, size, table
 from dataflow.cli.support.progress import RunDisplay, shown, waiting_for
 from dataflow.cli.support.report import is_lacking, print_report, report_json
+from dataflow.execution.failure import OperatorFailure
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, RunReport, Status
 from dataflow.text import jsonable
 
@@ -372,6 +373,14 @@ def test_an_error_about_a_file_is_told_by_its_class(last: str, file: bool) -> No
 
     assert about_a_file(trace) is file
     assert not about_a_file(last)
+
+
+def test_an_operator_that_fails_when_it_is_called_again_is_no_internal_error(capsys) -> None:
+    with pytest.raises(typer.Exit) as ended, friendly_errors():
+        raise OperatorFailure("odometry", "setup()", KeyError("gain"))
+
+    assert ended.value.exit_code == 2
+    assert "error: operator 'odometry' failed in setup(): KeyError: 'gain'" in capsys.readouterr().err
 
 
 def test_an_interruption_is_no_error(capsys) -> None:

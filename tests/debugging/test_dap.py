@@ -348,6 +348,27 @@ def test_a_hit_count_counts_the_passes_of_a_call_forwards_and_back(
         assert float(client.value("value")) == values[-2]
 
 
+def test_passes_are_counted_on_where_breakpoints_are_set_anew(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, 1, stopOnEntry=False) as client:
+        client.breakpoints(ADDED, hitCondition="1")
+        client.ask("configurationDone")
+        client.stopped()
+        assert client.call() == 1
+
+        client.breakpoints(ADDED, hitCondition="1")
+
+        client.go("continue")
+        assert client.call() == 2
+
+
+def test_a_condition_that_raises_is_said_once(recorded: tuple[Recording, Path]) -> None:
+    with editing(recorded, 1, stopOnEntry=False) as client:
+        client.breakpoints(ADDED, condition="nothing > 1", hitCondition="1")
+        client.ask("configurationDone")
+        client.stopped()
+        assert sum("raises NameError" in text for text in client.told) == 1
+
+
 def test_a_log_point_prints_once_and_does_not_stop(recorded: tuple[Recording, Path]) -> None:
     with editing(recorded, 2) as client:
         client.breakpoints(ADDED, condition="value > 2", logMessage='adds {value:.2f} to "{added}"')
@@ -431,7 +452,7 @@ def test_a_breakpoint_that_cannot_be_says_why(recorded: tuple[Recording, Path]) 
         assert not beyond["verified"]
         told = client.ask("setBreakpoints", source={"path": np_file()}, breakpoints=[{"line": 1}])
         assert "not for libraries" in told["breakpoints"][0]["message"]
-        for more in ({"condition": "value >"}, {"hitCondition": "often"}, {"hitCondition": "% 0"}, {"logMessage": "{"}):
+        for more in ({"condition": "value >"}, {"hitCondition": "often"}, {"hitCondition": "0"}, {"logMessage": "{"}):
             (wrong,) = client.breakpoints(ADDED, **more)
             assert not wrong["verified"]
             assert next(iter(more.values())) in wrong["message"]

@@ -606,8 +606,8 @@ def test_an_expression_that_could_be_tried_in_no_call_is_an_error(
     ("line", "text", "found"),
     [
         ("until inp.x.sta", "inp.x.sta", ["inp.x.stamp"]),
-        ('print before["to', "to", ['total"]']),
-        ("print after['to", "to", ["total']"]),
+        ('print before["to', "to", ["total"]),
+        ("print after['to", "to", ["total"]),
         ('print before["la', "la", []),  # no name of the state, and no keyword of Python
         ('until out.total == "whi', "whi", []),
     ],

@@ -10,6 +10,7 @@ import urllib.error
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from dataclasses import dataclass
 from email.message import Message as Headers
 from functools import partial
 from pathlib import Path
@@ -240,24 +241,36 @@ def test_what_a_call_changes_in_its_object_and_credentials_are_no_miss() -> None
     assert again(recorded(body("of the robot")), body("of the desk")).result.first is None
 
 
+@dataclass
+class Turn:
+    """One text of a conversation."""
+
+    role: str
+    content: str
+
+
+Said = Callable[[str, str], Any]
+
+
 class Conversation:
     """A client that keeps what was said, and since when it has been silent."""
 
-    def __init__(self, prompt: str) -> None:
-        self.messages, self.since = [{"role": "system", "content": prompt}], random.random()
+    def __init__(self, prompt: str, said: Said) -> None:
+        self.messages, self.since = [said("system", prompt)], random.random()
 
     def ask(self) -> Any:
-        self.messages.append({"role": "user", "content": "and now?"})
+        self.messages.append(self.messages[0])
         self.since = random.random()
         return next(WORLD)
 
 
-def test_a_conversation_that_begins_with_another_prompt_is_a_miss() -> None:
+@pytest.mark.parametrize("said", [Turn, lambda role, content: {"role": role, "content": content}])
+def test_a_conversation_that_begins_with_another_prompt_is_a_miss(said: Said) -> None:
     def body(prompt: str) -> Body:
         clients: list[Conversation] = []
 
         def asking(operator: Asking, x: FeatureVector) -> float:
-            clients[:] = clients or [Conversation(prompt)]
+            clients[:] = clients or [Conversation(prompt, said)]
             return float(operator.effect(clients[0].ask))
 
         return asking

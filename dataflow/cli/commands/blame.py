@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -125,7 +126,7 @@ def drops(
         from dataflow.drops.search import Drops
         from dataflow.recording import Recording
 
-        with Recording(recording) as opened, progress() as show:
+        with Recording(recording) as opened, progress() as show, redirect_stdout(sys.stderr):
 
             def watch(replays: int, left: int) -> None:
                 show(f"{plural(replays, 'replay')}; losses undone in the next one: {count(left)}")
@@ -181,7 +182,7 @@ def _found(recording: Path, field: Field, graph: Graph | None, budget: float, to
     from dataflow.blame.chain import Blame
     from dataflow.recording import Recording
 
-    with Recording(recording) as opened, progress() as show:
+    with Recording(recording) as opened, progress() as show, redirect_stdout(sys.stderr):
 
         def watch(made: int, links: int) -> None:
             show(f"{plural(made, 'call')} made again, {plural(links, 'link')} found")

@@ -6,6 +6,7 @@ import re
 import shlex
 import sys
 import time
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -181,7 +182,8 @@ def _capture(
     with Recording(recording) as opened:
         debugger = Debugger(opened, operator, graph)
         try:
-            found = captured(opened, debugger, firing, predicate)
+            with redirect_stdout(sys.stderr):  # what operators print
+                found = captured(opened, debugger, firing, predicate)
         except SyntaxError as error:
             raise fail(f"--predicate {predicate}: no Python expression: {error.msg}") from None
         finally:

@@ -241,7 +241,7 @@ class Shell(cmd.Cmd):
         if (quoted := _PART.search(head)) is not None:
             before, after = (None, None) if at is None else at.states()
             keys = _keys(before if quoted[1] == "before" else after, quoted[2])
-            return [f"{key}{quoted[3]}]" for key in keys if key.startswith(text)]
+            return [key for key in keys if key.startswith(text)]  # readline closes the quote
         if head.count('"') % 2 or head.count("'") % 2:
             return []
         names = {} if at is None else at.names() | dict.fromkeys(("before", "after"))

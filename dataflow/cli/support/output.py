@@ -166,6 +166,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     from dataflow.chaos.plan import ChaosError
     from dataflow.client.attach import Lost, NotRunning
     from dataflow.environments import EnvError
+    from dataflow.execution.failure import OperatorFailure
     from dataflow.graph import GraphError, OperatorImportError
     from dataflow.interop.mapping import MappingError
     from dataflow.machines.keys import KeysError
@@ -204,6 +205,8 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
             return message, details, INTERRUPTED if error.interrupted else DIFFERENT
         case Lost():
             return str(error), "", DIFFERENT
+        case OperatorFailure():  # of calls that are made again
+            return str(error), error.traceback, COULD_NOT_RUN
         case BrokenPipeError():
             return None
         case OSError() if error.strerror and error.filename:

@@ -83,8 +83,8 @@ class Session:
         self._connection, self._wire, self._debugger, self._number = connection, Wire(connection), debugger, number
         self._going = Going(first, self._first_line)
         self._breakpoints: dict[str, dict[int, Breakpoint]] = {}
-        self._passes: Counter[Breakpoint] = Counter()
-        """Passes of the call under way at breakpoints with `hits`."""
+        self._passes: Counter[tuple[str, int]] = Counter()
+        """Passes of the call under way by lines of breakpoints with `hits`; editors set all anew when one is set."""
         self._variables, self._frames = Variables(), list[FrameType]()
         self._homes = homes_of(debugger.node.operator.__module__)
         self._lines = Lines(self._at_line, self._homes)
@@ -299,18 +299,19 @@ class Session:
 
     def _count(self, frame: FrameType) -> None:
         found = self._breakpoint(frame)
-        if found is not None and found.hits is not None and self._is_so(found, frame):
-            self._passes[found] += 1
+        if found is not None and found.hits is not None and self._is_so(found, frame, told=False):
+            self._passes[_place(frame)] += 1
 
-    def _is_so(self, found: Breakpoint, frame: FrameType) -> bool:
+    def _is_so(self, found: Breakpoint, frame: FrameType, *, told: bool = True) -> bool:
         try:
             return found.condition is None or bool(eval(found.condition, frame.f_globals, frame.f_locals))
         except Exception as error:
-            self._say(f"the condition {found.text} raises {readable(error)}", "stderr")
+            if told:
+                self._say(f"the condition {found.text} raises {readable(error)}", "stderr")
             return True
 
     def _is_hit(self, found: Breakpoint, frame: FrameType) -> bool:
-        return self._is_so(found, frame) and (found.hits is None or found.hits(self._passes[found]))
+        return self._is_so(found, frame) and (found.hits is None or found.hits(self._passes[_place(frame)]))
 
     def _breaks(self, frame: FrameType, count: int) -> str:
         found = self._breakpoint(frame)
@@ -564,6 +565,10 @@ class Session:
 _real = cache(os.path.realpath)
 
 
+def _place(frame: FrameType) -> tuple[str, int]:
+    return _real(frame.f_code.co_filename), frame.f_lineno
+
+
 def _breakpoint(wanted: Mapping[str, Any]) -> Breakpoint:
     """Returns a breakpoint as it is asked for. Raises LookupError for one that cannot be, with the reason."""
     text, log = wanted.get("condition") or "", wanted.get("logMessage") or ""
@@ -587,7 +592,7 @@ def _hits(text: str) -> Callable[[int], bool] | None:
     if not text.strip():
         return None
     found = re.fullmatch(r"\s*(==|>=|<=|>|<|%|)\s*(\d+)\s*", text)
-    if found is None or (found[1] == "%" and not int(found[2])):
+    if found is None or (found[1] in ("", "==", "%") and not int(found[2])):
         raise LookupError(f"the hit count {text} is none of: 3, >= 3, > 3, <= 3, < 3, % 3")
     number = int(found[2])
     if found[1] == "%":

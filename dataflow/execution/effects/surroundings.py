@@ -6,6 +6,7 @@ import re
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from functools import partial
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
@@ -111,6 +112,8 @@ def _of_operator(operator: Operator, held: Mapping[str, Any]) -> dict[str, Any]:
 def _is_text(value: Any) -> bool:
     if isinstance(value, Mapping):
         return all(_is_text(part) for pair in value.items() for part in pair)
+    if is_dataclass(value) and not isinstance(value, type):
+        return all(_is_text(getattr(value, each.name)) for each in fields(value))
     return isinstance(value, str | bool) or (isinstance(value, list | tuple) and all(map(_is_text, value)))
 
 
