@@ -564,6 +564,10 @@ def _alike(value: Any, other: Any) -> bool:
 
     if isinstance(value, np.ndarray) and isinstance(other, np.ndarray):
         return (value.dtype, value.shape) == (other.dtype, other.shape) and value.tobytes() == other.tobytes()
+    if isinstance(value, list | tuple) and type(value) is type(other):
+        return len(value) == len(other) and all(map(_alike, value, other))
+    if isinstance(value, Mapping) and isinstance(other, Mapping):
+        return value.keys() == other.keys() and all(_alike(value[key], other[key]) for key in value)
     try:
         return bool(value == other or (value != value and other != other))
     except Exception:  # such as an array beside a number

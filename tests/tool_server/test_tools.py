@@ -209,6 +209,10 @@ def test_a_value_that_stays_not_a_number_does_not_change() -> None:
 
     assert _alike(nan, float("nan"))
     assert _alike(half, half.copy())
+    assert _alike((nan, [1, {"a": half}]), (float("nan"), [1, {"a": half.copy()}]))
+    assert not _alike((nan, 1), (nan, 2))
+    assert not _alike([nan], [nan, nan])
+    assert not _alike({"a": nan}, {"b": nan})
     assert not _alike(half, half.astype(np.float32))
     assert not _alike(np.array([0.10000001]), np.array([0.1]))
     assert not _alike(half, 0.5)
