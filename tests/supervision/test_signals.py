@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 
+from dataflow.supervision.interrupts import ONE_REQUEST, interrupts
+
 ASKS = """
 import os, signal
 from dataflow.supervision.interrupts import interrupts
@@ -36,3 +38,14 @@ def test_a_run_is_asked_to_end_by_each_of_three_signals() -> None:
 def test_signals_that_were_ignored_at_the_start_stay_ignored() -> None:
     assert asked("HUP") == ["SIGHUP 0", "SIGINT 1", "SIGTERM 1"]  # as nohup does
     assert asked("INT", "HUP") == ["SIGHUP 0", "SIGINT 0", "SIGTERM 1"]  # as a script's background job is begun
+
+
+def test_a_signal_that_is_sent_twice_at_once_asks_once() -> None:
+    """`timeout` sends it to the process, and then to its group."""
+    now, stops = [100.0], list[float]()
+    with interrupts(lambda: stops.append(now[0]), lambda: now[0]):
+        for after in (0.0, 0.02, 2 * ONE_REQUEST):
+            now[0] += after
+            signal.raise_signal(signal.SIGTERM)
+
+    assert stops == [100.0, now[0]]
