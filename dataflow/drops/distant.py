@@ -114,7 +114,8 @@ class There:
                 raise ReplayError(f"{self._node.name}: {name}() is not over after {LONGEST:g} s in its environment")
             what, found = pickle.loads(self._pipe.recv_bytes())
         except (EOFError, OSError) as error:
-            code = self._process.wait(LEAVE_WITHIN)
+            self.close()
+            code = self._process.returncode
             raise ReplayError(f"{self._node.name}: its process in {self._node.env} ended ({code})") from error
         if what == "failed":
             raise OperatorFailure(self._node.name, found[0], Raised(found[1]))
