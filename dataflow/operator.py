@@ -337,15 +337,14 @@ def validate_parameters(cls: type[Operator], params: Mapping[str, Any]) -> pydan
         raise ParameterError("\n".join(_explain(cls, fault) for fault in error.errors())) from None
 
 
-def outputs_of(operator: Operator, returned: Outputs) -> dict[str, Message]:
+def outputs_of(spec: OperatorSpec, returned: Outputs) -> dict[str, Message]:
     """Returns what `process()` returned as port → message, checked against the declared ports. Raises `OutputError`."""
     if returned is None:
         return {}
-    spec = operator.spec
+    only = spec.only_output
+    if only is not None and isinstance(returned, only.types):
+        return {only.name: returned}
     if isinstance(returned, Message):
-        only = spec.only_output
-        if only is not None and isinstance(returned, only.types):
-            return {only.name: returned}
         dynamic = [p for p in spec.outputs.values() if not p.static]
         if len(dynamic) != 1:
             raise OutputError(

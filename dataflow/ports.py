@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import pydantic
@@ -208,26 +207,24 @@ class OperatorSpec:
     every: int | None
     process_takes: tuple[str, ...]
     state: Any = None
+    absent: Mapping[str, tuple[()] | None] = field(init=False, repr=False, compare=False)
+    """What `process()` is given on each input where that takes no part."""
+    takes_context: bool = field(init=False, repr=False, compare=False)
+    """True when `process()` has a parameter named `context`."""
+    only_output: OutputPort | None = field(init=False, repr=False, compare=False)
+    """The one output that is not static, where there is exactly one."""
+
+    def __post_init__(self) -> None:
+        """Derives what every firing asks for: a plain attribute costs a tenth of a cached property."""
+        dynamic = [port for port in self.outputs.values() if not port.static]
+        absent = {name: () if port.kind == "batch" else None for name, port in self.inputs.items()}
+        object.__setattr__(self, "absent", absent)
+        object.__setattr__(self, "takes_context", "context" in self.process_takes)
+        object.__setattr__(self, "only_output", dynamic[0] if len(dynamic) == 1 else None)
 
     @property
     def triggers(self) -> tuple[InputPort, ...]:
         return tuple(p for p in self.inputs.values() if p.kind == "in")
-
-    @cached_property
-    def absent(self) -> Mapping[str, tuple[()] | None]:
-        """Returns what `process()` is given on each input where that takes no part."""
-        return {name: () if port.kind == "batch" else None for name, port in self.inputs.items()}
-
-    @cached_property
-    def takes_context(self) -> bool:
-        """Tells whether `process()` has a parameter named `context`."""
-        return "context" in self.process_takes
-
-    @cached_property
-    def only_output(self) -> OutputPort | None:
-        """The one output that is not static, where there is exactly one."""
-        dynamic = [port for port in self.outputs.values() if not port.static]
-        return dynamic[0] if len(dynamic) == 1 else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,8 @@ from dataflow.execution.generators.shared_generators import AT_WORK
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.execution.threads import limit_threads_again
 from dataflow.graph.model import Node
-from dataflow.messages.base import Message
-from dataflow.operator import FINDING, Context, Operator, OutputError, Outputs, outputs_of
+from dataflow.messages.base import Message, lacking
+from dataflow.operator import FINDING, Context, Operator, OperatorSpec, OutputError, Outputs, outputs_of
 from dataflow.sync import NEVER, Entry, Firing, InputValue
 
 Place = tuple[int, int]
@@ -73,21 +74,26 @@ class Calls:
 
     def process(self, firing: Firing) -> dict[str, Message]:
         """Returns what `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
+        operator, effects, stamp = self.operator, self.effects, firing.stamp
         AT_WORK.fires = True
-        AT_WORK.operator, AT_WORK.stamp = self.node.name, firing.stamp
+        AT_WORK.operator, AT_WORK.stamp = self.node.name, stamp
         AT_WORK.begun += 1
         try:
-            seed = FiringSeed(self._seeded_by, firing.stamp)
+            seed = FiringSeed((self._seeded_by, stamp))
             seed_generators(seed, self.version)
-            self.operator.seed_rng(seed)
-            self._firing, self._thread, self.effects.asked = firing.stamp, threading.get_ident(), 0
-            outputs = outputs_of(self.operator, _call(self.operator, firing))
-            if self.effects.missed is not None:  # the operator has caught it
-                raise self.effects.missed
-            complete_outputs(self.operator.spec, outputs, firing)
+            operator.seed_rng(seed)
+            self._firing, self._thread, effects.asked = stamp, get_ident(), 0
+            spec = operator.spec
+            outputs = outputs_of(spec, _call(operator, spec, firing))
+            if effects.missed is not None:  # the operator has caught it
+                raise effects.missed
+            for message in outputs.values():
+                if lacking(message):
+                    complete_outputs(spec, outputs, firing)
+                    break
             return outputs
         except RAISED as error:
-            missed = self.effects.missed
+            missed = effects.missed
             if missed is None or error is missed or isinstance(error, KeyboardInterrupt):
                 raise
             raise missed from error  # the operator has raised another error in its place
@@ -154,7 +160,7 @@ class Calls:
         stamp = self._firing
         if stamp is None:
             problem = "effect() is for process() and finish(): an answer is recorded with a firing"
-        elif threading.get_ident() != self._thread:
+        elif get_ident() != self._thread:
             problem = "effect() on another thread than process(): use the threads inside the call"
         elif self._asking:
             problem = "effect() inside an effect: its answer is part of the outer one's"
@@ -187,15 +193,15 @@ def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
         raise OperatorFailure(name, "summary()", error) from error
 
 
-def _call(operator: Operator, firing: Firing) -> Outputs:
+def _call(operator: Operator, spec: OperatorSpec, firing: Firing) -> Outputs:
     if firing.kind == "finish":
         return operator.finish()
     arguments: dict[str, Any] = {}
     given = firing.inputs
-    for name, absent in operator.spec.absent.items():
+    for name, absent in spec.absent.items():
         value = given.get(name, absent)
         arguments[name] = value.value if value.__class__ is Entry else value_of(value)
-    if operator.spec.takes_context:
+    if spec.takes_context:
         arguments["context"] = Context(firing.stamp, firing.tick, firing.stale, firing.late)
     return operator.process(**arguments)
 

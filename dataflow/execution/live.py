@@ -122,7 +122,7 @@ class LiveRunner(OperatorRunner):
         return [*mine, *theirs], more + Counter(others)
 
     def has_drops(self) -> bool:
-        return bool(self._log.pending) or self.aligner.has_drops()
+        return bool(self._log.pending or self.aligner.dropped)
 
     # What streams say
 

@@ -51,12 +51,17 @@ class OutputPorts:
         self.node, self.emitter, self.lossy = node, emitter, lossy
         streams = node.outputs  # a recorded graph lacks the ports that its operators have got since
         self.states = {name: PortState(port, streams[name]) for name, port in spec.outputs.items() if name in streams}
-        self.emitted = 0
         self.withheld: Counter[str] = Counter()
         """Messages that were not sent because their stamps did not increase, by port."""
         self._prepared: list[Entry] = []
         self._nothing = (None,) * len(self.states)
         self._all = tuple(self.states.values())
+        self._named = tuple(self.states.items())
+
+    @property
+    def emitted(self) -> int:
+        """Returns how many messages were sent so far."""
+        return sum(state.digest.count for state in self._all)
 
     def prepare(self, messages: Mapping[str, Message], firing: int) -> tuple[Emission | None, ...]:
         """Checks and numbers what one firing emitted; `publish` sends it, after the firing was recorded.
@@ -67,11 +72,12 @@ class OutputPorts:
         if not messages:
             return self._nothing
         for name, message in messages.items():
-            if message.stamp < firing or message.stamp <= self.states[name].last:
+            stamp = message.stamp
+            if stamp < firing or stamp <= self.states[name].last:
                 self.check(messages, firing)
                 break
         emissions: list[Emission | None] = []
-        for name, state in self.states.items():
+        for name, state in self._named:
             emitted = messages.get(name)
             if emitted is None:
                 emissions.append(None)
@@ -87,7 +93,6 @@ class OutputPorts:
             state.last = state.promised = stamp
             emissions.append(Emission(seq, stamp, digest))
             state.seq = seq + 1
-            self.emitted += 1
         return tuple(emissions)
 
     def check(self, messages: Mapping[str, Message], firing: int) -> None:
@@ -113,7 +118,6 @@ class OutputPorts:
         state = self.states[name]
         digest = message.digest()
         state.digest.update(digest)
-        self.emitted += 1
         state.last = state.promised = max(state.promised, message.stamp)
         self.emitter.message(state.stream, Entry(message.stamp, message, seq, incarnation, digest, state.stream))
 
@@ -126,11 +130,11 @@ class OutputPorts:
 
     def publish(self) -> None:
         """Sends what was prepared, in order."""
-        if not self._prepared:
-            return
-        prepared, self._prepared = self._prepared, []
-        for entry in prepared:
-            self.emitter.message(entry.stream, entry)
+        prepared = self._prepared
+        if prepared:
+            self._prepared = []
+            for entry in prepared:
+                self.emitter.message(entry.stream, entry)
 
     def begin(self, incarnation: int, *, stamps_go_back: bool = False) -> None:
         """Begins a new incarnation of every dynamic port: numbers from 0 again, and stamps too if they may go back."""

@@ -100,7 +100,7 @@ class OperatorRunner(Runner):
 
     def has_drops(self) -> bool:
         """Returns whether anything was dropped since the last record."""
-        return self.aligner.has_drops()
+        return bool(self.aligner.dropped)
 
     def waiting(self) -> tuple[int | None, dict[str, int]]:
         """The stamp that cannot be decided yet, and the frontiers that would decide it, by input."""
@@ -189,11 +189,12 @@ class OperatorRunner(Runner):
             failure = OperatorFailure(self.node.name, f"{kind} at stamp {firing.stamp}", error)
             self._record(kind, firing, started, (), failure.summary)
             raise failure from error
-        self.firings += kind != "finish"
+        if kind != "finish":
+            self.firings += 1
         self._record(kind, firing, started, emissions, None)
         self.ports.publish()
-        spacing = self.snapshots if kind != "finish" else None
-        if spacing is not None and spacing.is_due(firing.stamp, self.work.cpu_ns, self.firings):
+        spacing = self.snapshots
+        if spacing is not None and kind != "finish" and spacing.is_due(firing.stamp, self.work.cpu_ns, self.firings):
             self._snapshot(firing.stamp, spacing)
 
     def _call_watched(self, firing: Firing) -> dict[str, Message]:

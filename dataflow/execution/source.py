@@ -115,7 +115,7 @@ class SourceRunner:
             seed_generators(change_seed(self.seed, self.node.name, "step", self.records.incarnation, self._pulled))
         try:
             for step in self._steps:
-                messages = outputs_of(self.operator, step)
+                messages = outputs_of(self.operator.spec, step)
                 if messages:
                     require_complete(self.operator.spec, messages, "stream()")
                     if shift := self.clock.shift(step_stamp(messages)):

@@ -50,14 +50,13 @@ class Work:
         """
         if self._exact:
             self.cpu_ns += time.thread_time_ns() - self._cpu
-        wall = time.monotonic_ns() - self._wall
-        if not self._exact:
-            if wall < PREEMPTED:
-                self.cpu_ns += wall
-            else:
-                now = time.thread_time_ns()
-                self.cpu_ns += min(wall, now - self._cpu)
-                self._cpu = now
+            wall = time.monotonic_ns() - self._wall
+        elif (wall := time.monotonic_ns() - self._wall) < PREEMPTED:
+            self.cpu_ns += wall
+        else:
+            now = time.thread_time_ns()
+            self.cpu_ns += min(wall, now - self._cpu)
+            self._cpu = now
         self.wall_ns += wall
         self.mean_ns += (wall - self.mean_ns) // SETTLES_IN
 

@@ -288,9 +288,10 @@ class Message(_Declared):
 
     def digest(self) -> bytes:
         """xxh3-128 (16 bytes) over schema, stamp, header fields and, per array, dtype, shape and bytes."""
-        cached: bytes | None = self.__dict__.get("_digest")
+        state = self.__dict__
+        cached: bytes | None = state.get("_digest")
         if cached is None:
-            cached = self.__dict__["_digest"] = (self._made or self._compile()).digest(self)
+            cached = state["_digest"] = (self._made or self._compile()).digest(self)
         return cached
 
     def compute_digest(self) -> bytes:
@@ -363,10 +364,13 @@ class Message(_Declared):
         return f"{type(self).__name__}({', '.join(words)})"
 
 
-def lacking(message: Message) -> list[str]:
+def lacking(message: Message) -> Sequence[str]:
     """Returns the names of what a message was constructed without and that is not filled in yet."""
     state = message.__dict__
-    return [name for name in message._filled if name not in state]
+    for name in message._filled:
+        if name not in state:
+            return [each for each in message._filled if each not in state]
+    return ()
 
 
 def complete(message: Message, stamp: int, frame: str) -> None:

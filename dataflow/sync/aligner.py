@@ -25,7 +25,7 @@ leave room, this is the reading:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import count
 from typing import NamedTuple
 
@@ -62,6 +62,8 @@ class Aligner:
         self.ends: dict[str, StreamEnd] = {}
         """The streams that ended, and how."""
         self._drop_log = DropLog()
+        self.dropped: Collection[Drop] = self._drop_log.pending
+        """The drops that were not taken (`take_drops`)."""
         self._inputs = Inputs(spec)
         self._streams, lanes = self._inputs.streams, self._inputs.lanes
         triggers = [lane for trigger in spec.triggers for lane in lanes[trigger.name]]
@@ -270,10 +272,6 @@ class Aligner:
         """Tells how many messages came after what needed them was decided, by input. Triggers among them are dropped as
         `late`; Sampled and Batch messages still serve the firings to come."""
         return self._drop_log.late
-
-    def has_drops(self) -> bool:
-        """Tells whether there is a drop that was not taken."""
-        return bool(self._drop_log.pending)
 
     def take_drops(self) -> list[Drop]:
         """The drops since this was last asked, at most the last `KEPT`."""

@@ -6,7 +6,7 @@ It decides what `Aligner` does, which it falls back upon for everything else; he
 from __future__ import annotations
 
 from dataflow.sync.aligner import Aligner
-from dataflow.sync.entries import Firing, InputValue, Waiting
+from dataflow.sync.entries import Entry, Firing, InputValue, Waiting
 from dataflow.sync.spec import AlignSpec
 from dataflow.sync.stamps import FOREVER, NEVER
 
@@ -27,7 +27,26 @@ class SingleAligner(Aligner):
         super().__init__(spec)
         (trigger,) = spec.triggers
         (self._lane,) = self._inputs.lanes[trigger.name]
+        self._state = self._lane.state
         self._many = trigger.many
+
+    def push(self, stream: str, entry: Entry) -> None:
+        lane, state, stamp = self._lane, self._state, entry.stamp
+        if (
+            stream == state.name
+            and entry.stream
+            and entry.incarnation == state.incarnation
+            and stamp > state.promised
+            and stamp > lane.frontier
+            and stamp < FOREVER
+            and state.first is not None
+            and not state.ended
+        ):
+            lane.entries.append(entry)
+            state.last = state.promised = lane.frontier = stamp
+            self._undecided.settled = False
+        else:
+            super().push(stream, entry)
 
     def poll(self, most: int | None = None) -> Firing | None:
         lane = self._lane

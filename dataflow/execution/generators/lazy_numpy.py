@@ -65,6 +65,7 @@ class MT19937(np.random.MT19937):
 
 
 _GENERATOR = MT19937(0)
+_LOCK: _SeedingLock = MT19937.lock
 _STATE_WORDS = 624
 _WORDS = (ctypes.c_uint32 * (_STATE_WORDS + 1)).from_address(_GENERATOR.ctypes.state_address)
 """The state where numpy keeps it: the words that are drawn, and how many of them have been."""
@@ -74,10 +75,10 @@ def seed_lazily(seed: SupportsInt) -> None:
     """Seeds the global generator, as `numpy.random.seed` does, with the low 32 bits of `seed`, at the next access
     to it."""
     if mtrand._rand._bit_generator is _GENERATOR:
-        _GENERATOR.lock.pending = seed
+        _LOCK.pending = seed
     elif type(mtrand._rand._bit_generator) is np.random.MT19937:
         mtrand.set_bit_generator(_GENERATOR)
-        _GENERATOR.lock.pending = seed
+        _LOCK.pending = seed
     else:
         np.random.seed(int(seed) & 0xFFFFFFFF)
 
@@ -88,8 +89,8 @@ Held = tuple[bool, Any]
 
 def held() -> Held:
     """Returns what `give_back` brings back: what is pending, or the state; does not seed the generator."""
-    if mtrand._rand._bit_generator is _GENERATOR and _GENERATOR.lock.pending is not None:
-        return True, _GENERATOR.lock.pending
+    if mtrand._rand._bit_generator is _GENERATOR and _LOCK.pending is not None:
+        return True, _LOCK.pending
     return False, (mtrand._rand._bit_generator, np.random.get_state(legacy=False))
 
 
@@ -110,10 +111,9 @@ def peek() -> tuple[object, ...]:
 
     While a seed is pending the value is a number, since a draw settles the seed; copying the state takes 30 µs.
     """
-    lock = _GENERATOR.lock
-    settled = lock.settled
+    settled = _LOCK.settled
     if mtrand._rand._bit_generator is _GENERATOR:
-        if lock.pending is not None:
+        if _LOCK.pending is not None:
             return (settled,)
         return settled, _WORDS[0], _WORDS[_STATE_WORDS]  # all words are made anew once all have been drawn
     state: Any = np.random.get_state(legacy=False)

@@ -11,12 +11,12 @@ from dataflow.execution.generators.loading import LOADS
 def seed_libraries(seed: SupportsInt) -> None:
     """Seeds the libraries that are loaded; one that is just being loaded by another thread is left out."""
     modules = sys.modules
-    if (torch := modules.get("torch")) is not None:
-        _seed_torch(torch, seed)
-    if (cv2 := modules.get("cv2")) is not None:
-        _seed_cv2(cv2, seed)
-    if (open3d := modules.get("open3d")) is not None:
-        _seed_open3d(open3d, seed)
+    if "torch" in modules:
+        _seed_torch(modules.get("torch"), seed)
+    if "cv2" in modules:
+        _seed_cv2(modules.get("cv2"), seed)
+    if "open3d" in modules:
+        _seed_open3d(modules.get("open3d"), seed)
 
 
 def _seed_torch(torch: Any, seed: SupportsInt) -> None:

@@ -36,7 +36,7 @@ def version_of(run_facts: Mapping[str, str]) -> int:
 
 def firing_seed(graph_seed: int, operator: str, stamp: int) -> int:
     """63 bits from (graph seed, operator, stamp); independent of grouping, machine and run."""
-    return int(FiringSeed(f"{graph_seed}/{operator}/", stamp))
+    return int(FiringSeed((f"{graph_seed}/{operator}/", stamp)))
 
 
 def change_seed(graph_seed: int, operator: str, what: str, incarnation: int, stamp: int) -> int:
@@ -45,17 +45,17 @@ def change_seed(graph_seed: int, operator: str, what: str, incarnation: int, sta
     return xxhash.xxh3_64_intdigest(text.encode()) & (2**63 - 1)
 
 
-class FiringSeed:
-    """The seed of a firing, made from (graph seed, operator, stamp) when it is converted to an integer."""
+class FiringSeed(tuple[str, int]):
+    """The seed of a firing, made of (`GRAPH_SEED/OPERATOR/`, stamp) when it is converted to an integer.
 
-    __slots__ = ("_of", "_stamp")
+    A tuple, which is made without a call of Python: there is one for every firing, and few draw.
+    """
 
-    def __init__(self, of: str, stamp: int) -> None:
-        """`of`: `GRAPH_SEED/OPERATOR/`."""
-        self._of, self._stamp = of, stamp
+    __slots__ = ()
 
     def __int__(self) -> int:
-        return xxhash.xxh3_64_intdigest(f"{self._of}{self._stamp}".encode()) & (2**63 - 1)
+        of, stamp = self
+        return xxhash.xxh3_64_intdigest(f"{of}{stamp}".encode()) & (2**63 - 1)
 
 
 def seed_generators(seed: SupportsInt, version: int = VERSION) -> None:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import keyword
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,8 @@ _FROZEN, _FROZEN_IS = 0x401, 0x001
 """Of numpy's array flags C-contiguous and writeable, and what they are in a frozen array."""
 
 
-class Compiled(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Compiled:
     """The functions of one class.
 
     `construct` takes the message, the stamp and the fields by keyword; it is None where a name is no plain identifier.
@@ -151,7 +153,7 @@ def _adopt(
     given = [f"_a{k}" for k in range(len(arrays))]
     text = [
         "def _adopt(_self, stamp, _header, _given):",
-        f"    if _header.__len__() != {len(scalars)} or _given.__len__() != {len(arrays)}:",
+        f"    if _len(_header) != {len(scalars)} or _len(_given) != {len(arrays)}:",
         "        return False",
     ]
     if scalars:
@@ -215,7 +217,7 @@ def _fit(names: dict[str, Any], arrays: tuple[ArrayField, ...], given: list[str]
         fits = [
             f"{name}.__class__ is _ndarray",
             f"({dtypes})",
-            f"((_n{k} := (_e{k} := {name}.shape).__len__()) >= 0)",
+            f"((_n{k} := _len(_e{k} := {name}.shape)) >= 0)",
             f"({shapes})",
             *_parallel(arrays, given, k),
         ]
