@@ -208,7 +208,7 @@ class OperatorSpec:
     process_takes: tuple[str, ...]
     state: Any = None
     absent: Mapping[str, tuple[()] | None] = field(init=False, repr=False, compare=False)
-    """What `process()` is given on each input where that takes no part."""
+    """The arguments of `process()` for inputs that take no part in a firing."""
     takes_context: bool = field(init=False, repr=False, compare=False)
     """True when `process()` has a parameter named `context`."""
     only_output: OutputPort | None = field(init=False, repr=False, compare=False)

@@ -40,7 +40,8 @@ _INT64_MIN, _INT64_MAX = -(2**63), 2**63 - 1
 _PADDING = bytes(ALIGNMENT)
 _HEAD_FIELDS: Final = 6
 _KINDS: Final = {int(kind): kind for kind in Kind}
-_MESSAGE: Final = Kind.MESSAGE
+_MESSAGE: Final = Kind.MESSAGE  # the member of an enumeration is looked up anew, every time
+_REFERENCE: Final = Kind.REFERENCE
 _SMALL_BODY: Final = 4096
 _SMALL_ARRAY: Final = 64
 """Bytes of a head or body, and elements of an array in it, up to which it is decoded as a whole: then a hostile one,
@@ -63,17 +64,18 @@ def encode_parts(envelope: Envelope) -> list[Buffer]:
     Raises `ValueError` when a head or body exceeds what the prelude can say, or `message` does not fit `kind`.
     """
     message = envelope.message
-    if (message is not None) != (envelope.kind is Kind.MESSAGE) or envelope.kind is Kind.REFERENCE:
-        raise ValueError(f"envelope of kind {envelope.kind.name} on {envelope.stream!r}: message is {message!r}")
+    kind = envelope.kind
+    if (message is not None) != (kind is _MESSAGE) or kind is _REFERENCE:
+        raise ValueError(f"envelope of kind {kind.name} on {envelope.stream!r}: message is {message!r}")
     head = encode_head(envelope)
     if message is None:
-        return [PRELUDE.pack(MAGIC, VERSION, envelope.kind, len(head), 0) + head]
+        return [PRELUDE.pack(MAGIC, VERSION, kind, len(head), 0) + head]
     if message.stamp != envelope.stamp:
         raise ValueError(f"envelope on {envelope.stream!r}: stamp {envelope.stamp}, but its message's {message.stamp}")
     content, arrays = (message._made or message.compiled()).content(message)
     body = _pack(content)
     offset = PRELUDE.size + len(head) + len(body)
-    parts: list[Buffer] = [PRELUDE.pack(MAGIC, VERSION, envelope.kind, len(head), len(body)) + head + body]
+    parts: list[Buffer] = [PRELUDE.pack(MAGIC, VERSION, kind, len(head), len(body)) + head + body]
     for data in arrays:
         if data is None or data.nbytes == 0:
             continue

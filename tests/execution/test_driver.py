@@ -119,7 +119,7 @@ def test_all_operators_are_closed_whatever_one_of_them_raises() -> None:
 
 
 def calls_of_a_firing(messages: int = 40) -> float:
-    """Calls of the engine's Python functions for each firing of a chain, once it runs."""
+    """Calls of Python functions for each firing of a chain, once it runs, but for those that seed what is loaded."""
     driver = Driver()
     chain(driver, *"abcdefgh")
     driver.feeding.feeds.append(Fed(HandOver(driver), [1000 * k for k in range(1, 2 * messages + 1)]))
@@ -127,7 +127,7 @@ def calls_of_a_firing(messages: int = 40) -> float:
 
     def count(frame: FrameType, event: str, _: object) -> None:
         nonlocal calls
-        calls += event == "call" and ("/dataflow/" in frame.f_code.co_filename or frame.f_code.co_name == "__init__")
+        calls += event == "call" and "/generators/" not in frame.f_code.co_filename
 
     while driver.operators[-1].firings < messages:
         driver.turn()
@@ -142,4 +142,4 @@ def calls_of_a_firing(messages: int = 40) -> float:
 
 def test_a_firing_takes_few_calls() -> None:
     """What is called for every firing slows every graph."""
-    assert calls_of_a_firing() <= 42
+    assert calls_of_a_firing() <= 40

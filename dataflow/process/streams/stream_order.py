@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Envelope, Kind
 
+_MESSAGE = Kind.MESSAGE
 Place = tuple[int, int]
 """Incarnation, and number within it."""
 
@@ -53,7 +54,7 @@ class StreamOrder:
         False, and nothing is taken note of, for anything else: that is for `take`.
         """
         if (
-            envelope.kind is not Kind.MESSAGE
+            envelope.kind is not _MESSAGE
             or self._end is not None
             or (envelope.incarnation, envelope.seq) != self._next
             or envelope.incarnation != self.incarnation
