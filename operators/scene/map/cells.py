@@ -145,7 +145,9 @@ class Cells:
             return np.asarray((square < distance * distance).any(axis=1))
         low, high = self.bounds
         found = np.zeros(len(points), np.bool_)
-        around = np.flatnonzero(((points > low - distance) & (points < high + distance)).all(axis=1))
+        columns = np.ascontiguousarray(points.T)
+        within = (columns > (low - distance)[:, None]) & (columns < (high + distance)[:, None])
+        around = np.flatnonzero(within[0] & within[1] & within[2])
         apart, _ = self.tree().query(points[around], distance_upper_bound=distance)
         found[around] = np.isfinite(apart)
         return found

@@ -277,9 +277,11 @@ class ObjectMap:
         close = apart <= (radii[None] + radii[rows, None]) / 2 + 0.1
         touch = may_be_one([o.cells for o in known], rows)
         joined = False  # then what touches has changed
-        for k, n in np.argwhere(close).tolist():
+        for (k, n), touches in zip(np.argwhere(close).tolist(), touch[close].tolist(), strict=True):
+            if not (joined or touches):
+                continue
             i, j = changed[k], ids[n]
-            if i not in self.objects or j not in self.objects or i == j or not (joined or touch[k, n]):
+            if i not in self.objects or j not in self.objects or i == j:
                 continue
             a, b = self.objects[i], self.objects[j]
             if are_one(a, b, self._kinds, self._settings.voxel):
