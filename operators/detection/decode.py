@@ -48,6 +48,7 @@ class Layout:
     - `nms_iou`: overlap above which its authors drop the weaker box of a class; 1 for networks that suppress.
     - `draw` draws the masks of candidates that have any.
     - `sized`: the network has a second input, the (width, height) of the image in whose pixels its boxes are.
+    - `grid`: cells of its coarsest grid, in pixels.
     - `words`: tokens of each class's name that the network takes besides, for an open vocabulary; 0 for none.
     """
 
@@ -60,6 +61,7 @@ class Layout:
     nms_iou: float = 0.45
     draw: Draw | None = None
     sized: bool = False
+    grid: int = 32
     words: int = 0
 
 

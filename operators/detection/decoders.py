@@ -66,6 +66,7 @@ LAYOUTS: dict[DecoderName, Layout] = {
         mean=_MEAN,
         scale=_DEVIATION,
         nms_iou=0.6,
+        grid=64,
     ),
     "ssd": Layout(
         decode_ssd,

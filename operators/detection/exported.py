@@ -48,7 +48,8 @@ class ExportedFinder:
         self._layout: Layout = LAYOUTS[decoder]
         self._session = open_session(file, provider)
         self._input = self._image_input(side)
-        if side is not None and self._input.size != (side, side):
+        self._opened = side is not None and self._input.size != (side, side)
+        if self._opened and side is not None:
             self._open_input(side, provider)
         self._feed = self._size_input() if self._layout.sized else {}
         self._batch = next(each.shape[0] for each in self._session.get_inputs() if each.name == self._input.name)
@@ -126,15 +127,28 @@ class ExportedFinder:
         All images go in at once where the model takes so. Raises ModelError where the model's output is not what the
         decoder reads, or has other classes than names.
         """
-        fits = [Fit.plan(self._fit, (each.shape[1], each.shape[0]), self._input.size) for each in images]
+        fits = [self._fitted(each) for each in images]
         tensors = [self._input.tensor(fit.apply(each)) for fit, each in zip(fits, images, strict=True)]
         answers = self._answers(tensors)
         return [self._read(each, fit, threshold, nms_iou, most) for each, fit in zip(answers, fits, strict=True)]
 
+    def _fitted(self, image: NDArray[np.uint8]) -> Fit:
+        """Returns how an image (H, W, 3) goes in: an input that was opened holds one row of cells of padding, no more.
+
+        Without any, networks that learned with padding find other things at its border.
+        """
+        fit = Fit.plan(self._fit, (image.shape[1], image.shape[0]), self._input.size)
+        if not self._opened or self._feed or fit.offset != (0, 0):
+            return fit
+        grid = self._layout.grid
+        width, height = (-(-(extent + grid) // grid) * grid for extent in fit.inner)
+        return replace(fit, target=(min(width, fit.target[0]), min(height, fit.target[1])))
+
     def _answers(self, tensors: Sequence[NDArray[Any]]) -> list[Outputs]:
         """Returns the outputs for each image, with a batch axis of 1."""
         count = len(tensors)
-        at_once = count > 1 and not self._feed and not isinstance(self._batch, int)
+        alike = len({each.shape for each in tensors}) == 1
+        at_once = count > 1 and alike and not self._feed and not isinstance(self._batch, int)
         batches = [np.concatenate(tensors)] if at_once else tensors
         runs = [self._session.run(None, {self._input.name: batch, **self._feed}) for batch in batches]
         answers = [[a.astype(np.float32) if a.dtype == np.float16 else a for a in map(np.asarray, r)] for r in runs]
@@ -150,7 +164,7 @@ class ExportedFinder:
 
     def _read(self, outputs: Outputs, fit: Fit, threshold: float, nms_iou: float, most: int) -> Candidates:
         try:
-            found = self._layout.decode(outputs, self._input.size, threshold)
+            found = self._layout.decode(outputs, fit.target, threshold)
         except ValueError as error:
             raise ModelError(f"OnnxDetector.decoder={self._decoder!r} does not fit {self._file}: {error}") from None
         self._check_classes(outputs, found)

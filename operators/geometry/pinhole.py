@@ -21,6 +21,10 @@ def unproject(pixels: Pixels, K: Matrix) -> Points:
 def project(points: Points, K: Matrix) -> Pixels:
     """Returns pixels (N, 2) of points (N, 3), metres; points at or behind the camera land far outside any image."""
     z = points[:, 2]
-    safe = np.where(z > 1e-3, z, 1e-9)
-    uv = np.column_stack([points[:, 0] / safe * K[0, 0] + K[0, 2], points[:, 1] / safe * K[1, 1] + K[1, 2]])
-    return np.clip(np.where((z > 1e-3)[:, None], uv, -1e6), -1e6, 1e6)
+    before = z > 1e-3
+    safe = np.where(before, z, 1e-9)
+    pixels = np.empty((len(points), 2))
+    for axis in range(2):
+        place = points[:, axis] / safe * K[axis, axis] + K[axis, 2]
+        pixels[:, axis] = np.where(before, place, -1e6).clip(-1e6, 1e6)
+    return pixels

@@ -187,8 +187,8 @@ def _seen(
     classes = None
     if masks is not None:
         classes = np.full(len(points), -1, np.int32)
-        column, row = np.rint(pixels[inside]).astype(np.int64).T
-        classes[inside] = masks.classes.astype(np.int32)[row, column]
+        column, row = np.rint(u[inside]).astype(np.intp), np.rint(v[inside]).astype(np.intp)
+        classes[inside] = masks.classes[row, column]
     spacing = np.sqrt(info.width * info.height / max(int(inside.sum()), 1))
     grain = min(0.5 * float(spacing) + (masks is not None), _MOST_GRAIN)
     return Seen(points, pixels + 0.5, inside, up, classes, grain)  # boxes count from the image's edge

@@ -86,17 +86,25 @@ class Cells:
     def add(self, other: Cells) -> None:
         """Takes in the voxels of another view, or of another object that is the same."""
         keys, own, new = _merged(self._keys, other._keys)
-        values = np.zeros((7, len(keys)))  # weighted coordinates, hits, free, other, weighted times
-        values[:3, own], values[3, own] = (self.points * self.hits[:, None]).T, self.hits
-        values[4, own], values[5, own], values[6, own] = self.free, self.other, self.times * self.hits
-        values[:3, new] += (other.points * other.hits[:, None]).T
-        values[3, new] += other.hits
-        values[4, new] -= other.hits  # a voxel that is seen again was not free after all
-        values[5, new] += other.other
-        values[6, new] += other.times * other.hits
-        self.hits, self.free, self.other = values[3], values[4].clip(min=0), values[5]
-        self.times = values[6] / np.maximum(self.hits, 1e-9)
-        self.points = np.ascontiguousarray((values[:3] / np.maximum(self.hits, 1e-9)).T)
+
+        def together(mine: Array, others: Array) -> Array:
+            if len(keys) == len(mine):
+                sums = mine.copy()
+            else:
+                sums = np.zeros(len(keys))
+                sums[own] = mine
+            sums[new] += others
+            return sums
+
+        hits = together(self.hits, other.hits)
+        most = np.maximum(hits, 1e-9)
+        points = np.empty((len(keys), 3))
+        for mine, others, mean in zip(self.points.T, other.points.T, points.T, strict=True):
+            np.divide(together(mine * self.hits, others * other.hits), most, out=mean)
+        self.times = together(self.times * self.hits, other.times * other.hits) / most
+        self.free = together(self.free, -other.hits).clip(min=0)  # a voxel that is seen again was not free after all
+        self.other = together(self.other, other.other)
+        self.hits, self.points = hits, points
         self._keys, self._tree, self._bounds, self._middle = keys, None, None, None
 
     def correct(self, correction: Correction) -> None:
@@ -145,7 +153,9 @@ class Cells:
             return np.asarray((square < distance * distance).any(axis=1))
         low, high = self.bounds
         found = np.zeros(len(points), np.bool_)
-        around = np.flatnonzero(((points > low - distance) & (points < high + distance)).all(axis=1))
+        columns = np.ascontiguousarray(points.T)
+        within = (columns > (low - distance)[:, None]) & (columns < (high + distance)[:, None])
+        around = np.flatnonzero(within[0] & within[1] & within[2])
         apart, _ = self.tree().query(points[around], distance_upper_bound=distance)
         found[around] = np.isfinite(apart)
         return found

@@ -117,6 +117,21 @@ def alike(
     return value + 0.3 * share if share >= s.overlap else 0.0
 
 
+def in_reach(seen: Sequence[Observation], cells: Sequence[Cells], rows: Array, s: MapSettings) -> NDArray[np.bool_]:
+    """Tells of observations (N) and boxes (M, 7), centre, size and heading, which are not too far apart to be `alike`.
+
+    A micrometre more passes: `alike` decides.
+    """
+    middles = np.array([each.middle for each in cells])
+    eyes = [middle if each.image is None else each.image.eye for each, middle in zip(seen, middles, strict=True)]
+    reach = s.reach + _SLACK * np.sqrt(np.square(middles - np.array(eyes)).sum(axis=1))
+    x, y, z = middles.T[..., None] - rows.T[:3, None]
+    cos, sin = np.cos(rows[:, 6]), np.sin(rows[:, 6])
+    gaps = np.stack([np.abs(cos * x + sin * y), np.abs(cos * y - sin * x), np.abs(z)]) - rows.T[3:6, None] / 2
+    gaps = np.maximum(gaps, 0)
+    return np.asarray((gaps * gaps).sum(axis=0) <= np.square(reach + 1e-6)[:, None])
+
+
 @dataclass(frozen=True, eq=False)
 class InImages:
     """The same of each observation (N) and object (M): `iou` and `within` (N, M)."""

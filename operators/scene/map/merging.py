@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -21,11 +22,12 @@ _NEAR, _NEAR_MOVERS = 0.1, 0.3  # metres that the bounds of two entries of one t
 _SELDOM = 0.15  # share of the views in which both are seen beside each other, from which they are two
 
 
-def may_be_one(cells: Sequence[Cells], rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+def may_be_one(known: Sequence[MapObject], rows: NDArray[np.intp], kinds: Kinds) -> NDArray[np.bool_]:
     """Tells of some entries (N,) of the map and all (M,) whether their bounds are near enough to be `are_one`'s."""
-    low, high = (np.array([each.bounds[side] for each in cells]) for side in (0, 1))
-    apart = np.maximum(low[rows, None], low[None]) - np.minimum(high[rows, None], high[None])
-    return np.asarray(apart.max(axis=2) <= _NEAR_MOVERS)
+    low, high = (np.array([each.cells.bounds[side] for each in known]).T for side in (0, 1))
+    movers = np.array([kinds.is_mover(each) for each in known])
+    apart = np.maximum(low[:, rows, None], low[:, None]) - np.minimum(high[:, rows, None], high[:, None])
+    return np.asarray(apart.max(axis=0) <= np.where(movers[rows, None] | movers, _NEAR_MOVERS, _NEAR))
 
 
 def are_one(a: MapObject, b: MapObject, kinds: Kinds, voxel: float) -> bool:
@@ -40,7 +42,7 @@ def are_one(a: MapObject, b: MapObject, kinds: Kinds, voxel: float) -> bool:
         return False
     if all(movers):
         return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
-    volumes = float(np.prod(a.size)), float(np.prod(b.size))
+    volumes = math.prod(a.size.tolist()), math.prod(b.size.tolist())
     beside = max(a.beside[b.id], b.beside[a.id]) > _SELDOM * min(a.views, b.views)
     both = shared_volume(a.box, b.box)
     shared = both / max(min(volumes), 1e-9)

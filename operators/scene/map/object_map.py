@@ -23,6 +23,7 @@ from operators.scene.map.matching import (
     color_likeness,
     in_image,
     in_places_of_their_own,
+    in_reach,
     outside,
 )
 from operators.scene.map.merging import are_one, may_be_one, merge, smaller_in_place
@@ -158,7 +159,7 @@ class ObjectMap:
         boxes = np.column_stack([centers, sizes, [o.yaw for o in known]])[compared]
         near_by = [known[j] for j in compared]
         images = in_image(seen, boxes, np.array([self._kinds.is_round(o) for o in near_by], bool))
-        for k, n in np.argwhere(here[:, compared]).tolist():
+        for k, n in np.argwhere(here[:, compared] & in_reach(seen, cells, boxes, s)).tolist():
             j, image = compared[n], None if images is None else images.of(k, n)
             value[k, j] = alike(seen[k], cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
         left: dict[int, bool] = {}
@@ -275,11 +276,13 @@ class ObjectMap:
         rows = np.searchsorted(ids, changed)
         apart = np.linalg.norm(centers[None] - centers[rows, None], axis=2)
         close = apart <= (radii[None] + radii[rows, None]) / 2 + 0.1
-        touch = may_be_one([o.cells for o in known], rows)
+        touch = may_be_one(known, rows, self._kinds)
         joined = False  # then what touches has changed
-        for k, n in np.argwhere(close).tolist():
+        for (k, n), touches in zip(np.argwhere(close).tolist(), touch[close].tolist(), strict=True):
+            if not (joined or touches):
+                continue
             i, j = changed[k], ids[n]
-            if i not in self.objects or j not in self.objects or i == j or not (joined or touch[k, n]):
+            if i not in self.objects or j not in self.objects or i == j:
                 continue
             a, b = self.objects[i], self.objects[j]
             if are_one(a, b, self._kinds, self._settings.voxel):

@@ -37,7 +37,7 @@ class RangeView:
         self._own, self._T_world_sensor = points, T_world_sensor
         self.origin = np.asarray(T_world_sensor, np.float64)[:3, 3]
         self._angle = angle
-        column, row, ranges = self._directions(points)
+        column, row, ranges = self._directions(np.ascontiguousarray(points.T))
         self._first = np.array([column.min(initial=_FAR), row.min(initial=_FAR)])
         self._shape = (column.max(initial=-_FAR) - self._first[0] + 1, row.max(initial=-_FAR) - self._first[1] + 1)
         self._nearest, self._farthest = np.full(0, np.inf), np.zeros(0)
@@ -71,7 +71,7 @@ class RangeView:
 
     def of(self, places: Array, margin: float, growth: float = GROWTH) -> Sight:
         """Classifies places (N, 3) in the world by the view, within a margin and a share of the range."""
-        column, row, ranges = self._directions(transform_points(self._T_sensor_world, places))
+        column, row, ranges = self._directions(self._in_sensor(places))
         if not len(self._nearest):
             none = np.zeros(len(places), np.bool_)
             return Sight(none, none, none)
@@ -87,7 +87,7 @@ class RangeView:
 
     def may_show(self, centers: Array, radii: Array) -> Mask:
         """Tells which spheres (N,) are at least partly in the directions and the range that the view covers."""
-        column, row, ranges = self._directions(transform_points(self._T_sensor_world, centers))
+        column, row, ranges = self._directions(self._in_sensor(centers))
         if not len(self._nearest):
             return np.zeros(len(centers), np.bool_)
         more = np.ceil(np.arcsin(np.clip(radii / np.maximum(ranges, 1e-9), 0, 1)) / self._angle) * _WIDER
@@ -108,9 +108,16 @@ class RangeView:
         parts = (np.split(values, ends) for values in (whole.looked, whole.free, whole.confirmed))
         return [Sight(*part) for part in zip(*parts, strict=True)]
 
+    def _in_sensor(self, places: Array) -> Array:
+        """Returns places (N, 3) in the world by coordinate (3, N) in the sensor's frame."""
+        R, t = self._T_sensor_world[:3, :3], self._T_sensor_world[:3, 3:]
+        return np.ascontiguousarray((places @ R.T).T) + t
+
     def _directions(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
-        around = np.arctan2(points[:, 0], points[:, 2])
-        rise = np.arcsin(np.clip(points[:, 1] / np.maximum(ranges, 1e-9), -1, 1))
+        """Returns column, row and range (N,) of points by coordinate (3, N)."""
+        x, y, z = points
+        ranges = np.sqrt(x * x + z * z + y * y)
+        around = np.arctan2(x, z)
+        rise = np.arcsin((y / np.maximum(ranges, 1e-9)).clip(-1, 1))
         column = np.floor(around / self._angle).astype(np.int64)
         return column, np.floor(rise / self._angle).astype(np.int64), ranges

@@ -10,7 +10,7 @@ import pytest
 
 from dataflow.messages import Image
 from operators.detection import CustomDetector, OnnxDetector
-from operators.inference import ModelError
+from operators.inference import ModelError, open_content
 
 onnx = pytest.importorskip("onnx")
 
@@ -260,6 +260,28 @@ def test_a_network_of_convolutions_takes_a_larger_input_than_it_was_exported_for
     found = larger.process(image)
     np.testing.assert_allclose(found.scores, [1.0], atol=1e-5)
     np.testing.assert_allclose(found.boxes, [[24, 0, 56, 32]], atol=1e-3)  # around the corner of cell (5, 2)
+
+
+def test_an_opened_input_holds_one_row_of_cells_of_padding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes: list[tuple[int, ...]] = []
+
+    class Session:
+        def __init__(self, content: bytes, *told: str) -> None:
+            self._session = open_content(content, *told)  # type: ignore[arg-type]
+            self.get_inputs, self.get_modelmeta = self._session.get_inputs, self._session.get_modelmeta
+
+        def run(self, wanted: None, given: dict[str, np.ndarray]) -> list[np.ndarray]:
+            shapes.extend(each.shape for each in given.values())
+            return list(self._session.run(wanted, given))
+
+    monkeypatch.setattr("operators.detection.exported.open_content", Session)
+    data = np.zeros((32, 128, 3), np.uint8)
+    data[16:24, 40:48, 0] = 255
+    options = {"decoder": "fastestdet", "classes": names(tmp_path, "mug"), "score_threshold": 0.5}
+    model = save_convolution(tmp_path / "m.onnx", 32, fixed=False)
+    found = detector(model=model, **options, fit="corner", input_size=128).process(Image(stamp=1, frame="c", data=data))
+    assert shapes[-1] == (1, 3, 64, 128)  # and not 128 lines, 64 of them only padding
+    np.testing.assert_allclose(found.boxes, [[8, 0, 72, 32]], atol=1e-3)  # half as large as the input, around its cell
 
 
 def test_an_input_size_that_a_network_cannot_take_is_refused(tmp_path: Path) -> None:

@@ -70,3 +70,16 @@ def test_a_cup_before_what_a_box_is_around_is_not_the_box_thing() -> None:
     seen.points[cup] *= 2 / 3
     (found,) = lift(seen, np.array([[268.0, 188, 372, 292]]), [-1], [], LiftSettings())
     assert set(seen.points[found.points, 2]) == {3.0}
+
+
+def test_columns_of_pixels_hold_all_points_between_two_places_and_none_that_is_a_pixel_away() -> None:
+    rng = np.random.default_rng(3)
+    u, v = rng.uniform(0, 640, 4000), rng.uniform(0, 480, 4000)
+    inside = rng.random(4000) < 0.8
+    seen = Seen(np.zeros((4000, 3)), np.stack([u, v], axis=1), inside, np.array([0, 0, 1.0]))
+    for left, right in [(100.3, 231.7), (-50.0, 12.0), (630.0, 900.0), (-9.0, -2.0), (700.0, 800.0)]:
+        first, last = seen.columns.between(left, right)
+        rows = seen.columns.order[first:last]
+        assert set(np.flatnonzero(inside & (u >= left) & (u <= right))) <= set(rows)
+        assert inside[rows].all()
+        assert ((u[rows] > left - 1) & (u[rows] < right + 1)).all()

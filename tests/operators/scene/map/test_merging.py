@@ -13,7 +13,8 @@ from operators.scene.map.cells import Cells
 from operators.scene.map.cuboid import ImageView
 from operators.scene.map.kinds import Kinds
 from operators.scene.map.map_object import MapObject
-from operators.scene.map.merging import are_one
+from operators.scene.map.matching import MapSettings, Observation, in_reach, outside
+from operators.scene.map.merging import are_one, may_be_one
 
 SIZE = np.array([0.16, 0.04, 0.23])
 NAMES = ("book", "mug")
@@ -47,3 +48,25 @@ def test_entries_of_two_classes_are_one_where_they_share_more(shared: float, bes
     a, b = entry(1, 0.0), entry(2, 0.04 * (1 - shared), 1)
     a.beside[2] = beside
     assert are_one(a, b, KINDS, 0.03) is one
+
+
+def test_entries_that_are_one_are_among_those_that_may_be() -> None:
+    known = [entry(k + 1, 0.007 * k) for k in range(60)]
+    may = may_be_one(known, np.arange(60), KINDS)
+    one = np.array([[are_one(a, b, KINDS, 0.03) for b in known] for a in known])
+    assert (may | ~one).all()
+    assert np.count_nonzero(one) > 60  # others than each with itself
+    assert not may.all()
+
+
+def test_what_is_within_reach_of_a_box_is_compared_with_it() -> None:
+    rng = np.random.default_rng(4)
+    rows = np.column_stack([rng.uniform(0, 2, (40, 3)), rng.uniform(0.05, 1, (40, 3)), rng.uniform(-3, 3, 40)])
+    cells = Cells.of_each([place + np.zeros((1, 3)) for place in rng.uniform(0, 2, (50, 3))], 0.03)
+    seen = [Observation(c.points, 0, 0.5, image=VIEW if k % 2 else None) for k, c in enumerate(cells)]
+    found = in_reach(seen, cells, rows, MapSettings())
+    for k, each in enumerate(cells):
+        reach = 0.12 + (0.02 * float(np.linalg.norm(each.middle)) if k % 2 else 0.0)
+        gaps = np.array([outside(each.middle, (row[:3], row[3:6], float(row[6]))) for row in rows])
+        np.testing.assert_array_equal(found[k], gaps <= reach)
+    assert 0 < np.count_nonzero(found) < found.size
