@@ -29,8 +29,8 @@ PIXEL_STRENGTH = 0.2
 # believe too little where all is well. Calibration, rolling shutters and unsynchronised images err alike in every
 # residual, so no count averages them out, but tracks then miss by more than they jitter. And what moves by less than a
 # gate is wide pulls a pose along by its share of the view, however many residuals there are; it shows as a share of
-# the depth and of the tracks that disagree. What draws tracks and depth apart by more than both believe to err by does
-# so at one keyframe after another, so its errors add up: variances grow with the square of the disagreement.
+# the depth and of the tracks that disagree. What draws tracks and depth apart by more than both believe to err by, at
+# one keyframe after another, adds up: variances grow with the square of the disagreement that lasts.
 SYSTEMATIC = 0.43
 JITTER = 0.38  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
 CONTESTED = 120.0  # of the product of both shares, and of the square of the gate
