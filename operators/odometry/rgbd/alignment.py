@@ -22,6 +22,7 @@ from operators.odometry.rgbd.surface import Array32, DepthNoise, Surface
 CAUCHY = 2.0  # residuals of this many sigmas count half
 SLACK = 0.02  # metres along a ray that a tilted or rough surface makes up within one patch
 UNTOLD = 1e-3  # 1/m² and 1/rad²: information along what measurements do not determine
+ROUNDING = 1.2e-7  # of the most information, by which sums in single precision are wrong
 NOTHING: Vector = np.zeros(0)
 
 
@@ -49,13 +50,23 @@ class Normal:
         """Squared residual in the median, in units of sigma; None without any."""
         return float(np.median(self.squared)) if len(self.squared) else None
 
+    @property
+    def told(self) -> Matrix:
+        """(6, 6) information that is some along every direction."""
+        values, axes = np.linalg.eigh(self.H)
+        return np.asarray((axes * np.maximum(values, max(UNTOLD, ROUNDING * values[-1]))) @ axes.T, np.float64)
 
-def disagreement(one: Normal, other: Normal) -> float:
-    """Returns a sixth of the squared distance between the poses that either would give alone, in units of what both
-    believe to err by: 1 where they are right about that."""
-    a, b = (part.H + UNTOLD * np.eye(6) for part in (one, other))
-    apart = np.linalg.solve(b, other.b) - np.linalg.solve(a, one.b)
-    return float(apart @ np.linalg.solve(np.linalg.inv(a) + np.linalg.inv(b), apart)) / 6
+    @property
+    def step(self) -> Vector:
+        """(6,) to the pose that it would give alone."""
+        return gauss_newton_step(self.told, self.b)
+
+
+def drawn_apart(one: Normal, other: Normal) -> Vector:
+    """Returns how far apart (6,) the poses are that either would give alone, in units of what both believe to err by:
+    a sixth of its squared length is 1 where they are right about that."""
+    variances, axes = np.linalg.eigh(np.linalg.inv(one.told) + np.linalg.inv(other.told))
+    return np.asarray(axes @ (axes.T @ (one.step - other.step) / np.sqrt(variances)), np.float64)
 
 
 class Term(Protocol):

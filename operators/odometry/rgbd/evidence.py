@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages.geometry import transform_points
+from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import Points, project
 from operators.geometry.se3 import Matrix
 from operators.odometry.features import Gray
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.frame import Frame
 from operators.odometry.rgbd.keyframe import Keyframe
-from operators.odometry.rgbd.surface import DepthNoise
+from operators.odometry.rgbd.surface import DepthNoise, Surface
 
 STRIDE = 2  # patches of the view's surface between points that are compared
 NEAR, NEAR_PER_SQUARE = 0.03, 0.01  # metres by which depths may differ, and so much more by the square of the depth;
@@ -36,7 +36,9 @@ class Evidence:
 
     `overlap` is the share of the view that the map saw, of which `agreement` lies on the map's surfaces, at so many
     `points`; `likeness` is the correlation of brightness there, `beside` that on the surface that is second in it: a
-    door or a poster that hangs elsewhere, too, is like itself on one.
+    door or a poster that hangs elsewhere, too, is like itself on one. `contrary` is the share of the view
+    that stands where the map saw past it, and that of the map that the view sees past: what has moved, or a bookcase
+    like another, which leaves what stands around that one.
     """
 
     points: int
@@ -44,6 +46,7 @@ class Evidence:
     agreement: float
     likeness: float
     beside: float
+    contrary: float
 
     @property
     def certain(self) -> bool:
@@ -52,7 +55,7 @@ class Evidence:
             self.points >= FEWEST
             and self.overlap >= OVERLAP
             and self.agreement >= AGREEMENT
-            and self.likeness >= LIKENESS
+            and self.likeness - self.contrary >= LIKENESS
             and self.agreement + self.likeness >= TOGETHER
             and self.beside >= BESIDE
         )
@@ -80,17 +83,24 @@ def gathered(
     """Compares a frame at a pose with keyframes, by the colour camera of whose images K_color is."""
     points = frame.surface.points(STRIDE)
     here, facing = sampled(levelled(frame.gray), points, camera), frame.surface.planes_at(points)[:, :3]
-    met, same, found = 0, 0, [np.zeros((0, 5))]
+    met, same, found, before, after = 0, 0, [np.zeros((0, 5))], np.zeros(2), np.zeros(2)
     for keyframe in keyframes:
-        moved, on, known = compared(points, T_world_camera, keyframe, slack_of(noise))
+        T_there_here = keyframe.T_camera_world @ T_world_camera
+        moved, behind, known = laid(points, T_there_here, keyframe.surface, slack_of(noise))
+        on = known & (np.abs(behind) < 1.0)
         met += int(np.count_nonzero(known))
         same += int(np.count_nonzero(on))
+        before += np.count_nonzero(known & (behind > 1.0)), np.count_nonzero(known)
+        _, behind, known = laid(keyframe.surface.points(STRIDE), invert(T_there_here), frame.surface, slack_of(noise))
+        after += np.count_nonzero(known & (behind > 1.0)), np.count_nonzero(known)
         there = sampled(levelled(keyframe.gray), moved[on], camera)
         found.append(np.column_stack([here[on], there, facing[on]]))
     both = np.concatenate(found)
     both = both[np.isfinite(both).all(axis=1)]
     overlap, pairs = met / max(len(points) * len(keyframes), 1), both[:, :2]
-    return Evidence(len(both), overlap, same / max(met, 1), _correlation(pairs), _second(pairs, both[:, 2:]))
+    likeness, beside = _correlation(pairs), _second(pairs, both[:, 2:])
+    contrary = sum(float(seen[0] / max(seen[1], 1)) for seen in (before, after))
+    return Evidence(len(both), overlap, same / max(met, 1), likeness, beside, contrary)
 
 
 def _correlation(pairs: NDArray[np.float64]) -> float:
@@ -118,16 +128,24 @@ def compared(
     points: Points, T_world_camera: Matrix, keyframe: Keyframe, slack: float = NEAR_PER_SQUARE
 ) -> tuple[Points, NDArray[np.bool_], NDArray[np.bool_]]:
     """Returns points (N, 3) in a keyframe's camera, which lie on its surface, and which are where it has one."""
-    moved = transform_points(keyframe.T_camera_world @ T_world_camera, points)
-    h, w = keyframe.surface.inverse_depth.shape
+    moved, behind, known = laid(points, keyframe.T_camera_world @ T_world_camera, keyframe.surface, slack)
+    return moved, known & (np.abs(behind) < 1.0), known
+
+
+def laid(
+    points: Points, T_there_here: Matrix, surface: Surface, slack: float
+) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]:
+    """Returns points (N, 3) in another view, how far its surface lies behind each, in units of what they may differ by,
+    and which are where it has one."""
+    moved = transform_points(T_there_here, points)
+    h, w = surface.inverse_depth.shape
     z = moved[:, 2]
     ahead = z > 0.1
-    u, v = np.rint(project(np.where(ahead[:, None], moved, 1.0), keyframe.surface.K)).astype(np.int64).T
+    u, v = np.rint(project(np.where(ahead[:, None], moved, 1.0), surface.K)).astype(np.int64).T
     inside = ahead & (u >= 0) & (v >= 0) & (u < w) & (v < h)
-    inverse = keyframe.surface.inverse_depth[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
+    inverse = surface.inverse_depth[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
     known = inside & (inverse > 0)
-    off = np.abs(1.0 / np.where(known, inverse, 1.0) - z)
-    return moved, known & (off < NEAR + slack * z * z), known
+    return moved, (1.0 / np.where(known, inverse, 1.0) - z) / (NEAR + slack * z * z), known
 
 
 def levelled(gray: Gray) -> NDArray[np.float32]:

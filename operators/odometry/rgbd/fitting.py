@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
+from operators.geometry import se3
 from operators.geometry.perspective import agreed_pose
 from operators.geometry.pinhole import Pixels, Points, project
-from operators.geometry.se3 import Matrix
+from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.motion import Motion
-from operators.odometry.rgbd.alignment import Freedom, Normal, PixelTerm, PlaneTerm, PriorTerm, align, disagreement
+from operators.odometry.rgbd.alignment import Freedom, Normal, PixelTerm, PlaneTerm, PriorTerm, align, drawn_apart
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.frame import Frame
 from operators.odometry.rgbd.keyframe import Keyframe
@@ -28,8 +29,8 @@ PIXEL_STRENGTH = 0.2
 # believe too little where all is well. Calibration, rolling shutters and unsynchronised images err alike in every
 # residual, so no count averages them out, but tracks then miss by more than they jitter. And what moves by less than a
 # gate is wide pulls a pose along by its share of the view, however many residuals there are; it shows as a share of
-# the depth and of the tracks that disagree. What draws tracks and depth apart by more than both believe to err by does
-# so at one keyframe after another, so its errors add up: variances grow with the square of the disagreement.
+# the depth and of the tracks that disagree. What draws tracks and depth apart by more than both believe to err by, at
+# one keyframe after another, adds up: variances grow with the square of the disagreement that lasts.
 SYSTEMATIC = 0.43
 JITTER = 0.38  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
 CONTESTED = 120.0  # of the product of both shares, and of the square of the gate
@@ -43,7 +44,17 @@ STAGES = ((4, 0.15, 2), (2, 0.06, 2))  # stride over patches, gate in metres, it
 def systematic(missed: float, disagreement: float) -> float:
     """Returns how much larger variances are, for what errs alike in all residuals, where tracks miss by so many working
     pixels, and tracks and depth disagree by so much."""
-    return max(1.0, missed / JITTER) ** 4 + max(1.0, disagreement / AGREED) ** 2 - 1.0
+    return _astray(missed) + max(1.0, disagreement / AGREED) ** 2 - 1.0
+
+
+def alone(missed: float, disagreement: float) -> float:
+    """Returns the same of a pose by tracks alone: they differ from depth by so much in what they believe to err by,
+    most of which is theirs, since they believe less than depth. Tracks and depth together believe far more."""
+    return _astray(missed) + max(1.0, disagreement) - 1.0
+
+
+def _astray(missed: float) -> float:
+    return max(1.0, missed / JITTER) ** 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +90,7 @@ class Fit:
     missed: float  # working pixels by which this frame's tracks miss; without any, those before
     movers: Movers
     sighting: Sighting | None
+    apart: Vector | None = None  # (6,) how tracks and depth are drawn apart, here or else at the keyframe
 
     @property
     def depth_inliers(self) -> float:
@@ -107,7 +119,8 @@ class Fit:
     def covariance(self) -> Matrix:
         """(6, 6) of the pose against its references, right perturbation: see SYSTEMATIC."""
         gate = max(1.0, self.noise.pixel / JITTER) ** 2
-        misfit = systematic(self.missed, self.noise.disagreement) + CONTESTED * gate * self.contested
+        together = systematic if self.compared else alone
+        misfit = together(self.missed, self.noise.lasting) + CONTESTED * gate * self.contested
         return SYSTEMATIC * misfit * np.asarray(np.linalg.inv(self.information + self.prior), np.float64)
 
     @property
@@ -190,17 +203,11 @@ class Fitter:
         spread = motion.spread(frame.stamp, config.acceleration, config.angular_acceleration)
         prior, freedom = PriorTerm(T_predicted, np.diag(1.0 / np.diag(spread))), Freedom.of(spread)
         T, features = T_predicted, list[PixelTerm]()
-        sigma = self.noise.pixel
         if sighting:
             T = sighting.T_world_camera
             if sighting.recognised:
-                prior, sigma = PriorTerm(T, 1e-3 * np.eye(6)), max(1.0, sigma)
-            features = [
-                PixelTerm(
-                    sighting.points_world, sighting.pixels, self.camera.K_color, self.camera.T_color_depth,
-                    sigma, PIXEL_STRENGTH,
-                )
-            ]  # fmt: skip
+                prior = PriorTerm(T, 1e-3 * np.eye(6))
+            features = [self._features(sighting)]
             rough = align(T, features, prior, 4)
             T = rough.T_world_camera
             freedom = Freedom.of(np.asarray(np.linalg.inv(rough.information + prior.information), np.float64))
@@ -222,7 +229,10 @@ class Fitter:
             alignment = align(T, [*features, *surfaces], prior, iterations)
             T = alignment.T_world_camera
         corners, depth = alignment.normals[: len(features)], alignment.normals[len(features) :]
-        followed = corners[0].median if corners and sighting and not sighting.recognised else None
+        noise, missed, apart = self.noise, self.noise.pixel, None
+        if sighting and not sighting.recognised:
+            noise, apart = self._learnt(corners[0], depth, known.newest.apart)
+            missed = self._missed(features[0], corners[0], T, noise)
         return Fit(
             T_world_camera=T,
             information=alignment.information,
@@ -231,17 +241,40 @@ class Fitter:
             offered=len(points) * len(depth),
             compared=sum(part.seen for part in depth),
             agreeing=sum(part.inliers for part in depth),
-            noise=self.noise if followed is None else self._learnt(corners[0], depth),
-            missed=self.noise.missed(followed),
+            noise=noise,
+            missed=missed,
             movers=movers,
             sighting=sighting,
+            apart=apart,
         )
 
-    def _learnt(self, tracks: Normal, depth: Sequence[Normal]) -> Noise:
-        """Returns the noise after a frame's fit."""
-        if not depth:
-            return self.noise.after(tracks.median, None, None)
-        return self.noise.after(tracks.median, depth[0].median, disagreement(tracks, sum(depth[1:], depth[0])))
+    def _features(self, sighting: Sighting) -> PixelTerm:
+        sigma = max(1.0, self.noise.pixel) if sighting.recognised else self.noise.pixel
+        return PixelTerm(
+            sighting.points_world, sighting.pixels, self.camera.K_color, self.camera.T_color_depth,
+            sigma, PIXEL_STRENGTH,
+        )  # fmt: skip
+
+    def _learnt(self, tracks: Normal, depth: Sequence[Normal], before: Vector | None) -> tuple[Noise, Vector | None]:
+        """Returns the noise after a frame's fit, and how its tracks and depth, or else those `before`, are apart."""
+        noise = self.noise.after(tracks.median, depth[0].median if depth else None)
+        if not sum(part.seen for part in depth):
+            return noise, before
+        apart = drawn_apart(tracks, sum(depth[1:], depth[0]))
+        return noise.disagreed(apart, before), apart
+
+    def _missed(self, term: PixelTerm, tracks: Normal, T_world_camera: Matrix, noise: Noise) -> float:
+        """Returns what a frame's tracks miss by, working pixels.
+
+        Depth that draws the pose from where they have it makes them miss by more. Where that does not last, they are
+        asked at their own.
+        """
+        missed = self.noise.missed(tracks.median)
+        if noise.lasts == 1.0 or missed < JITTER:
+            return missed
+        own = T_world_camera @ se3.exp(tracks.step)
+        alone = min(missed, self.noise.missed(term.linearise(own).median))
+        return float(np.sqrt(alone**2 + noise.lasts * (missed**2 - alone**2)))
 
     def _planes(self, points: Points, references: Sequence[Keyframe], freedom: Freedom, gate: float) -> list[PlaneTerm]:
         noise, scale = self.config.depth_noise, self.noise.depth

@@ -37,6 +37,7 @@ class Keyframe:
     ages: NDArray[np.int64]  # (N,) keyframes that have confirmed each corner's point
     segment: int = 0  # maps begun before this one after a loss; two segments share no known motion
     sunk: Vector = field(default_factory=lambda: np.zeros(6))  # part of the covariance: a standard deviation that grows
+    apart: Vector | None = None  # (6,) how tracks and depth were drawn apart by its fit; None if not known
 
     @cached_property
     def points_world(self) -> Points:

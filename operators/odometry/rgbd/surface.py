@@ -39,7 +39,8 @@ class Surface:
     def from_depth(depth: Array32, K: Matrix, near: float, far: float, block: int) -> "Surface":
         """Averages block x block pixels of a (H, W) depth, metres; NaN or outside near..far is no return.
 
-        Where returns are sparse, blocks are wider, so that each holds some.
+        Where returns are sparse, blocks are wider, so that each holds some: two and a half, or where pixels are blocks,
+        five of eight of them.
         """
         valid = cv2.inRange(depth, near, far)  # 255 or 0; a NaN compares false
         # One full-size array, written over at each step: new ones cost as much as the arithmetic.
@@ -48,7 +49,7 @@ class Surface:
         found = density[density > 0.02]
         per_pixel = float(found.mean()) if found.size else 1.0
         fewest = 0.25
-        while per_pixel * block * block < 2.5:
+        while per_pixel < min(2.5 / block**2, 0.625):
             block, fewest = 2 * block, 0.02
         h, w = depth.shape[0] // block, depth.shape[1] // block
         whole = np.s_[: h * block, : w * block]

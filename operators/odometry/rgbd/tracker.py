@@ -316,7 +316,7 @@ class RgbdOdometry:
         segment = self.state.map.newest.segment if self.state.map.keyframes else 0
         return Keyframe(
             frame.stamp, T, self.state.covariance, frame.gray, movers.left_out_of(frame.surface),
-            found.pixels, found.points, found.ages, segment,
+            found.pixels, found.points, found.ages, segment, apart=fit.apart if fit else None,
         )  # fmt: skip
 
     def _layers(self, frame: Frame, T_world_camera: Matrix) -> list[Layer]:

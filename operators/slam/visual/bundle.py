@@ -168,7 +168,7 @@ def adjust_newest(graph: KeyframeGraph[View], points: MapPoints, fitter: Fitter,
     bundle = adjusted(
         fitter.camera, np.array([graph.nodes[k].T for k in place]), points.world(rows, graph.nodes), observed,
         [replace(edge, first=place[edge.first], last=place[edge.last]) for edge in edges], len(held),
-        STRENGTH / (systematic(noise.pixel, noise.disagreement) * astray(noise)), ITERATIONS,
+        STRENGTH / (systematic(noise.pixel, noise.lasting) * astray(noise)), ITERATIONS,
     )  # fmt: skip
     for k in free:
         graph.nodes[k].T = bundle.poses[place[k]]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from operators.geometry import se3
-from operators.odometry.rgbd.alignment import CAUCHY, NOTHING, Freedom, Normal, PixelTerm, PlaneTerm, disagreement
+from operators.odometry.rgbd.alignment import CAUCHY, NOTHING, Freedom, Normal, PixelTerm, PlaneTerm, drawn_apart
 from operators.odometry.rgbd.surface import DepthNoise, Surface
 
 K = np.array([[290.0, 0.0, 160.0], [0.0, 290.0, 120.0], [0.0, 0.0, 1.0]])
@@ -78,7 +78,17 @@ def test_disagreement_is_how_far_apart_two_terms_would_put_the_pose() -> None:
     for _ in range(2000):
         x, y = rng.normal(0, 0.2, 6), rng.normal(0, 0.1, 6)
         one = Normal(25 * np.eye(6), -25 * x, 1, NOTHING)
-        every.append(disagreement(one, Normal(100 * np.eye(6), -100 * y, 1, NOTHING)))
-        none.append(disagreement(one, Normal(some, -some @ y, 1, NOTHING)))
-    assert np.mean(every) == pytest.approx(1.0, rel=0.05)
-    assert np.mean(none) == pytest.approx(0.5, rel=0.05)
+        every.append(drawn_apart(one, Normal(100 * np.eye(6), -100 * y, 1, NOTHING)))
+        none.append(drawn_apart(one, Normal(some, -some @ y, 1, NOTHING)))
+    assert np.square(every).mean() == pytest.approx(1.0, rel=0.05)
+    assert np.square(none).mean() == pytest.approx(0.5, rel=0.05)
+    np.testing.assert_allclose(every[-1], (x - y) / np.hypot(0.2, 0.1), rtol=1e-3)
+
+
+def test_what_single_precision_leaves_of_no_information_is_none() -> None:
+    """A wall says nothing of motion along it; rounding may have it say less than nothing."""
+    wall = np.diag([-0.2, -0.1, 5e7, 5e6, 9e6, -0.05])
+    tracks = Normal(1e6 * np.eye(6), np.full(6, -1e3), 1, NOTHING)
+    apart = drawn_apart(tracks, Normal(wall, np.zeros(6), 1, NOTHING))
+    assert abs(apart[0]) < 0.01
+    assert apart[2] == pytest.approx(1e-3 / np.sqrt(1e-6 + 2e-8), rel=0.02)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from operators.geometry import se3
+from operators.geometry.se3 import Vector
 from operators.odometry.rgbd.fitting import Fit, Sighting
 from operators.odometry.rgbd.keyframe import SINKING, TURNING, Keyframe, carried
 from operators.odometry.rgbd.movers import Movers
@@ -56,18 +57,52 @@ def test_a_pose_is_less_certain_where_tracks_of_its_own_frame_miss() -> None:
 
 def test_a_pose_is_less_certain_where_tracks_and_depth_have_disagreed() -> None:
     """By more than they believe to err by: what draws them apart errs alike at every keyframe."""
-    agreed, torn = (supported(1.0, 1.0, Noise(0.3, 1.0, by)).covariance for by in (AGREED, 4 * AGREED))
+    agreed, torn = (supported(1.0, 1.0, Noise(0.3, 1.0, by, by)).covariance for by in (AGREED, 4 * AGREED))
     np.testing.assert_allclose(torn, 16 * agreed)
-    np.testing.assert_array_equal(supported(1.0, 1.0, Noise(0.3, 1.0, 0.1 * AGREED)).covariance, agreed)
+    little = supported(1.0, 1.0, Noise(0.3, 1.0, 0.1 * AGREED, 0.1 * AGREED)).covariance
+    np.testing.assert_array_equal(little, agreed)
+
+
+def test_a_pose_by_tracks_alone_is_less_certain_by_what_they_differ_from_depth_once() -> None:
+    """They believe less than both together, so the same disagreement is less of what they believe."""
+    both, tracks = (supported(1.0, 1.0, Noise(0.3, 1.0, 2.0, 2.0)) for _ in range(2))
+    tracks = replace(tracks, compared=0, agreeing=0)
+    agreed = supported(1.0, 1.0, Noise(0.3, 1.0)).covariance
+    np.testing.assert_allclose(tracks.covariance, 2.0 * agreed)
+    np.testing.assert_allclose(both.covariance, (2.0 / AGREED) ** 2 * agreed)
+
+
+def long(size: float) -> Vector:
+    """What draws tracks and depth apart along each axis, so that they disagree by `size`."""
+    return np.full(6, np.sqrt(size))
 
 
 def test_disagreement_is_learnt_from_frames_and_one_frame_counts_for_little() -> None:
     noise = Noise()
-    assert noise.after(None, None, None).disagreement == AGREED
-    assert noise.after(None, None, 1e6).disagreement < 2 * AGREED
+    assert noise.lasting == AGREED
+    assert noise.disagreed(long(1e6), None).lasting < 2 * AGREED
     for _ in range(60):
-        noise = noise.after(None, None, 2.0)
+        noise = noise.disagreed(long(2.0), long(2.0))
     assert noise.disagreement == pytest.approx(2.0, rel=0.01)
+    assert noise.lasting == noise.disagreement
+
+
+def test_a_disagreement_that_goes_to_and_fro_does_not_last() -> None:
+    """As of colour and depth of different times in a fast motion; one that half recurs counts in full."""
+    lasting, noise = [], Noise()
+    for share in (-1.0, 0.0, 0.1, 0.5):
+        noise = Noise()
+        for _ in range(100):
+            noise = noise.disagreed(long(2.0), share * long(2.0))
+        lasting.append(noise.lasting)
+    assert lasting[0] == 0.0
+    assert lasting[1] == pytest.approx(0.0, abs=0.01)
+    assert 0.2 < lasting[2] < 1.0
+    assert lasting[3] == noise.disagreement
+
+
+def test_where_no_disagreement_is_left_nothing_is_divided_by_it() -> None:
+    assert Noise(disagreement=0.0, recurring=0.0).lasting == 0.0
 
 
 def first_keyframe() -> Keyframe:

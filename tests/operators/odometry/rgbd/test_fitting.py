@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,11 +11,17 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import project
+from operators.monitoring.image_flaws import Watch
+from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
-from operators.odometry.rgbd.fitting import Fitter, Sighting
+from operators.odometry.rgbd.fitting import Fit, Fitter, Sighting
+from operators.odometry.rgbd.frame import Frame
+from operators.odometry.rgbd.keyframe import Keyframe
+from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.movers import Movers
 from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
+from operators.odometry.rgbd.surface import Surface
 
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 TURNED = se3.exp(np.array([0.02, 0.0, 0.01, 0.0, 0.01, 0.0]))  # the camera
@@ -110,3 +118,55 @@ def test_tiles_around_what_moves_are_known_to_move(column: float, row: float, ti
     assert not still.hold(point).any()
     for both in (moving.also(still), still.also(moving)):
         np.testing.assert_array_equal(both.tiles, expected)
+
+
+# -- tracks and depth that disagree --------------------------------------------------------------------------
+
+
+def wall_and(noise: Noise, drawn: float) -> tuple[Fitter, Frame, Sighting, LocalMap]:
+    """A camera at rest in a corner of a room, turned by `drawn` radians as its tracks have it, but not its depth."""
+    v, u = np.mgrid[:240, :320]
+    rays = np.dstack([(u - K[0, 2]) / 260.0, (v - K[1, 2]) / 260.0, np.ones_like(u)])
+    planes = np.array([[0.5, 0.1, 1.0], [-0.6, 0.2, 1.0], [0.0, 1.2, 0.5]])
+    depth = np.min([2.0 / np.maximum(rays @ n, 0.1) for n in planes], axis=0).astype(np.float32)
+    surface = Surface.from_depth(depth, K, 0.3, 6.0, 2)
+    gray = np.zeros((240, 320), np.uint8)
+    frame = Frame(0, gray, K, depth, surface, None, None, Watch())
+    none = np.zeros((0, 3))
+    newest = Keyframe(
+        0, np.eye(4), np.zeros((6, 6)), gray, surface, none[:, :2], none, np.zeros(0, np.int64), apart=np.zeros(6)
+    )
+    known = LocalMap(5)
+    known.add(newest)
+    points = corners(200, 10, 310, 2.0, 1)
+    T = se3.exp(np.array([0, 0, 0, 0, drawn, 0]))
+    pixels = project(transform_points(invert(T), points), K) + np.random.default_rng(2).normal(0, 0.2, (200, 2))
+    sighting = Sighting(T, points, pixels, np.zeros(200, np.int64), 200)
+    return Fitter(RgbdCamera(K, K, np.eye(4)), RgbdOdometryConfig(), noise), frame, sighting, known
+
+
+def refined(noise: Noise, drawn: float) -> Fit:
+    fitter, frame, sighting, known = wall_and(noise, drawn)
+    return fitter.refine(frame, sighting, Motion(-33_000_000, np.eye(4), np.zeros(6)), np.eye(4), known, 0)
+
+
+def test_tracks_that_depth_draws_the_pose_from_miss_by_their_own_noise_unless_that_lasts() -> None:
+    lasting, passing = Noise(1.2, 1.0, 5.0, 5.0), Noise(1.2, 1.0, 5.0, 0.0)
+    torn, fro, alike = refined(lasting, 0.02), refined(passing, 0.02), refined(passing, 0.0)
+    assert torn.missed > 4 * alike.missed
+    assert fro.missed < 1.2 * alike.missed
+    assert np.trace(torn.covariance) > 100 * np.trace(fro.covariance)
+    np.testing.assert_array_equal(torn.T_world_camera, fro.T_world_camera)
+
+
+def test_a_fit_remembers_what_draws_it_apart_and_without_depth_what_drew_its_keyframe() -> None:
+    fitter, frame, sighting, known = wall_and(Noise(0.3, 1.0), 0.01)
+    motion = Motion(-33_000_000, np.eye(4), np.zeros(6))
+    fit = fitter.refine(frame, sighting, motion, np.eye(4), known, 0)
+    assert fit.apart is not None
+    assert fit.noise.disagreement > fitter.noise.disagreement
+    known.keyframes[0] = replace(known.newest, apart=np.arange(6.0))
+    blind = replace(frame, surface=Surface(np.zeros_like(frame.surface.inverse_depth), frame.surface.K))
+    alone = fitter.refine(blind, sighting, motion, np.eye(4), known, 0)
+    np.testing.assert_array_equal(alone.apart, np.arange(6.0))
+    assert (alone.noise.disagreement, alone.noise.recurring) == (fitter.noise.disagreement, fitter.noise.recurring)

@@ -74,13 +74,13 @@ def test_what_is_black_empty_or_repeated_is_named_and_counts_as_nothing() -> Non
 
 def test_noise_is_learnt_from_the_residuals_of_frames_within_bounds() -> None:
     """Tracks err by twice, depths by half of what was believed: medians of squares, in units of that."""
-    noise = Noise(0.5, 1.2).after(4.0 * MEDIAN_OF_TWO, 0.25 * MEDIAN_OF_ONE, None)
+    noise = Noise(0.5, 1.2).after(4.0 * MEDIAN_OF_TWO, 0.25 * MEDIAN_OF_ONE)
     assert noise.pixel == pytest.approx(0.5 + RATE * 0.5)
     assert noise.depth == pytest.approx(1.2 - RATE * 0.6)
     for _ in range(100):
-        noise = noise.after(4.0 * MEDIAN_OF_TWO, 0.25 * MEDIAN_OF_ONE, None)
+        noise = noise.after(4.0 * MEDIAN_OF_TWO, 0.25 * MEDIAN_OF_ONE)
     assert (noise.pixel, noise.depth) == (PIXEL_BOUNDS[1], DEPTH_BOUNDS[0])
-    assert Noise(0.5, 1.2).after(None, None, None) == Noise(0.5, 1.2)
+    assert Noise(0.5, 1.2).after(None, None) == Noise(0.5, 1.2)
     assert Noise(0.5).missed(9.0 * MEDIAN_OF_TWO) == pytest.approx(1.5)
     assert Noise(0.5).missed(None) == 0.5
 

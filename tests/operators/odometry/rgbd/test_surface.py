@@ -118,6 +118,19 @@ def test_where_returns_are_sparse_patches_are_larger_so_that_each_has_some() -> 
     assert dense.inverse_depth.shape == (HEIGHT // 2, WIDTH // 2)
 
 
+def test_patches_of_one_pixel_stay_so_where_most_pixels_have_returns() -> None:
+    """As of a depth camera of 160 x 120 pixels, which has none to spare."""
+    drawn, depth = np.random.default_rng(0).random((HEIGHT, WIDTH)), wall()
+    whole = Surface.from_depth(depth, K, 0.3, 6.0, 1)
+    np.testing.assert_allclose(whole.depth, depth, rtol=1e-6)
+    np.testing.assert_array_equal(whole.K, K)
+    holed, sparse = (
+        Surface.from_depth(np.where(drawn < share, depth, np.float32(0)), K, 0.3, 6.0, 1) for share in (0.8, 0.5)
+    )
+    assert holed.inverse_depth.shape == (HEIGHT, WIDTH)
+    assert sparse.inverse_depth.shape == (HEIGHT // 4, WIDTH // 4)
+
+
 def test_depth_noise_grows_with_the_square_of_the_depth() -> None:
     np.testing.assert_allclose(DepthNoise(0.001, 0.003).sigma(np.array([0.0, 1.0, 4.0])), [0.001, 0.004, 0.049])
 
