@@ -42,13 +42,15 @@ class Retrial:
     `repeated`: whether both times they made the same, to the end, in the process that they had. `instead` are the
     answers that count for operators rather than those of the first trial. `shared` names, by operator that makes what
     was recorded, those that share its process where it does not, or where alone it does. `wrote`: the messages that
-    operators wrote into, by operator.
+    operators wrote into, by operator. `overwritten`: who, of its process, wrote into what an operator was given up to
+    its first difference, by operator: what it had was not what was recorded.
     """
 
     repeated: dict[str, bool] = field(default_factory=dict)
     instead: dict[str, Answer] = field(default_factory=dict)
     shared: dict[str, tuple[str, ...]] = field(default_factory=dict)
     wrote: dict[str, str] = field(default_factory=dict)
+    overwritten: dict[str, str] = field(default_factory=dict)
 
 
 def retry(
@@ -66,6 +68,7 @@ def retry(
     others = {name: answer for name, answer in apart.items() if _others(of[name], answer)}
     _acquit_apart(outcome, {n: a for n, a in others.items() if _first(a, n) is None}, of, attempt)
     _confirm(outcome, {n: a for n, a in others.items() if _first(a, n) is not None}, mates, attempt)
+    _acquit_overwritten(outcome, told, of)
     return outcome
 
 
@@ -115,6 +118,15 @@ def _confirm(
             if _alike(answer, suspects[name], name):
                 outcome.repeated[name] = True
                 outcome.instead[name] = answer
+
+
+def _acquit_overwritten(outcome: Retrial, told: Mapping[str, Answer], of: Mapping[str, Answer]) -> None:
+    """Acquits those that were given what an operator of the process that they had has written into by then."""
+    for name in [name for name in outcome.repeated if name not in outcome.wrote]:
+        writer, since = told[name]["reached"].get(name, ("", 0))
+        if writer and since <= of[name]["operators"][name]["first"]["stamp"]:
+            del outcome.repeated[name]
+            outcome.overwritten[name] = writer
 
 
 def _grouped(first: Mapping[str, First | None], mates: Mapping[str, frozenset[str]]) -> list[Trial]:

@@ -309,6 +309,7 @@ def _report(
     for name in task.operators:
         task.ledger.enter(found[name])
         found[name].wrote = found[name].wrote or retrial.wrote.get(name, "")
+        found[name].own_fault &= name not in retrial.overwritten
     for name, stream in task.unfed.items():
         calls = task.books.of(name).calls
         found[name] = Verification(name, firings=calls, unverifiable=max(calls, 1), missing=stream)
@@ -353,6 +354,7 @@ def _report(
         changes=task.changes,
         repeated=retrial.repeated,
         shared=retrial.shared,
+        overwritten=retrial.overwritten,
         mates={name: tuple(sorted(mates - {name})) for name, mates in mates_of(task.placed, task.operators).items()},
     )
 

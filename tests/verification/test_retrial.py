@@ -95,6 +95,19 @@ def test_a_reader_of_a_message_that_its_maker_changed_in_their_process_is_no_cul
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("since", [0, 5])
+def test_one_that_had_a_message_before_and_after_another_wrote_into_it_is_downstream_of_that(
+    tmp_path: Path, since: int
+) -> None:
+    path = recorded(tmp_path / "run.mcap", f"solve: Solve {{since: {since}}}\nlate: Late", "one_process")
+
+    report = verify(path, jobs=1)
+
+    assert verdicts(report) == {"solve": "culprit", "late": "downstream"}
+    assert report.overwritten == {"late": "solve"}
+
+
+@pytest.mark.long
 def test_operators_that_shared_a_module_in_the_run_and_differ_apart_are_named_with_those_beside(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count", "one_process")
 
@@ -108,7 +121,7 @@ def answer(differences: str, got: str = "b") -> dict[str, Any]:
     """What a trial of the operator `clock` shows, which differs from its third call on."""
     found = Verification("clock", firings=9, verified=9, outputs=9, differing=4, differences=differences)
     found.first, found.own_fault = Difference(3, "fire", 30, "out", "a", got), True
-    return {"operators": {"clock": asdict(found)}}
+    return {"operators": {"clock": asdict(found)}, "reached": {}}
 
 
 @pytest.mark.parametrize(
@@ -125,6 +138,18 @@ def test_an_operator_repeats_only_where_all_that_differs_is_the_same(again: dict
 
     assert found.repeated == {"clock": repeats}
     assert asked[0] == Trial(frozenset({"clock"}), {"clock": (0, 3, "b")})
+
+
+@pytest.mark.parametrize(("since", "downstream"), [(20, True), (30, True), (31, False)])
+def test_a_message_that_was_written_into_counts_where_it_came_before_the_difference(
+    since: int, downstream: bool
+) -> None:
+    again = {**answer("1"), "reached": {"clock": ["writer", since]}}
+
+    found = retry(["clock"], {"clock": answer("1")}, {"clock": frozenset({"clock"})}, lambda trials: [again])
+
+    assert found.overwritten == ({"clock": "writer"} if downstream else {})
+    assert found.repeated == ({} if downstream else {"clock": True})
 
 
 def test_a_parameter_that_another_graph_changes_is_named(tmp_path: Path) -> None:

@@ -182,6 +182,8 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
         yield f"{v.operator}: run a second time, it differed alike: {_since(report, v)}"
     if v.wrote:
         yield f"{v.operator}: it changed the memory of {v.wrote}; messages are immutable: copy before writing"
+    elif writer := report.overwritten.get(v.operator):
+        yield f"{v.operator}: {writer}, which ran in its process, wrote into a message that it was given"
     elif judged.verdict == "culprit" and (mates := report.mates.get(v.operator)):
         yield (
             f"{v.operator}: in the run it shared a process with {', '.join(mates)}; what operators keep in a module or "

@@ -28,7 +28,8 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     difference, as `retrial.First`, or None: once each has differed, and not first so, the rest is left), `guard` (watch
     over messages in every call), `live_effects` (make them again).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
-    stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: those of each operator.
+    stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: those of each operator;
+    `reached`: see `MemoryGuard`.
     """
     graph = Graph.from_json(request["graph"])
     with Recording(request["path"], watch=board.goes_on) as recording:
@@ -43,6 +44,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             if stream in checks:
                 checks[stream].take((entry.incarnation, entry.seq), entry.digest)
 
+        guard = MemoryGuard(keeping=True) if request["guard"] else None
         work = Recomputation(
             recording,
             graph,
@@ -52,7 +54,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             read=read,
             begin=request["begin"],
             slices=request["slices"],
-            guard=MemoryGuard(keeping=True) if request["guard"] else None,
+            guard=guard,
             watcher=board,
             live_effects=request["live_effects"],
         )
@@ -78,6 +80,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         "work": {name: values for name, values in counts.items() if name not in slices},
         "reading": work.reading_cpu_ns,
         "wall": work.wall,
+        "reached": {} if guard is None else {name: list(by) for name, by in guard.reached.items()},
     }
 
 
