@@ -19,7 +19,7 @@ from dataflow.verification.verify import verify
 Placement = Literal["one_process", "process_each"]
 
 
-def recorded(path: Path, operators: str, placement: Placement = "process_each") -> Path:
+def recorded(path: Path, operators: str, placement: Placement = "process_each", live: bool = False) -> Path:
     """A run of operators (`name: Class`, and parameters) that all take the matrices of one source."""
     lines = ["graph: test", "operators:", "  src: {use: 'sharing_operators:Matrices'}"]
     for line in operators.splitlines():
@@ -29,7 +29,7 @@ def recorded(path: Path, operators: str, placement: Placement = "process_each") 
         params = f"params: {more}" if more.startswith("{") else ""
         fields = [f"use: 'sharing_operators:{use}'", f"inputs: {{x: {taken}}}", params]
         lines.append(f"  {name}: {{{', '.join(filter(None, fields))}}}")
-    run(load_text("\n".join(lines)), placement=placement, record=path)
+    run(load_text("\n".join(lines)), placement=placement, record=path, live=live)
     return path
 
 
@@ -96,15 +96,29 @@ def test_a_reader_of_a_message_that_its_maker_changed_in_their_process_is_no_cul
 
 @pytest.mark.long
 @pytest.mark.parametrize("since", [0, 5])
-def test_one_that_had_a_message_before_and_after_another_wrote_into_it_is_downstream_of_that(
+def test_one_that_had_a_message_before_and_after_another_wrote_into_it_is_no_culprit(
     tmp_path: Path, since: int
 ) -> None:
     path = recorded(tmp_path / "run.mcap", f"solve: Solve {{since: {since}}}\nlate: Late", "one_process")
 
     report = verify(path, jobs=1)
 
-    assert verdicts(report) == {"solve": "culprit", "late": "downstream"}
-    assert report.overwritten == {"late": "solve"}
+    assert verdicts(report) == {"solve": "culprit", "late": "identical"}
+    assert report.shared == {"late": ("solve",)}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("live", [False, True])
+def test_operators_that_shared_a_module_in_the_run_are_called_in_its_order(
+    tmp_path: Path, jobs: int, live: bool
+) -> None:
+    path = recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count\nthree: Count from one/out", "one_process", live)
+
+    report = verify(path, jobs=jobs)
+
+    assert verdicts(report) == dict.fromkeys(("one", "two", "three"), "identical")
+    assert report.shared.keys() >= {"one", "two"}
 
 
 @pytest.mark.long
@@ -115,6 +129,7 @@ def test_operators_that_shared_a_module_in_the_run_and_differ_apart_are_named_wi
 
     assert report.culprits == ("one",)
     assert report.repeats("one")
+    assert report.mates == {"one": ("two",)}
 
 
 def answer(differences: str, got: str = "b") -> dict[str, Any]:
